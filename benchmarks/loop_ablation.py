@@ -95,15 +95,15 @@ def run(asked: tuple[str, str]) -> dict[str, Any]:
     """Put one case to one variant."""
     variant, name = asked
     VARIANTS[variant]()
+    from driftlab.commands.explain import explain
     from driftlab.config import load_config
-    from driftlab.jobs.explain import explain
 
     case = next(case for case in cases("develop", 1) if case.name == name)
     with tempfile.TemporaryDirectory(prefix="ablation_") as folder:
         prepared = case.make(Path(folder))
         config = load_config(save(prepared.config, Path(folder) / "declared.yaml"))
         names = [list(map(str, part)) for part in (prepared.calibration, prepared.train, prepared.holdout)]
-        explain(config, *names, Path(folder) / "out")
+        explain(config, *names, out=Path(folder) / "out")
         return judged(prepared, Path(folder) / "out")
 
 

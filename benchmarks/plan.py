@@ -16,7 +16,7 @@ import numpy as np
 from common import Row, show
 
 import driftlab
-from driftlab.arguments import config_of
+from driftlab.commands.inputs import config_of
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import RatedProfile, judge, search
 from driftlab.planning.unit_model import UnitModel, twin_of

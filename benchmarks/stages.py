@@ -76,12 +76,12 @@ def timed_iterator(owner: Any, attribute: str, name: str) -> None:
 def main() -> None:
     config, recording, out = sys.argv[1:]
     with stage("start"):
+        import driftlab.commands.run as filtering
         import driftlab.evaluation.overview as overview
         import driftlab.filtering.run as run
         import driftlab.filtering.tracker as tracker
-        import driftlab.jobs.run as filtering
+        from driftlab.commands.console import keep_freed_memory
         from driftlab.config import load_config
-        from driftlab.jobs.allocator import keep_freed_memory
         from driftlab.storage.hdf5 import GrowingFile
 
         loaded = load_config(Path(config), recording)
@@ -99,7 +99,7 @@ def main() -> None:
             timed(filtering, name, "report")
     keep_freed_memory()
     begun = time.perf_counter()
-    filtering.run_to_folder(loaded, Path(out), title="benchmark")
+    filtering.run(loaded, out=Path(out))
     clock.switch()
     print(json.dumps({**spent, "wall": time.perf_counter() - begun}))
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         plan,
         run,
         simulate,
-    )
+    )  # fmt: skip
 
 __version__ = version("driftlab")
 __all__ = [

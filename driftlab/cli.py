@@ -11,31 +11,18 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated, NoReturn
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
-from driftlab.commands.allan import allan
-from driftlab.commands.compare import compare
-from driftlab.commands.explain import explain
-from driftlab.commands.export import export
-from driftlab.commands.fit_map import fit_map
-from driftlab.commands.fleet import fleet
-from driftlab.commands.import_map import import_map
-from driftlab.commands.init import init
-from driftlab.commands.inspect import check, plugins, schema
-from driftlab.commands.live import live
-from driftlab.commands.live_web import LiveCommand
-from driftlab.commands.plan import plan
-from driftlab.commands.run import run
-from driftlab.commands.session import with_session
-from driftlab.commands.simulate import simulate
+from driftlab.commands.options import ENFORCE_LIMITS, JSON, NEEDED, Command, Option
 from fusion_core.escaping import lines
 
 INTERRUPTED = 130
-NARROWEST = 20  # columns of a terminal: below, `COLUMNS` is some program's mistake
+MIN_COLUMNS = 20  # columns of a terminal: below, `COLUMNS` is some program's mistake
 COUNTS = ("NUMBA_NUM_THREADS", "POLARS_MAX_THREADS", "NUMBA_DISABLE_JIT")  # variables that libraries die of
 CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")  # a line end, or what acts on a terminal
 
@@ -48,19 +35,67 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, fleet, plan, simulate, live, check)
-for command in COMMANDS:
-    kind = LiveCommand if command is live else None
-    app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
-BESIDE: dict[str, Callable[..., None]] = {
-    "init": init,
-    "export": export,
-    "import": import_map,
-    "plugins": plugins,
-    "schema": schema,
+PORT = 8088  # of the page of a live run, where none is named
+
+
+class WithPort(TyperCommand):
+    """A command whose `--web` may stand alone, or with a port behind it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Name the port where none is named."""
+        named = [
+            f"--web={PORT}" if arg == "--web" and not following.isdecimal() else arg
+            for arg, following in zip(args, [*args[1:], ""], strict=True)
+        ]
+        return super().parse_args(ctx, named)
+
+
+LIMITED = {"enforce_limits": ENFORCE_LIMITS, "json": JSON}
+SIZES = {
+    "select": Option("--select", "Choose the number of neurons first (onnx_network), and show why."),
+    "neurons_max": Option("--neurons-max N", "Largest number that --select tries.", int, 10, {"min": 1, "max": 20}),
 }
-for name, command in BESIDE.items():  # the --set of export and import is of the form
-    app.command(name)(with_session(command, config=False))
+COMMANDS = (
+    Command("run", "filtering", options=LIMITED, defaults={"out": Path("driftlab_out")}),
+    Command(
+        "fit_map",
+        "fitting",
+        metavars={"data": "SOAK[::START:STOP]", "out": "MAP"},
+        options=SIZES | LIMITED,
+        several=True,
+    ),
+    Command("allan", "reading", options=LIMITED),
+    Command(
+        "compare",
+        "comparing",
+        options={"paper": Option("--paper", "Print the paper's tables 5 to 12 too, in SI."), "json": JSON},
+    ),
+    Command("explain", "explaining", defaults={"out": NEEDED}),
+    Command(
+        "fleet",
+        module="driftlab.production.fleet",
+        metavars={"out": "FLEET"},
+        options={
+            "units": Option("--units 'GLOB'|MANIFEST.csv", "", str, NEEDED),
+            "workers": Option("--workers N", "", int, None, {"min": 1}),
+            **LIMITED,
+        },
+        indent=1,
+    ),
+    Command(
+        "plan", "planning", options={"effects": Option("--effects KIND,...", kind=str, default=None), "json": JSON}
+    ),
+    Command("simulate", "simulating", metavars={"out": "FILE"}, defaults={"out": NEEDED}),
+    Command("live", options={}, kind=WithPort),
+    Command("check", "reading"),
+    Command("init", "reading", metavars={"out": "CONFIG"}),
+    Command("export", "exporting", metavars={"out": "PATH"}),
+    Command("import_map", "importing", title="import", metavars={"out": "MAP"}),
+    Command("plugins", module="driftlab.commands.check", options={}),
+    Command("schema", module="driftlab.commands.check", options={}),
+)
+for command in COMMANDS:
+    command.add_to(app)
 
 
 def _show_version(asked: bool) -> None:
@@ -103,8 +138,8 @@ def main() -> None:
         name = error.filename if error.filename is not None else "standard output"
         _leave(f"{name}: cannot be read or written ({error.strerror or error}); make room, or check the rights", 1)
     except KeyboardInterrupt as stopped:
-        said = str(stopped) or "what was written so far is in the folder with the suffix .partial"
-        _leave(f"interrupted; {said}", INTERRUPTED)
+        what_is_left = str(stopped) or "what was written so far is in the folder with the suffix .partial"
+        _leave(f"interrupted; {what_is_left}", INTERRUPTED)
     except Exception:
         sys.stderr.write(lines(traceback.format_exc()))
         _leave(None, 1)
@@ -145,7 +180,7 @@ def _run() -> None:
         if CONTROL.search(argument):
             raise ConfigError(f"'{shown(argument)}': has a control character; rename the file, or leave it out")
     columns = os.environ.get("COLUMNS", "")
-    if columns.isdecimal() and int(columns) < NARROWEST:
+    if columns.isdecimal() and int(columns) < MIN_COLUMNS:
         del os.environ["COLUMNS"]
     try:
         app()
@@ -153,14 +188,14 @@ def _run() -> None:
         if isinstance(ended.__context__, BrokenPipeError):
             raise ended.__context__ from None
         if ended.code == INTERRUPTED:
-            raise KeyboardInterrupt(*_said(ended)) from ended
+            raise KeyboardInterrupt(*_interruption(ended)) from ended
         sys.stdout.flush()
         if ended.code:
             raise
 
 
-def _said(ended: BaseException) -> tuple[object, ...]:
-    """Return what was said with the interruption that ended a command."""
+def _interruption(ended: BaseException) -> tuple[object, ...]:
+    """Return the arguments of the interruption that ended a command."""
     error: BaseException | None = ended
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__

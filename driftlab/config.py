@@ -33,7 +33,7 @@ from fusion_core.units import LIMITS, Quantity, Unit, bias_unit
 from fusion_core.units.grammar import NUMBER
 
 
-def _zupt_unless_said(value: Any) -> Any:
+def _default_kind(value: Any) -> Any:
     """Return a filter section with the kind that it has where it does not say one."""
     return {"kind": "zupt", **value} if isinstance(value, dict) else value
 
@@ -54,6 +54,7 @@ class Config(Settings):
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
     _name: str = PrivateAttr("")
+    _file: Path | None = PrivateAttr(None)
 
     serial: Serial | None = None
     """Serial number of the unit, for the pages; a text or a whole number."""
@@ -64,7 +65,7 @@ class Config(Settings):
     # one made in memory is none of the union
     source: Annotated[Source, Installed(), SerializeAsAny()] | None = None
     """How the recording is read."""
-    filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
+    filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_default_kind)] = None
     """The filter: its sensors, and how their biases move."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
     """What the unit may have at most; the pages say whether it passes."""
@@ -73,6 +74,16 @@ class Config(Settings):
     def name(self) -> str:
         """What its file is called; empty where it was made otherwise."""
         return self._name
+
+    @property
+    def file(self) -> Path | None:
+        """The file that it was read from, if it was."""
+        return self._file
+
+    @property
+    def recording(self) -> str:
+        """What its recording is called; empty where it has none."""
+        return "" if self.source is None else self.source.name
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -127,23 +138,23 @@ class Config(Settings):
         return self.model_copy(update={"filter": self.filter.tracking(channel), "limits": None})
 
     def files(self) -> list[Path]:
-        """Return the files that the config reads: its recording and its maps."""
+        """Return the files that the config is read from, and reads: its own, its recording and its maps."""
         return self._files(self.maps())
 
     def files_to_fit(self) -> list[Path]:
-        """Return the files that a fit of the tracked sensor's map reads: the recording, and the others' maps."""
+        """Return the files that a fit of the tracked sensor's map reads: all of them but for that map."""
         return self._files(self._other_maps())
 
     def _files(self, maps: Iterable[ThermalMap]) -> list[Path]:
         recording = self.source.path if isinstance(self.source, FileSource) else None
-        found = [recording, *(settings.path for settings in maps)]
-        return [Path(path) for path in found if path is not None]
+        items = [self._file, recording, *(settings.path for settings in maps)]
+        return [Path(path) for path in items if path is not None]
 
 
 def maps_of(sensor: Sensor) -> list[ThermalMap]:
     """Return the thermal maps of a sensor: the calibration's, then the bias model's."""
-    found = [sensor.calibration, sensor.bias.map if isinstance(sensor.bias, ThermalBias) else None]
-    return [item for item in found if item is not None]
+    items = [sensor.calibration, sensor.bias.map if isinstance(sensor.bias, ThermalBias) else None]
+    return [item for item in items if item is not None]
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -166,6 +177,7 @@ def load_config(path: Path, recording: str | None = None, settings: Sequence[str
         With one line for each thing that is wrong.
     """
     config = understood(reduce(override, settings, read_document(path, products())))
+    config._file = path
     return config if recording is None else with_recording(config, recording)
 
 
@@ -229,16 +241,12 @@ LONGEST = 64  # characters of a serial number
 def _serial(value: Any) -> Any:
     """Return a serial number as text; of a number with a point nobody knows any more how it was written."""
     if isinstance(value, float):
-        raise _limit_problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
+        raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if isinstance(value, str) and not (0 < len(value) <= LONGEST and is_plain(value) and value == value.strip()):
-        raise _limit_problem(f"'{shown(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
+        raise _problem(f"'{shown(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
     return value
-
-
-def _limit_problem(text: str) -> PydanticCustomError:
-    return PydanticCustomError("serial", "{text}", {"text": text})
 
 
 Serial = Annotated[str, BeforeValidator(_serial, json_schema_input_type=str | int)]

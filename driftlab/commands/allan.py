@@ -1,66 +1,132 @@
-"""`driftlab allan`."""
+"""Allan deviation of a recording at rest: `driftlab allan`."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
-import typer
+import numpy as np
 
-from driftlab.commands.common import (
-    ConfigFile,
-    EnforceLimits,
-    Json,
-    Recording,
-    check_limits,
-    leave_by_limits,
-    print_verdict,
-    progress,
-    terminal,
-)
-from driftlab.commands.session import load, print_json, say
+from driftlab.commands.console import print_verdict, say, terminal
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
+from driftlab.commands.result import Result, in_folder
+from driftlab.config import Config
+from driftlab.evaluation.limits import LimitResult, check_limits, verdict
+from driftlab.evaluation.measurements import of_allan
+from driftlab.noise.recording import Analysis, analyse
+from driftlab.reports.allan import config_lines, document, figure, table, units_of, used, write_results
+from driftlab.reports.provenance import sheet_of
+from driftlab.storage.json import write_json
+from driftlab.units import tracked_unit
+from fusion_core.faults import Faults
 
 if TYPE_CHECKING:
-    from driftlab.jobs.allan import AllanResult
+    from matplotlib.figure import Figure
+
+
+class AllanResult(Result):
+    """Deviations over the averaging time `tau` (J,), s: `gyro`, `gyro_hadamard` and `gyro_sigma` (J, d), `accel` alike.
+
+    Where the config is about another sensor they are called by its channel, in its unit.
+    `found` is the analysis, with the coefficients; `config_lines` is what to paste into a config.
+    """
+
+    command = "allan"
+
+    def __init__(self, config: Config, analysis: Analysis) -> None:
+        self.config, self.found, self.name, self._read = config, analysis, analysis.name, config.files()
+        self.judged = _limit_results(config, analysis)
+        self.limits_verdict = self.verdict = verdict(self.judged)
+        limits = [row.as_json(tracked_unit(config.filter)) for row in self.judged]
+        self.summary = {**document(analysis, curves=False), "serial": config.serial, "limits": limits}
+        self.config_lines = config_lines(analysis)
+        self.units, self.labels = {"tau": "s"}, {}
+        self._columns = {"tau": next(iter(analysis.curves.values()))[0].tau}
+        for channel, curves in analysis.curves.items():
+            spread = np.stack([item.spread for item in analysis.coefficients[channel]], axis=1)
+            allan = np.stack([curve.allan for curve in curves], axis=1)
+            values = {"": allan, "_hadamard": np.stack([curve.hadamard for curve in curves], axis=1)}
+            for end, array in {**values, "_sigma": allan * spread}.items():
+                self._columns[channel + end] = array
+                self.units[channel + end] = units_of(analysis, channel).deviation_si
+                self.labels[channel + end] = tuple(analysis.axes[channel])
+
+    def lines(self) -> list[str]:
+        """Return the notes on the analysis, a sentence each."""
+        return self.found.notes
+
+    def plot(self) -> Figure:
+        """Draw the deviations of every axis, with the terms that were fitted."""
+        return figure(self.found)
+
+    def _write(self, folder: Path) -> None:
+        sheet = sheet_of(self.config, judged=self.judged, plugins=self.found.plugins)
+        write_results(folder, self.found, sheet, self.summary["limits"], write_json)
 
 
 def allan(
-    config: ConfigFile,
-    input: Recording = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for curves and report.")] = None,
-    enforce_limits: EnforceLimits = False,
-    json: Json = False,
-) -> None:
+    config: ConfigLike,
+    data: DataLike = None,
+    *,
+    units: Units | None = None,
+    out: Place | None = None,
+    progress: Progress | None = None,
+) -> AllanResult:
     """Fit noise and walk to a recording at rest.
 
     They are fitted to its Allan deviation; prints the lines for a config.
+
+    Parameters
+    ----------
+    config, data, units, progress : as those of `run`; the config needs no filter
+    out : path, optional
+        Folder for curves and report.
+
+    Returns
+    -------
+    AllanResult
+        `tau` (J,), `gyro`, `gyro_sigma`, `gyro_hadamard` (J, d), `accel` alike; `config_lines` is for a config, and
+        `summary` holds the coefficients with their limits.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the recording cannot be used, or `out` must not be replaced.
     """
-    from driftlab.jobs.allan import allan as job
-    from driftlab.reports.allan import document
-    from driftlab.storage.json import plain
+    understood = config_with(config, data, units)
 
-    loaded = load(config, input)
-    check_limits(loaded, enforce_limits)
-    with progress("reading") as report:
-        result = job(loaded, out, progress=report, read=[config])
-    if json:
-        content = document(result.found) | {name: result.summary[name] for name in ("serial", "limits")}
-        print_json(plain(content))
-    else:
-        _print(result, out)
-    leave_by_limits(result.verdict, enforce_limits)
+    def analysed() -> AllanResult:
+        faults = Faults()
+        analysis = analyse(understood, faults, progress)
+        analysis.notes[:0] = faults.lines()
+        return AllanResult(understood, analysis)
+
+    return in_folder(out, "allan", understood.files(), analysed)
 
 
-def _print(result: AllanResult, out: Path | None) -> None:
-    from driftlab.reports.allan import table, used
+def _limit_results(config: Config, analysis: Analysis) -> list[LimitResult]:
+    """Hold noise and bias instability of the tracked sensor against the limits of the config."""
+    channel = config.filter.tracked.channel if config.filter else "gyro"
+    items = analysis.coefficients.get(channel)
+    measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
+    return check_limits(config.limits, measured)
 
-    found, console = result.found, terminal()
-    console.print(f"{found.name}: {used(found)}", soft_wrap=True)
+
+def content_of(result: AllanResult, given: Mapping[str, Any]) -> Any:
+    """Return the coefficients with the curves that they were fitted to."""
+    return document(result.found) | {name: result.summary[name] for name in ("serial", "limits")}
+
+
+def show(result: AllanResult, given: Mapping[str, Any]) -> None:
+    """Print the coefficients of each sensor, and the lines for a config."""
+    analysis, console = result.found, terminal()
+    console.print(f"{analysis.name}: {used(analysis)}", soft_wrap=True)
     print_verdict(result.verdict, "limits: ")
-    for channel in found.curves:
-        console.print(table(found, channel))
+    for channel in analysis.curves:
+        console.print(table(analysis, channel))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
     say(f"\n{result.config_lines}")
-    if out is not None:
-        say(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")
+    if given["out"] is not None:
+        say(f"\nwritten to {given['out']}/: allan.json, allan.svg, report.html, summary.json\n")

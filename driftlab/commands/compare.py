@@ -1,92 +1,163 @@
-"""`driftlab compare`."""
+"""Several configs on one recording: `driftlab compare`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from driftlab.commands.common import Channel, Json, Recording, progress, terminal
-from driftlab.commands.session import load, print_json, say
+from driftlab.commands.console import load, say, terminal
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with, named
+from driftlab.commands.result import Result, in_folder
+from driftlab.config import Config
+from driftlab.evaluation import comparison
+from driftlab.evaluation.comparison import Comparison
+from driftlab.reports.charts import Chart
+from driftlab.reports.compare import bias_chart, write_comparison
+from driftlab.reports.provenance import sheet_of
+from driftlab.reports.tables import error_table, yardstick_table
+from driftlab.storage.json import write_json
+from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
+    import polars as pl
     from rich.table import Table
-
-    from driftlab.evaluation.comparison import Comparison
 
 UNLIMITED = 10_000  # characters
 
 
+class CompareResult(Result):
+    """A comparison: the `Comparison` of each config, by name; `name` is the recording's."""
+
+    command = "compare"
+
+    def __init__(self, configs: Mapping[str, Config], comparisons: dict[str, Comparison], recording: str) -> None:
+        self.configs, self.found, self.name, self._columns = dict(configs), comparisons, recording, comparisons
+        self._read = _files(configs)
+        self.summary = comparison.as_json(comparisons, recording)
+
+    def __getitem__(self, name: str) -> Comparison:  # type: ignore[override]
+        return self.found[name]
+
+    def lines(self) -> list[str]:
+        """Return who coasts best, and the notes on the runs, a sentence each."""
+        limits = [f"{name}: {line}" for name, line in comparison.limit_lines(self.found).items()]
+        return [self.summary["verdict"], *limits, *comparison.notes(self.found)]
+
+    def to_polars(self) -> pl.DataFrame:
+        """Return the tables as one: table, row, config, axis and error in SI."""
+        import polars as pl
+
+        sensor = next(iter(self.found.values())).sensor
+        rows = [
+            (table, label, name, axis, float(value))
+            for table, part in comparison.tables(self.found)
+            for label, columns in part
+            for name, values in zip(self.found, columns, strict=True)
+            for axis, value in zip(sensor.axes, values, strict=True)
+        ]
+        return pl.DataFrame(rows, schema=["table", "row", "config", "axis", f"error [{sensor.unit}]"], orient="row")
+
+    def _chart(self) -> Chart:
+        """Return bias, prediction and temperature over time, of every config."""
+        return bias_chart(self.found)
+
+    def _write(self, folder: Path) -> None:
+        write_json(folder / "summary.json", self.summary)
+        sheets = {name: sheet_of(self.configs[name], judged=c.judged) for name, c in self.found.items()}
+        write_comparison(folder / "report.html", self.found, self.name, sheets)
+
+
 def compare(
-    configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Two or more configs.")],
-    input: Recording = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the report.")] = None,
-    channel: Channel = None,
-    paper: Annotated[bool, typer.Option("--paper", help="Print the paper's tables 5 to 12 too, in SI.")] = False,
-    json: Json = False,
-) -> None:
-    """Compare configs on one recording: which coasts best."""
-    from driftlab.jobs.compare import compare as job
-    from driftlab.storage.json import plain
+    configs: Mapping[str, ConfigLike] | Sequence[ConfigLike],
+    data: DataLike = None,
+    *,
+    units: Units | None = None,
+    out: Place | None = None,
+    channel: str | None = None,
+    progress: Progress | None = None,
+) -> CompareResult:
+    """Compare configs on one recording: which coasts best.
 
-    loaded = {name: load(path, input, channel) for name, path in _named(configs).items()}
-    with progress("comparing") as report:
-        result = job(loaded, out, progress=report, read=configs)
-    if json:
-        print_json(plain(result.summary))
-        return
-    _print(result.found, result.name, paper)
-    if out is not None:
-        say(f"written to {out}/: summary.json, report.html\n")
+    Parameters
+    ----------
+    configs : mapping of str to config, or sequence of paths
+        Two or more configs.
+        A mapping names them as tables are to; files have their own names.
+    data, units, channel : as those of `run`
+    out : path, optional
+        Folder for the report.
+    progress : callable, optional
+        Called with texts.
+
+    Returns
+    -------
+    CompareResult
+        The comparison of each config, by name; `to_polars()` gives the paper's tables 5 to 12, and how each coasts.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If a config cannot be run on the recording, the recordings or the sensors differ, or `out` must not be replaced.
+    """
+    loaded = {name: config_with(config, data, units).tracking(channel) for name, config in named(configs).items()}
+    recordings = {config.source.name for config in loaded.values() if config.source is not None}
+    if len(recordings) != 1:
+        raise ConfigError(
+            f"the configs read different recordings ({', '.join(sorted(recordings))}); give one with --input"
+        )
+
+    def compared() -> CompareResult:
+        return CompareResult(loaded, comparison.compare(dict(loaded), progress), recordings.pop())
+
+    return in_folder(out, "compare", _files(loaded), compared)
 
 
-def _named(configs: list[Path]) -> dict[str, Path]:
-    """Return the configs by their stems, or by their paths where two have the same."""
-    from fusion_core.errors import ConfigError
-
-    stems = [path.stem for path in configs]
-    names = stems if len(set(stems)) == len(stems) else [str(path) for path in configs]
-    if len(set(names)) < len(names):
-        raise ConfigError("a config is named twice; name different ones")
-    return dict(zip(names, configs, strict=True))
+def _files(configs: Mapping[str, Config]) -> list[Path]:
+    return [path for config in configs.values() for path in config.files()]
 
 
-def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
-    from driftlab.evaluation import comparison as judging
-    from driftlab.evaluation import comparison as sentences
-    from driftlab.reports.tables import error_table, yardstick_table
+def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Load the configs, with what the command line sets."""
+    recordings, paths = arguments.pop("data", None), named(arguments["configs"])
+    loaded = {name: load(Path(path), recordings, arguments.get("channel")) for name, path in paths.items()}  # type: ignore[arg-type]
+    return {**arguments, "configs": loaded}
 
-    first = next(iter(found.values()))
+
+def show(result: CompareResult, given: Mapping[str, Any]) -> None:
+    """Print who coasts best, the tables, and with `paper` the paper's too."""
+    comparisons = result.found
+    first = next(iter(comparisons.values()))
     sensor, unit = first.sensor, first.initial.unit
 
     def coasts(part: dict[str, Comparison]) -> list[Table]:
-        return [yardstick_table({name: c.yardsticks for name, c in part.items()}, recording, sensor)]
+        return [yardstick_table({name: c.yardsticks for name, c in part.items()}, result.name, sensor)]
 
     def of_the_paper(part: dict[str, Comparison]) -> list[Table]:
-        tables = judging.paper(part)
+        tables = comparison.paper(part)
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
-    terminal().print(sentences.verdict(found))
-    for name, line in sentences.limit_lines(found).items():
+    terminal().print(comparison.verdict(comparisons))
+    for name, line in comparison.limit_lines(comparisons).items():
         terminal().print(f"{name}: {line}", soft_wrap=True)
     terminal().print()
-    _side_by_side(found, coasts)
-    if paper:
-        _side_by_side(found, of_the_paper)
-        _print_convergence(found)
-    for line in sentences.notes(found):
+    _side_by_side(comparisons, coasts)
+    if given["paper"]:
+        _side_by_side(comparisons, of_the_paper)
+        _print_convergence(comparisons)
+    for line in comparison.notes(comparisons):
         terminal().print(f"note: {line}", soft_wrap=True)
+    if given["out"] is not None:
+        say(f"written to {given['out']}/: summary.json, report.html\n")
 
 
-def _side_by_side(found: dict[str, Comparison], tables: Callable[[dict[str, Comparison]], list[Table]]) -> None:
+def _side_by_side(comparisons: dict[str, Comparison], tables: Callable[[dict[str, Comparison]], list[Table]]) -> None:
     """Print tables of the configs, with as few of them below one another as the terminal's width allows."""
-    width, names = terminal().width, list(found)
+    width, names = terminal().width, list(comparisons)
     for pieces in range(1, len(names) + 1):
         size = -(-len(names) // pieces)
         parts = [names[k : k + size] for k in range(0, len(names), size)]
-        made = [tables({name: found[name] for name in part}) for part in parts]
+        made = [tables({name: comparisons[name] for name in part}) for part in parts]
         needed = max(terminal(width=UNLIMITED).measure(table).maximum for part in made for table in part)
         if needed <= width:
             break
@@ -95,15 +166,15 @@ def _side_by_side(found: dict[str, Comparison], tables: Callable[[dict[str, Comp
         console.print(*same, sep="\n")
 
 
-def _print_convergence(found: dict[str, Comparison]) -> None:
+def _print_convergence(comparisons: dict[str, Comparison]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    first = next(iter(found.values()))
+    first = next(iter(comparisons.values()))
     size, near = first.initial.texts
     table = Table("config", title=f"Time to within {near}, {size} at the start (table 12)", title_justify="left")
     for axis in first.sensor.axes:
         table.add_column(Text(f"{axis} [s]"), justify="right", no_wrap=True)
-    for name, comparison in found.items():
-        table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in comparison.offset.convergence))
+    for name, one in comparisons.items():
+        table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in one.offset.convergence))
     terminal().print(table)

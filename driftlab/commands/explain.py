@@ -1,73 +1,419 @@
-"""`driftlab explain`."""
+"""The whole loop, from recordings and a declared model to a new config: `driftlab explain`."""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
-import typer
+import numpy as np
 
-from driftlab.commands.common import Channel, ConfigFile, Json, print_verdict, progress, terminal
-from driftlab.commands.session import load, print_json, say
+from driftlab import __version__
+from driftlab.commands.console import print_verdict, say, terminal
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
+from driftlab.commands.result import Result
+from driftlab.config import Config, load_config, part_of, paths_of, with_recording
+from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
+from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
+from driftlab.evaluation.overview import overview_of
+from driftlab.evaluation.run_limits import map_of
+from driftlab.evaluation.scores import moving_average
+from driftlab.evaluation.summary import remarks, summarise
+from driftlab.filtering.run import Run
+from driftlab.filtering.segment import RunLog, joined
+from driftlab.identification.candidates import check_kinds
+from driftlab.identification.config_edit import calibrated, clamped, declared_effects, the_map, with_map
+from driftlab.identification.model import explained_config, explained_map
+from driftlab.identification.records import Progress, gather
+from driftlab.identification.result import Explanation, Identification, Outcome, closed, investigate
+from driftlab.maps.fit import fit_map
+from driftlab.recordings.identity import identity, sha256
+from driftlab.recordings.overlap import SMALL, Content, content_of
+from driftlab.recordings.screening import read
+from driftlab.reports.explain import prediction_chart, tables, write_report
+from driftlab.reports.figures import figure_of
+from driftlab.reports.provenance import Sheet, sheet_of
+from driftlab.storage.folders import output_folder
+from driftlab.storage.in_memory import InMemoryName
+from driftlab.storage.json import write_json
+from driftlab.units import tracked_unit
+from fusion_core.contracts import Effect, FittedMap, ThermalMap
+from fusion_core.errors import ConfigError
+from fusion_core.escaping import comment
+from fusion_core.faults import Faults
+from fusion_core.host.provenance import participants
+from fusion_core.host.registry import registry
 
 if TYPE_CHECKING:
-    from driftlab.identification.result import Identification
+    from matplotlib.figure import Figure
 
-RECORDINGS = "PATH[::START:STOP]"
+PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")
+SAME = 0.9  # share of the samples from which on two recordings are one
+
+
+class ExplainResult(Result):
+    """The verdict on a declared model, the new config, and the predictions of both models for the holdout.
+
+    Arrays are those of `prediction.h5`, one holdout recording after the other: `t` (N,), `reference`, `before`,
+    `after`, `before_sigma`, `after_sigma` (N, d), and `recording` (N,), the number of the recording.
+
+    Attributes
+    ----------
+    verdict : str
+        `explained`, `nothing_missing`, `unexplained`, `ambiguous` or `refuted`.
+    config : str
+        The new config, as YAML; the map that it names is among the files that `save` writes.
+    closed : Identification
+        Everything that the loop found.
+    files : dict of str to bytes
+        What `save` writes.
+    """
+
+    command = "explain"
+
+    def __init__(self, closed: Identification, files: dict[str, bytes], read: Collection[Path]) -> None:
+        self.closed, self.verdict, self.summary = closed, closed.verdict.word, closed.content
+        self.config = files["explained.yaml"].decode()
+        self.files, self._read = files, read
+        outcomes, evidence = closed.outcomes, closed.search.columns.evidence
+        self.name = f"{self.verdict.replace('_', ' ')}, judged on {', '.join(o.name for o in outcomes)}"
+        self._columns = {name: np.concatenate([getattr(o, name) for o in outcomes]) for name in ("t", *PREDICTED)}
+        self._columns["recording"] = np.repeat(np.arange(len(outcomes)), [len(o.t) for o in outcomes])
+        self.units = {"t": "s", **dict.fromkeys(PREDICTED, evidence.unit.si)}
+        self.labels = dict.fromkeys(PREDICTED, tuple(evidence.axes))
+
+    def lines(self) -> list[str]:
+        """Return the findings, a sentence each."""
+        return list(self.closed.lines)
+
+    def plot(self, k: int = 0) -> Figure:
+        """Draw the prediction of the k-th holdout recording, before and after, and its errors."""
+        return figure_of(prediction_chart(self.closed.outcomes[k], self.closed.search.columns.evidence.axes))
+
+    def _write(self, folder: Path) -> None:
+        for name, content in self.files.items():
+            (folder / name).write_bytes(content)
 
 
 def explain(
-    config: ConfigFile,
-    calibration: Annotated[
-        list[str], typer.Option("--calibration", metavar=RECORDINGS, help="The soak; may be repeated.")
-    ],
-    train: Annotated[
-        list[str], typer.Option("--train", metavar=RECORDINGS, help="To find effects on; may be repeated.")
-    ],
-    holdout: Annotated[
-        list[str], typer.Option("--holdout", metavar=RECORDINGS, help="To judge on, opened last; may be repeated.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")],
-    channel: Channel = None,
-    estimate: Annotated[
-        bool, typer.Option("--estimate", help="Let the new config go on estimating the effects' coefficients.")
-    ] = False,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="KIND", help="Effects not to try; may be repeated.")
-    ] = None,
-    json: Json = False,
-) -> None:
+    config: ConfigLike,
+    calibration: DataLike,
+    train: DataLike,
+    holdout: DataLike,
+    *,
+    units: Units | None = None,
+    out: Place | None = None,
+    channel: str | None = None,
+    estimate: bool = False,
+    without: Sequence[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> ExplainResult:
     """Find what the declared model lacks, and add it.
 
     Shows the error before and after on recordings that are opened last.
+
+    Parameters
+    ----------
+    config : as that of `run`
+        The declared model; the map that it names, if it does, is fitted on the calibration.
+    calibration : as `data` of `run`, or a list of them
+        The soak; may be repeated.
+        All recordings are at rest. What is in memory is distinguished by the hash of its samples; parts that overlap
+        are not.
+    train : as `calibration`
+        To find effects on; may be repeated.
+    holdout : as `calibration`
+        To judge on, opened last; may be repeated.
+    units, channel : as those of `run`
+    out : path, optional
+        Folder for the results.
+        They are `loop.json`, `explained.yaml`, the maps, `prediction.h5` and `report.html`.
+    estimate : bool
+        Let the new config go on estimating the effects' coefficients.
+    without : sequence of str
+        Effects not to try; may be repeated.
+    progress : callable, optional
+        Called with texts.
+
+    Returns
+    -------
+    ExplainResult
+        `verdict`, `config` (the new one), and `t` (N,), `reference`, `before`, `after` (N, d) of the holdout.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the config or a recording cannot be used.
     """
-    from driftlab.jobs.explain import explain as close
-
-    loaded = load(config, channel=channel)
-    with progress("explaining") as show:
-        closed = close(
-            loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]
-        )
-    if json:
-        from driftlab.storage.json import plain
-
-        print_json(plain(closed.content))
-        return
-    _print(closed)
-    configs = "explained.yaml, candidate.yaml" if closed.refuted else "explained.yaml"
-    say(f"written to {out}: loop.json, {configs}, prediction.h5, report.html, and the maps\n")
+    given = {"calibration": calibration, "train": train, "holdout": holdout}
+    recordings = {role: recordings_of(data, units, role) for role, data in given.items()}
+    understood = config_of(config).tracking(channel)
+    used = [*understood.files(), *paths_of(name for names in recordings.values() for name in names)]
+    with TemporaryDirectory(prefix="driftlab-") if out is None else nullcontext(out) as place:
+        folder = Path(place) / "explained" if out is None else Path(place)
+        return _closed(understood, recordings, folder, used, progress or (lambda text: None), estimate, without)
 
 
-def _print(closed: Identification) -> None:
+def _closed(
+    config: Config,
+    recordings: Mapping[str, Sequence[str]],
+    out: Path,
+    used: Collection[Path],
+    progress: Progress,
+    estimate: bool,
+    without: Collection[str],
+) -> ExplainResult:
+    """Close the loop, and write its files into the folder `out`; it appears when all are whole."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    settings = the_map(config)
+    check_kinds(without)
+    calibration, train = distinct(config, recordings)
+    # the matrices are small: fits side by side are faster than divided matrices
+    with output_folder(out, "explain", used) as folder, threadpool_limits(1):
+        declared, fitted = _declared(config, settings, calibration, folder, progress)
+        evidence = gather(calibrated(declared), calibration, train, progress)
+        explanation = investigate(evidence, settings, declared_effects(config), progress, without)
+        new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
+        _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
+        progress("opening the holdout")
+        # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
+        both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
+        outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
+        identities = {role: list(map(identity, names)) for role, names in recordings.items()}
+        whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
+        if whole.refuted:
+            _refute(folder, config, new, whole)
+        chosen = 0 if whole.refuted else 1
+        whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
+        limits = _limit_results(both[chosen], [measured[chosen] for _, measured in outcomes])
+        rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
+        whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
+        _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
+        return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, used)
+
+
+def _declared(
+    config: Config, settings: ThermalMap | None, calibration: Sequence[str], folder: Path, progress: Progress
+) -> tuple[Config, FittedMap | None]:
+    """Return the declared config with its map fitted on the calibration, and the map; None where it has none."""
+    if settings is None:
+        return config, None
+    progress("fitting the declared map on the calibration")
+    fitted = fit_map(config, calibration, settings.kind, Faults())
+    path = folder / f"declared{settings.suffix}"
+    fitted.save(path)
+    return with_map(config, path=path), fitted
+
+
+def _explained(
+    config: Config,
+    explanation: Explanation,
+    fitted: FittedMap | None,
+    settings: ThermalMap | None,
+    names: list[str],
+    folder: Path,
+    estimate: bool,
+) -> Config:
+    """Write the new map, and return the new config; where nothing was added, those that were declared."""
+    path = None if settings is None else Path(f"explained{settings.suffix}")
+    if settings is not None and fitted is not None and path is not None:
+        if explanation.anything:
+            fitted = explained_map(explanation.search, explanation.fit, fitted, settings, names)
+        fitted.save(folder / path)
+    if not explanation.anything:
+        return config if path is None else with_map(config, path=path)
+    unit = explanation.search.columns.evidence.unit
+    return explained_config(config, unit, explanation.fit, path, estimate=estimate)
+
+
+def _refute(folder: Path, declared: Config, candidate: Config, whole: Identification) -> None:
+    """Move what was found to the candidate's files, and leave config and map as they were declared, to the byte."""
+    for declared_map in folder.glob("declared.*"):
+        explained = folder / f"explained{declared_map.suffix}"
+        candidate = with_map(candidate, path=Path(explained.rename(folder / f"candidate{explained.suffix}").name))
+        explained.write_bytes(declared_map.read_bytes())
+    _write_config(folder / "candidate.yaml", candidate, whole.verdict.word, whole.lines)
+    readable = declared.file is not None and declared.file.is_file()
+    text = declared.file.read_bytes() if readable else declared.as_yaml().encode()  # type: ignore[union-attr]
+    (folder / "explained.yaml").write_bytes(text)
+
+
+def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
+    head = [f"driftlab {__version__} explain: {word}", *lines]
+    releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
+    head.append(f"plugins: {', '.join(releases)}")
+    head.append("coefficients and sigma of effects are in SI units")
+    path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
+
+
+def _limit_results(config: Config, measured: Sequence[dict[str, Measured]]) -> list[LimitResult]:
+    """Hold the worst holdout, and the map, against the limits of the config."""
+    if config.limits is None:
+        return []
+    worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
+    fitted = map_of(config)
+    return check_limits(
+        config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))}
+    )
+
+
+def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult]) -> Sheet:
+    """Return the provenance sheet: recordings with the role of each, maps by the names that they have beside it."""
+    sheet = sheet_of(config, [], judged=limits, plugins=whole.content["plugins"])
+    roles = whole.content["recordings"].items()
+    recordings = [{**one, "name": f"{one['name']} ({role})"} for role, identities in roles for one in identities]
+    maps = [{**one, "file": Path(one["file"]).name} for one in sheet.maps]
+    return replace(sheet, recordings=recordings, maps=maps)
+
+
+def _write(folder: Path, whole: Identification, sheet: Sheet, progress: Progress) -> None:
+    """Write the files for programs, and the report; `explained.yaml` is there already."""
+    write_prediction(folder / "prediction.h5", whole.outcomes)
+    write_json(folder / "loop.json", whole.content)
+    progress("drawing the report")
+    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"), sheet)
+
+
+def outcome_of(
+    declared: Config, explained: Config, recording: str, progress: Progress
+) -> tuple[Outcome, tuple[dict[str, Measured], dict[str, Measured]]]:
+    """Run one holdout recording through both configs; return what they predict, and what of each is limited."""
+    runs = []
+    for what, config in (("declared", declared), ("explained", explained)):
+        progress(f"running {recording} through the {what} config")
+        runs.append(_run(with_recording(config, recording)))
+    (first, before, _, limited), (second, after, notes, limited_after) = runs
+    coasting = np.isfinite(first["coast"][:, 0])
+    outcome = Outcome(
+        name=recording,
+        unit=tracked_unit(declared.filter),
+        t=first["t"][coasting],
+        temperature=next((c["temperature_raw"][coasting] for c in (first, second) if "temperature_raw" in c), None),
+        reference=moving_average(first["t"], first["rate"], first["tau"], first["still"])[coasting],
+        before=first["coast"][coasting],
+        after=second["coast"][coasting],
+        before_sigma=first["coast_sigma"][coasting],
+        after_sigma=second["coast_sigma"][coasting],
+        summaries=(before, after),
+        remarks=tuple(notes),
+    )
+    return outcome, (limited, limited_after)
+
+
+def _run(config: Config) -> tuple[dict[str, Any], dict[str, Any], list[str], dict[str, Measured]]:
+    """Return the columns of a run, its summary, the notes on it, and the quantities that limits may be set for."""
+    journal = RunLog()
+    run = Run(config, journal)
+    columns, model = joined(run), run.model
+    alignment = journal.alignments[0]
+    overview = overview_of(columns, model, alignment)
+    limited = {
+        "noise": of_alignment(model.tracked, alignment, model.align),
+        "coast": of_coast(overview.yardsticks, overview.end - alignment.t, model.align),
+    }
+    return columns, summarise(overview, model, journal), remarks(overview, model, journal), limited
+
+
+def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """Write `prediction.h5`: what was predicted of each holdout recording, in a group named by its file's stem."""
+    import h5py
+
+    whole = io.BytesIO()  # HDF5 itself does not survive a full disk
+    with h5py.File(whole, "w") as file:
+        file.attrs["driftlab"] = __version__
+        for outcome in outcomes:
+            stem = Path(outcome.name.partition("::")[0]).stem
+            name, k = stem, 2
+            while name in file:
+                name, k = f"{stem}_{k}", k + 1
+            group = file.create_group(name)
+            group.attrs["recording"] = Path(outcome.name).name
+            group.create_dataset("t", data=outcome.t).attrs["unit"] = "s"
+            group["t"].attrs["first_row"] = outcome.summaries[0]["t"]["first_row_s"]
+            for column in PREDICTED:
+                group.create_dataset(column, data=getattr(outcome, column)).attrs["unit"] = outcome.unit.si
+    path.write_bytes(whole.getbuffer())
+
+
+def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[list[str], list[str]]:
+    """Return calibration and train under one name each: what serves as both is called alike.
+
+    Recordings are compared by their samples: parts of one file by their seconds, others by what they hold, so one that
+    was packed otherwise, cut or shifted in time is still the same.
+
+    Raises
+    ------
+    ConfigError
+        If a part has no recording, samples are in one twice, or some that teach are to judge.
+    """
+    calibration, train, holdout = (recordings[role] for role in ("calibration", "train", "holdout"))
+    contents: dict[str, Content] = {}
+
+    def check(role: str, name: str, others: Sequence[str], problem: str, same: float = np.inf) -> None:
+        for other in others:
+            if SMALL < _share(config, name, other, contents) < same:
+                raise ConfigError(f"--{role} {name}: {problem.format(other)}")
+
+    for role, names in recordings.items():
+        if not names:
+            raise ConfigError(f"--{role} is missing; name at least one recording")
+        for k, name in enumerate(names):
+            check(role, name, names[:k], "has samples in common with {}, and would count twice; name it once")
+    for name in train:
+        check(
+            "train", name, calibration,
+            "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
+            "that do not overlap",
+            SAME,
+        )  # fmt: skip
+    for name in holdout:
+        check(
+            "holdout", name, [*calibration, *train],
+            "overlaps {}, which was given for fitting, and cannot judge it; name another recording",
+        )  # fmt: skip
+    alike = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
+    return list(calibration), alike
+
+
+def _share(config: Config, name: str, other: str, contents: dict[str, Content]) -> float:
+    """Return the share of the samples of the shorter recording that is in both; 1 where one file's parts overlap."""
+    (file, start, stop), (other_file, other_start, other_stop) = _span(name), _span(other)
+    if file == other_file:
+        if (start, stop) == (other_start, other_stop):
+            return 1.0
+        return SAME / 2 if start < other_stop and other_start < stop else 0.0
+    for one in (name, other):
+        if one not in contents:
+            assert config.filter is not None
+            channel, chunks = config.filter.tracked.channel, read(with_recording(config, one), Faults())
+            contents[one] = content_of((chunk for chunk in chunks if channel in chunk.channels), channel)
+    return contents[name].share(contents[other])
+
+
+def _span(name: str) -> tuple[str, float, float]:
+    if isinstance(name, InMemoryName):
+        return name.identity()["sha256"], -np.inf, np.inf
+    path, span = part_of(name)
+    start, stop = span.get("start"), span.get("stop")
+    return sha256(path), -np.inf if start is None else start, np.inf if stop is None else stop
+
+
+def show(result: ExplainResult, given: Mapping[str, Any]) -> None:
+    """Print the verdict, the findings and their tables."""
     from rich.text import Text
 
-    from driftlab.reports.explain import tables
-
-    console = terminal()
-    console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))
-    for line in closed.lines:
+    console, closed = terminal(), result.closed
+    console.print(Text.assemble("verdict: ", (result.verdict.replace("_", " "), "bold")))
+    for line in result.lines():
         console.print(f"  {line}", soft_wrap=True)
     print_verdict(closed.content["limits_verdict"], "limits: ")
     for table in tables(closed):
         console.print()
         console.print(table)
+    configs = "explained.yaml, candidate.yaml" if closed.refuted else "explained.yaml"
+    say(f"written to {given['out']}: loop.json, {configs}, prediction.h5, report.html, and the maps\n")

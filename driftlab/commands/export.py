@@ -1,29 +1,69 @@
-"""`driftlab export`."""
+"""A calibration in the form of another program, and what it loses on the way: `driftlab export`."""
 
 from __future__ import annotations
 
+import json
+import os
+import tempfile
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import typer
+import numpy as np
 
-from driftlab.commands.common import Json, pairs, progress
-from driftlab.commands.session import print_json, say
+from driftlab import __version__
+from driftlab.commands.console import say
+from driftlab.commands.fit_map import FitMapResult
+from driftlab.commands.inputs import ConfigLike, Place, config_of, is_file
+from driftlab.config import Config, load_config, understood
+from driftlab.filtering.setup import loaded_map
+from driftlab.maps.fit import axes_of
+from driftlab.noise.innovations import SensorReadings, inflation
+from driftlab.storage.folders import check_writable
+from driftlab.storage.hdf5 import columns_of, reading, reason
+from driftlab.storage.json import plain, write_json
+from fusion_core.budget import read_whole
+from fusion_core.chunk import Array
+from fusion_core.contracts import (
+    Calibrated,
+    Effect,
+    Export,
+    Exporter,
+    FittedMap,
+    Inflation,
+    Loss,
+    MeasurementModel,
+    Sensor,
+    ThermalBias,
+    ThermalMap,
+)
+from fusion_core.data_sets import attribute
+from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, Unwritable, shown
+from fusion_core.host.config import Document, document_of, validate
+from fusion_core.host.provenance import participants
+from fusion_core.host.registry import registry
+from fusion_core.model import Flags
+from fusion_core.settings import nearest
+from fusion_core.thermal.record_texts import parse_json
+from fusion_core.units import along_axes
+
+CONFIGS = (".yaml", ".yml")
+SHOWN = {"rad/s": "deg/h", "m/s^2": "mg"}  # units in which people read those of a map's file
+LOSS = "loss.json"
+SCHEMA = 2  # of its layout
+NEEDED = ("t", "tau", "rate", "coast", "still", "used", "innovations", "x")
 
 
 def export(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="The form: see above.")],
-    map: Annotated[Path, typer.Argument(metavar="MAP|CONFIG", help="A map's file, or a config that names one.")],
-    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write; of c, the folder.")],
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")
-    ] = None,
-    run: Annotated[
-        Path | None, typer.Option("--run", metavar="DIR", help="A run's folder: noise as its innovations say.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file, and what stands beside it.")] = False,
-    json: Json = False,
-) -> None:
+    kind: str,
+    what: ConfigLike | FitMapResult,
+    out: Place,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    run: Place | None = None,
+    force: bool = False,
+) -> Loss:
     """Write a calibration in the form of another program or a vehicle.
 
     Says what is lost, measured in the target's own arithmetic; it stands in loss.json beside the file.
@@ -42,24 +82,302 @@ def export(
 
     For px4 and ardupilot, --set 'flies_from=20 degC' (and flies_to) says where the fit is to be best. `driftlab
     plugins` lists what else is installed.
+
+    Parameters
+    ----------
+    kind : str
+        The form: see above.
+    what : path of a map's file, config, or FitMapResult
+        A map's file, or a config that names one.
+        A config's maps are exported with its effects and noise.
+    out : path
+        The file to write; of c, the folder.
+        `loss.json` is written beside the file, or in the folder; it has an entry for each export there.
+    settings : mapping, optional
+        A setting of the form; may be repeated.
+        As `{"flies_from": "20 degC"}`.
+    run : path, optional
+        A run's folder: noise as its innovations say.
+    force : bool
+        Replace the file, and what stands beside it.
+
+    Returns
+    -------
+    Loss
+        `lines()` says what is lost, `sensors` has it in numbers, measured in the target's own arithmetic.
+
+    Raises
+    ------
+    ConfigError, MapError
+        If the target could not use it, a setting is wrong, or a file is in the way.
+    Unwritable
+        If the disk is full, or the like.
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
-    from json import loads
+    exporter = exporter_of(kind, {name: str(value) for name, value in (settings or {}).items()})
+    file = Path(what) if is_file(what) else None  # type: ignore[arg-type]
+    calibration = _export_of(what) if file is None else read_export(file)
+    if run is not None:
+        calibration = with_inflation(calibration, Path(run))
+    return _write(exporter, calibration, Path(out), force, [] if file is None else [file])
 
-    from driftlab.jobs.export import LOSS, export, exporter_of, key_of, read_export
 
-    exporter = exporter_of(kind, pairs("--set", settings, "KEY=VALUE", "'step=0.5 K'"))
-    with progress("exporting"):
-        what = read_export(map)
-        if run is not None:
-            from driftlab.jobs.inflation import with_inflation
+def installed(base: type, kind: str, option: str) -> Any:
+    """Return the installed class of a kind; raises ConfigError, which names the option, with a near one."""
+    classes = registry().classes(base)
+    if kind not in classes:
+        hint = nearest(kind, classes)
+        raise ConfigError(f"{option} {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
+    return classes[kind]
 
-            what = with_inflation(what, run)
-        loss = export(exporter, what, out, force=force, read=[map])
-    beside = (out if exporter.folder else out.parent) / LOSS
-    if json:
-        own = loads(beside.read_text(encoding="utf-8"))["exports"][key_of(out)]
-        print_json(own)
-        return
-    for line in loss.lines():
+
+def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
+    """Return the exporter of a kind with settings as a user writes them; raises ConfigError."""
+    document = Document(Path("--set"), {"kind": kind, **settings})
+    return validate(installed(Exporter, kind, "export"), document)  # type: ignore[no-any-return]
+
+
+def read_export(path: Path) -> Export:
+    """Return the calibration of a unit that a map's file or a config has.
+
+    Raises
+    ------
+    MapError, ConfigError
+        If no kind of map can read it, or the config has no filter.
+    """
+    return of_config(load_config(path)) if path.suffix in CONFIGS else of_map(read_map(path))
+
+
+def _export_of(what: ConfigLike | FitMapResult) -> Export:
+    return of_map(what.map) if isinstance(what, FitMapResult) else of_config(config_of(what))
+
+
+def of_map(fitted: FittedMap) -> Export:
+    """Return the calibration that a map has."""
+    record = fitted.record
+    shown = SHOWN.get(record.unit, record.unit)
+    return Export((Calibrated(record.channel, record.unit, shown, axes_of(fitted), fitted),))
+
+
+def of_config(config: Config) -> Export:
+    """Return the calibration of a config's sensors.
+
+    Raises
+    ------
+    ConfigError
+        If it has no filter.
+    MapError
+        If a map cannot be read, or is of another sensor than the one that it is named for.
+    """
+    if config.filter is None:
+        raise ConfigError(f"{config.name or 'config'}: has no filter section, and so no sensor; add one")
+    interval = getattr(config.source, "interval", None)
+    sensors = tuple(_calibrated(sensor) for sensor in config.filter.sensors)
+    return Export(sensors, None if interval is None else 1 / float(interval), config.serial or "")
+
+
+def _calibrated(sensor: Sensor) -> Calibrated:
+    bias, settings = sensor.bias, sensor.calibration
+    effects: tuple[Effect, ...] = ()
+    walk = (bias.as_random_walk() or {}).get("walk")
+    if isinstance(bias, ThermalBias):
+        settings, effects, walk = bias.map or settings, bias.effects, bias.walk
+    return Calibrated(
+        sensor.channel,
+        sensor.unit,
+        sensor.shown,
+        sensor.axes,
+        None if settings is None else loaded_map(settings, sensor),
+        effects,
+        sensor.noise,
+        None if walk is None else along_axes(walk, len(sensor.axes)),
+    )
+
+
+def read_map(path: Path) -> FittedMap:
+    """Read the map of a file, of whatever installed kind it is; raises MapError where none can read it."""
+    if not path.is_file():
+        raise MapError(f"map file {path} does not exist; fit it with `driftlab fit-map`")
+    why = []
+    for kind, cls in registry().classes(ThermalMap).items():
+        settings: Any = cls.model_validate({"kind": kind, "path": str(path.absolute())})
+        try:
+            return settings.load()  # type: ignore[no-any-return]
+        except FusionError as error:
+            if settings.suffix == path.suffix:
+                why.append(str(error).partition(";")[0])
+    reasons = f" ({', '.join(why)})" if why else ""
+    raise MapError(f"{path}: is a map of no installed kind{reasons}; name one that `driftlab fit-map` wrote")
+
+
+def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Collection[Path]) -> Loss:
+    """Write a calibration to `path`, whole or not at all, and its losses to `loss.json` beside it (in the folder)."""
+    _check(path, exporter.folder, force, read)
+    folder = path if exporter.folder else path.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
+        with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=folder) as temporary:
+            written = Path(temporary) / key_of(path)
+            if exporter.folder:
+                written.mkdir()
+            loss = exporter.export(what, written)
+            files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
+            if not files:
+                raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
+            for file in files:
+                _check(folder / file.name, False, force, read)
+            write_json(Path(temporary) / LOSS, _content(exporter, loss, path, _exports(folder / LOSS, path, force)))
+            for file in [*files, Path(temporary) / LOSS]:
+                os.replace(file, folder / file.name)
+    except OSError as error:
+        raise Unwritable(
+            f"--out {path}: cannot be written ({reason(error)}); make room, or name another file"
+        ) from None
+    return loss
+
+
+def key_of(path: Path) -> str:
+    """Return the name of an export in its `loss.json`; of `.` too."""
+    return Path(os.path.abspath(path)).name
+
+
+def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> None:
+    """Raise ConfigError where a file (or folder) is not to be written."""
+    if any(os.path.realpath(path) == os.path.realpath(other) for other in read):
+        raise ConfigError(f"--out {path}: is read here, and would be lost; name another file")
+    if folder:
+        if path.exists() and not path.is_dir():
+            raise ConfigError(f"--out {path}: is a file, a folder is written; name another")
+    elif path.is_dir() or (path.exists() and not force):
+        raise ConfigError(f"--out {path}: exists; name another file, or give --force to replace it")
+
+
+def _exports(beside: Path, path: Path, force: bool) -> dict[str, Any]:
+    """Return the exports in the `loss.json` that is there; raises ConfigError where it is somebody else's."""
+    try:
+        content = json.loads(read_whole(beside))
+        if content["schema"] == SCHEMA and isinstance(content["exports"], dict):
+            return dict(content["exports"])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    if not force:
+        raise ConfigError(
+            f"--out {path}: {beside} exists and is not of earlier exports; name another folder, or give --force to "
+            "replace it"
+        )
+    return {}
+
+
+def _content(exporter: Exporter, loss: Loss, path: Path, known: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of `loss.json`: the other exports that it has, and this one."""
+    entry = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
+    return {"schema": SCHEMA, "exports": {**known, key_of(path): entry}}
+
+
+def inflations(folder: Path) -> dict[str, dict[str, Inflation]]:
+    """Return by channel the inflation of noise that the innovations of a run's folder show, where walk is declared.
+
+    `compensated` is about readings less what map and effects say of their bias, `raw` about readings as they are; one
+    is missing where the run does not show it.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is none of a run.
+    UnreadableFile, SingularFit
+        If its files are damaged, or too little of it was at rest.
+    """
+    path = folder / "estimates.h5"
+    if not path.is_file():
+        raise ConfigError(f"run {folder}: has no estimates.h5; name the folder that `driftlab run --out` wrote")
+    with reading(path) as file:
+        if missing := [name for name in NEEDED if name not in file]:
+            raise UnreadableFile(f"{path}: has no {', '.join(missing)}; write it anew with `driftlab run`")
+        columns = {name: rows[: len(rows.node)] for name, rows in columns_of(path, file, NEEDED).items()}
+        text = str(attribute(path, file, "config"))
+    document = document_of(text)
+    document.data.pop("source", None)  # which may have been in memory
+    model = understood(document).filter
+    assert model is not None, "a run has a filter"
+    fresh = _fresh(folder, columns["t"])
+    ratios: dict[str, dict[str, Inflation]] = {}
+    for sensor in model.sensors:
+        walk = getattr(sensor.bias, "walk", None)
+        if walk is None:
+            continue
+        series = _series(model, sensor, columns)
+        noise, density = sensor.noise, along_axes(walk, len(sensor.axes))
+        ratios[sensor.channel] = {
+            name: _inflation(columns, values, fresh, noise, density) for name, values in series.items()
+        }
+    return ratios
+
+
+def _fresh(folder: Path, t: Array) -> Flags:
+    """Return the epochs (N,) at which a prediction starts anew: after each further alignment."""
+    fresh = np.zeros(len(t), dtype=bool)
+    path = folder / "summary.json"
+    if path.is_file():
+        try:
+            summary: dict[str, Any] = parse_json(read_whole(path))
+            moments = np.asarray(summary.get("aligned_again_s", []), dtype=np.float64)
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise UnreadableFile(
+                f"{path}: is damaged ({shown(error, 120)}); write it anew with `driftlab run`"
+            ) from None
+        again = np.searchsorted(t, moments.ravel(), side="right")
+        fresh[again[again < len(t)]] = True
+    return fresh
+
+
+def _inflation(columns: dict[str, Array], d: Array, fresh: Flags, noise: Array, walk: Array) -> Inflation:
+    still = columns["still"].astype(bool)
+    readings = SensorReadings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
+    return inflation(readings, noise, walk)
+
+
+def _series(model: MeasurementModel, sensor: Sensor, columns: dict[str, Array]) -> dict[str, Array]:
+    """Return the readings (N, d) of a sensor: raw, and less what map and effects say of its bias."""
+    if sensor.channel == model.tracked.channel:
+        return {"raw": columns["rate"], "compensated": columns["rate"] - columns["coast"]}
+    if sensor.bias.as_random_walk() is None:
+        return {}
+    rows = [k for k, (channel, _, unit) in enumerate(model.components) if channel == sensor.channel]
+    bias = columns["x"][:-1, model.places[sensor.channel]]
+    # what an update measures is the integral of the reading less the bias before it, and it is to be zero
+    after = bias - columns["innovations"][1:, rows] / columns["tau"][1:, None]
+    d = np.concatenate([np.full((1, len(rows)), np.nan), after])
+    return {"compensated": d} if sensor.calibration is not None else {"raw": d, "compensated": d}
+
+
+def with_inflation(what: Export, folder: Path) -> Export:
+    """Return the same with what the run in a folder says of each sensor; raises as `inflations`."""
+    ratios = inflations(folder)
+    if unknown := [channel for channel in ratios if what.sensor(channel) is None]:
+        raise ConfigError(f"run {folder}: is of {', '.join(unknown)}, which the config has not; name a run of its own")
+    of_sensors = [ratios.get(sensor.channel, {}) for sensor in what.sensors]
+    sensors = [
+        replace(sensor, compensated=ratio.get("compensated"), raw=ratio.get("raw"))
+        for sensor, ratio in zip(what.sensors, of_sensors, strict=True)
+    ]
+    return replace(what, sensors=tuple(sensors))
+
+
+def content_of(result: Loss, given: Mapping[str, Any]) -> Any:
+    """Return the entry of `loss.json`."""
+    return json.loads(_beside(given).read_text(encoding="utf-8"))["exports"][key_of(given["out"])]
+
+
+def show(result: Loss, given: Mapping[str, Any]) -> None:
+    """Print what is lost."""
+    for line in result.lines():
         say(f"{line}\n")
-    say(f"written to {out}, {beside}\n")
+    say(f"written to {given['out']}, {_beside(given)}\n")
+
+
+def _beside(given: Mapping[str, Any]) -> Path:
+    folder = registry().classes(Exporter)[given["kind"]].folder  # type: ignore[attr-defined]
+    out: Path = given["out"]
+    return (out if folder else out.parent) / LOSS

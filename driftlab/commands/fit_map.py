@@ -1,161 +1,379 @@
-"""`driftlab fit-map`."""
+"""A thermal map fitted on recordings at rest: `driftlab fit-map`."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
-import typer
+import numpy as np
 
-from driftlab.commands.common import (
-    Channel,
-    ConfigFile,
-    EnforceLimits,
-    Json,
-    check_limits,
-    leave_by_limits,
-    print_verdict,
-    progress,
-    terminal,
-)
-from driftlab.commands.session import load, print_json, say
+from driftlab.commands.console import print_verdict, say, terminal
+from driftlab.commands.family_map import FamilyMapResult, fit_family_map, show_family_map
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_of, recordings_of
+from driftlab.commands.result import Result
+from driftlab.config import Config, paths_of
+from driftlab.evaluation.limits import check_limits
+from driftlab.evaluation.limits import verdict as verdict_line
+from driftlab.evaluation.measurements import of_map
+from driftlab.maps.assessment import MapVerdict, judge
+from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.kind_selection import KindComparison, candidates, divide
+from driftlab.maps.kind_selection import compare as compare_kinds
+from driftlab.maps.network_size import Selection, check_selection, settings_selected
+from driftlab.reports import map_selection
+from driftlab.reports.charts import Chart
+from driftlab.reports.figures import svg
+from driftlab.reports.map import chart, page_of
+from driftlab.reports.provenance import map_facts, sheet_of
+from driftlab.soak.blocks import GrowingBlocks
+from driftlab.storage.json import plain, write_json
+from driftlab.storage.map_file import check_page, check_place, check_report, save, write_page
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.chunk import Array
+from fusion_core.contracts import ThermalMap
+from fusion_core.errors import ConfigError, Unwritable
+from fusion_core.faults import Faults
+from fusion_core.host.provenance import participants
+from fusion_core.host.registry import registry
 
 if TYPE_CHECKING:
-    from driftlab.jobs.fit_map import FitMapResult
-    from driftlab.maps.kind_selection import KindComparison
-    from driftlab.maps.network_size import Selection
-    from driftlab.units import BiasUnit
+    pass
+
+F = TypeVar("F")
+MAX_BLOCKS = 4096  # of all recordings, where kinds are compared
 
 
-Select = Annotated[
-    bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
-]
-NeuronsMax = Annotated[
-    int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
-]
-Compare = Annotated[
-    bool, typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits.")
-]
+class FitMapResult(Result):
+    """A fitted map, as arrays over its domain: `temperature` (N,), `bias`, `slope` and `sigma` (N, d).
 
-Kind = Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's; else spline.")]
-Out = Annotated[
-    Path | None, typer.Option("--out", metavar="MAP", help="Its file, instead of the config's; else CONFIG.map.json.")
-]
-Report = Annotated[
-    Path | None,
-    typer.Option(
-        "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
-    ),
-]
+    Attributes
+    ----------
+    map : FittedMap
+        The map itself: `map.bias(T)`, `map.slope(T)`, `map.sigma(T)` at any temperatures.
+    verdict : MapVerdict
+        How good it is: sigma, misfits, what differs between up and down, coverage.
+    selection : Selection or None
+        How its size was chosen, if it was.
+    comparison : KindComparison or None
+        How its kind was chosen, if it was.
+    limits : list of LimitResult
+        The config's limits, held against the map.
+    sensor, unit : Sensor or None, BiasUnit
+        Whose map it is, and in which unit it is shown.
+    written : tuple of Path
+        The files that were written.
+    """
 
+    def __init__(
+        self,
+        config: Config,
+        recordings: Sequence[str],
+        verdict: MapVerdict,
+        faults: Faults,
+        selection: Selection | None = None,
+        comparison: KindComparison | None = None,
+    ) -> None:
+        self.config, self.recordings, model = config, list(recordings) or None, config.filter
+        fitted, self.comparison = verdict.map, comparison
+        self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
+        self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
+        self.limits = check_limits(config.limits, of_map(fitted, self.unit))
+        self.limits_verdict = verdict_line(self.limits)
+        self.written: tuple[Path, ...] = ()
+        record, T = fitted.record, np.linspace(*fitted.domain, 400)
+        self.name = f"map {record.kind} of the {record.channel}"
+        self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
+        self.units = {"temperature": "degC", "bias": record.unit, "slope": f"{record.unit}/K", "sigma": record.unit}
+        self.labels = dict.fromkeys(("bias", "slope", "sigma"), axes_of(fitted))
+        self.summary = record.model_dump(mode="json") | {
+            "verdict": verdict.sentences(self.unit),
+            "judged": plain(verdict.as_json()),
+            "serial": config.serial,
+            "limits": plain([row.as_json(self.unit) for row in self.limits]),
+        }
+        if selection is not None:
+            self.summary["selection"] = plain(map_selection.selection_document(selection, self.unit))
+        if comparison is not None:
+            self.summary["compare"] = plain(map_selection.comparison_document(comparison, self.unit))
 
-Input = Annotated[
-    list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
-]
-FamilyFile = Annotated[
-    Path | None,
-    typer.Option("--family", metavar="FAMILY.json", help="Of a fleet: then a part of the range is soak enough."),
-]
-Lot = Annotated[str | None, typer.Option("--lot", help="Of the unit, where --family knows lots.")]
+    def lines(self) -> list[str]:
+        """Return the verdict on the map, and the notes on its recordings, a sentence each."""
+        return [*self.verdict.sentences(self.unit), *self.faults.lines()]
+
+    def _chart(self) -> Chart:
+        """Return samples and curve over temperature, the residuals, how sure it is and on how many samples."""
+        return chart(self.verdict, self.unit)
+
+    def save(self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None) -> None:
+        """Write the map to the file `out`, and its page; where its size was chosen, `select.json` and `select.svg` too.
+
+        Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
+        """
+        path, folder = Path(out), None if report is None else Path(report)
+        _check(path, folder, [], selected=self.selection is not None)
+        self.write(path, folder)
+
+    def write(self, path: Path, report: Path | None) -> None:
+        """Write the files where nothing is in the way."""
+        save(self.map, path)
+        page = _page(path, report)
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison))
+        more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
+        self.written = (path, page, *more)
 
 
 def fit_map(
-    config: ConfigFile,
-    input: Input = None,
-    kind: Kind = None,
-    out: Out = None,
-    select: Select = False,
-    neurons_max: NeuronsMax = 10,
-    compare: Compare = False,
-    channel: Channel = None,
-    report: Report = None,
-    family: FamilyFile = None,
-    lot: Lot = None,
-    enforce_limits: EnforceLimits = False,
-    json: Json = False,
-) -> None:
+    config: ConfigLike,
+    data: DataLike = None,
+    *,
+    units: Units | None = None,
+    kind: str | None = None,
+    out: Place | None = None,
+    neurons: range | None = None,
+    compare: bool = False,
+    channel: str | None = None,
+    report: Place | None = None,
+    family: Place | None = None,
+    lot: str | None = None,
+    progress: Progress | None = None,
+) -> FitMapResult | FamilyMapResult:
     """Fit a thermal map on a soak at rest, and say how good it is.
 
     Writes the map's file, and a page beside it.
+
+    Parameters
+    ----------
+    config : as that of `run`
+        Its source says how recordings are read; where no data are given, it is the recording.
+    data : as that of `run`, or a list of them
+        A recording; may be repeated.
+        The soak. Earth rate is removed.
+    units : as that of `run`
+    kind : str, optional
+        Kind of map, instead of the config's; else spline.
+    out : path, optional
+        Its file, instead of the config's; else CONFIG.map.json.
+        A program writes nothing where it is left out, also if the config names a path.
+    neurons : range, optional
+        Sizes of a network to choose from first, as `--select`.
+    compare : bool
+        Choose among all installed kinds first, by what is left out of their fits.
+    channel : str, optional
+        Sensor whose bias it is about, e.g. accel; default: the config's.
+    report : path, optional
+        Folder for report.html and what --select shows; default: beside the map.
+        It needs `out`.
+    family : path, optional
+        Of a fleet: then a part of the range is soak enough.
+        Its `family.json`.
+    lot : str, optional
+        Of the unit, where --family knows lots.
+    progress : callable, optional
+        Called with the recording's time in s and the number of samples so far, then with texts.
+
+    Returns
+    -------
+    FitMapResult
+        `temperature` (N,), `bias`, `slope`, `sigma` (N, d) over the map's domain; `map` is the map itself.
+    FamilyMapResult
+        With `family`: `temperature` (N,), `bias`, `sigma`, `own_bias`, `own_sigma` (N, d) over the family's domain.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If a recording cannot be used, its temperature moves too little, or the config names no map.
+    MapError
+        If the family is of another sensor.
+    Unwritable
+        Before anything is read, if the files cannot be written.
     """
-    from driftlab.jobs.fit_map import fit_map_to_file as job
-    from driftlab.jobs.fit_map import with_family
+    understood = config_of(config).tracking(channel)
+    recordings = [] if data is None else recordings_of(data, units, "data")
+    place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
+    if with_family(known, lot, more=bool(kind or neurons or compare or report)):
+        return fit_family_map(understood, recordings, known, lot or "", place, progress)
+    if compare:
+        _check_comparison(kind, neurons)
+    if place is not None:
+        read = [*understood.files_to_fit(), *paths_of(recordings)]
+        _check(place, folder, read, selected=neurons is not None)
+    result = _fitted(understood, recordings, kind, neurons, compare, progress)
+    if place is not None:
+        result.write(place, folder)
+    return result
 
-    if with_family(family, lot, more=select or compare or enforce_limits or bool(kind or report)):
-        _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
+
+def _fitted(
+    config: Config,
+    recordings: Sequence[str],
+    kind: str | None,
+    neurons: range | None,
+    compare: bool,
+    progress: Progress | None,
+) -> FitMapResult:
+    faults, selection, comparison, more = Faults(), None, None, {}
+    if not compare:
+        if kind is None and not config.tracked_maps():
+            kind = USUAL
+            faults.note(f"kind of map: {kind}, since the config names none; --compare tells which kind predicts best")
+        settings = map_settings(config, kind)
+    if neurons is not None:
+        check_selection(settings, neurons)
+    soak = gather(config, recordings, faults, progress)
+    if compare:
+        settings, comparison, tried = _compared(config, soak, progress)
+        more = {"comparison": tried}
+    elif neurons is not None:
+        settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
+        more = {"selection": tried}
+    fitted = fit_gathered(config, settings, soak, more)
+    verdict = judge(fitted, settings, soak.brief(), axes_of(fitted), soak.placements, soak.used)
+    return FitMapResult(config, recordings, verdict, faults, selection, comparison)
+
+
+def _check_comparison(kind: str | None, neurons: range | None) -> None:
+    """Raise ConfigError where one kind, or the size of one, is asked for beside a comparison of all."""
+    for option, value in (("--kind", kind), ("--select", neurons)):
+        if value is not None:
+            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
+
+
+def _compared(config: Config, soak: GatheredSoak, progress: Progress | None) -> tuple[ThermalMap, KindComparison, str]:
+    """Return the settings that the samples ask for among all installed kinds, the comparison, and a map's note on it.
+
+    Raises
+    ------
+    ConfigError
+        If no kind can be fitted.
+    """
+    T, bias = _blocks(soak)
+
+    def report(done: int, count: int) -> None:
+        if progress is not None:
+            progress(f"{done} of {count} maps fitted")
+
+    tried = candidates(config.tracked_maps(), registry().classes(ThermalMap).values())
+    comparison = compare_kinds(tried, np.concatenate(T), np.concatenate(bias), divide(T), report)
+    settings = comparison.chosen.settings
+    assert settings is not None
+    return settings, comparison, f"{comparison.chosen.name}, of {len(tried)} kinds and sizes"
+
+
+def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
+    """Return T (K_r,) and bias (K_r, d) of each recording's blocks, all of the same number of samples."""
+    n = 1
+    while len(soak.T) > n * MAX_BLOCKS:
+        n *= 2
+    T, bias = [], []
+    for start, stop in zip(soak.starts, [*soak.starts[1:], len(soak.T)], strict=True):
+        growing = GrowingBlocks(most=stop - start + 1, n=n)
+        growing.add(np.arange(start, stop, dtype=np.float64), soak.T[start:stop], soak.bias[start:stop])
+        means = growing.blocks()
+        T.append(means.T)
+        bias.append(means.bias)
+    return T, bias
+
+
+def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
+    check_place(path, read)
+    check_page(_page(path, report))
+    if selected:
+        check_report(_stem(path, report))
+
+
+def _page(path: Path, report: Path | None) -> Path:
+    """Return the place of the page: in the folder, or beside the map under its name."""
+    return path.with_name(f"{path.stem}.report.html") if report is None else report / "report.html"
+
+
+def _stem(path: Path, report: Path | None) -> Path:
+    """Return the name of the selection's files without its ending: in the folder, or beside the map under its name."""
+    return path.with_name(f"{path.stem}.select") if report is None else report / "select"
+
+
+def _write_selection(choice: Selection, unit: BiasUnit, stem: Path) -> list[Path]:
+    """Write select.json and select.svg."""
+    names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
+    try:
+        write_json(names[0], map_selection.selection_document(choice, unit))
+        names[1].write_text(svg(map_selection.figure(choice, unit)), encoding="utf-8")
+    except OSError as error:
+        raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
+    return names
+
+
+def with_family(family: F | None, lot: str | None, *, more: bool) -> TypeGuard[F]:
+    """Tell whether a family is asked for; raises ConfigError where something else is that it does not give."""
+    if family is None and lot is not None:
+        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
+    if family is not None and more:
+        raise ConfigError(
+            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
+            "--report out"
+        )
+    return family is not None
+
+
+def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Say which sizes are tried, and where the map is written: where the config says, or beside the config."""
+    config, kind, compare = arguments["config"], arguments.get("kind"), arguments["compare"]
+    more = any((kind, arguments.get("report"), compare, options["select"], options["enforce_limits"]))
+    out = arguments.get("out")
+    if not with_family(arguments.get("family"), arguments.get("lot"), more=more):
+        if options["select"]:
+            arguments["neurons"] = range(1, options["neurons_max"] + 1)
+        if compare:
+            _check_comparison(kind, arguments.get("neurons"))
+        named = config.tracked_maps() if compare or kind is None else [map_settings(config, kind)]
+        out = out or next((settings.path for settings in named), None)
+        if out is None and _names_a_path(config):
+            raise ConfigError(
+                "--out is missing, and the config names no path for a map of this kind; give one of the two"
+            )
+    usual = ".".join(filter(None, (config.file.stem, arguments.get("channel"), "map.json")))
+    return {**arguments, "out": out or config.file.with_name(usual)}
+
+
+def _names_a_path(config: Config) -> bool:
+    return any(settings.path for settings in config.tracked_maps())
+
+
+def show(result: FitMapResult | FamilyMapResult, given: Mapping[str, Any]) -> None:
+    """Print the choice of size or kind, the map, and where it was written."""
+    if isinstance(result, FamilyMapResult):
+        show_family_map(result)
         return
-    sizes = range(1, neurons_max + 1) if select else None
-    loaded = load(config, channel=channel)
-    check_limits(loaded, enforce_limits)
-    named = any(settings.path for settings in loaded.tracked_maps())
-    out = out if out or named else config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
-    with progress("fitting") as show:
-        how: dict[str, Any] = {"kind": kind, "neurons": sizes, "compare": compare, "report": report}
-        fitted = job(loaded, input or [], out, progress=show, read=[config], **how)
-    if json:
-        print_json(fitted.summary)
-    else:
-        _print(fitted, config, line=not named and not compare)
-    leave_by_limits(fitted.kept, enforce_limits)
+    if result.selection is not None:
+        _print_selection(result.selection, result.unit)
+    if result.comparison is not None:
+        _print_comparison(result.comparison, result)
+    _print_map(result)
+    say(f"written to {', '.join(map(str, result.written))}\n")
+    if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
+        path = os.path.relpath(result.written[0], given["config"].file.parent)
+        line = f"{{kind: {result.map.record.kind}, path: {path}}}"
+        say(f"in the config: {result.sensor.section}.calibration: {line}\n")
 
 
-def _print(fitted: FitMapResult, config: Path, *, line: bool) -> None:
-    if fitted.selection is not None:
-        _print_selection(fitted.selection, fitted.unit)
-    if fitted.comparison is not None:
-        _print_comparison(fitted.comparison, fitted)
-    _print_map(fitted)
-    say(f"written to {', '.join(map(str, fitted.written))}\n")
-    if line:
-        _print_line(fitted, config)
-
-
-def _fit_with_family(
-    config: Path, recordings: list[str], family: Path, lot: str, out: Path | None, channel: str | None, *, as_json: bool
-) -> None:
-
-    from driftlab.jobs.family_map import fit_family_map
-
-    loaded = load(config, channel=channel)
-    out = out or config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
-    with progress("fitting") as show:
-        found = fit_family_map(loaded, recordings, family, lot=lot, out=out, progress=show, read=[config])
-    if as_json:
-        print_json(found.summary)
-        return
-    for line in found.sentences():
-        say(f"{line}\n")
-    terminal().print(found.table())
-    for line in found.faults.lines():
-        say(f"note: {line}\n")
-    say(f"written to {out}\n")
-
-
-def _print_line(fitted: FitMapResult, config: Path) -> None:
-    """Print what puts the map into a config that names none."""
-    if fitted.sensor is not None:
-        line = f"{{kind: {fitted.map.record.kind}, path: {os.path.relpath(fitted.written[0], config.parent)}}}"
-        say(f"in the config: {fitted.sensor.section}.calibration: {line}\n")
-
-
-def _print_selection(found: Selection, unit: BiasUnit) -> None:
-    from driftlab.reports.map_selection import comparison, selection_table
-
+def _print_selection(choice: Selection, unit: BiasUnit) -> None:
     console = terminal()
-    console.print(selection_table(found, unit))
-    for line in comparison(found, unit):
+    console.print(map_selection.selection_table(choice, unit))
+    for line in map_selection.comparison(choice, unit):
         console.print(line, soft_wrap=True)
 
 
-def _print_comparison(found: KindComparison, fitted: FitMapResult) -> None:
-    from driftlab.reports.map_selection import comparison_table, config_line, failures, verdict
-
+def _print_comparison(choice: KindComparison, fitted: FitMapResult) -> None:
     axes, console = fitted.verdict.axes, terminal()
-    console.print(comparison_table(found, fitted.unit, axes))
-    for line in (*verdict(found, fitted.unit, axes), *failures(found)):
+    console.print(map_selection.comparison_table(choice, fitted.unit, axes))
+    for line in (*map_selection.verdict(choice, fitted.unit, axes), *map_selection.failures(choice)):
         console.print(line, soft_wrap=True)
-    say(f"in the config: {config_line(found, fitted.written[0])}\n\n")
+    say(f"in the config: {map_selection.config_line(choice, fitted.written[0])}\n\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:
@@ -170,7 +388,7 @@ def _print_map(fitted: FitMapResult) -> None:
         say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
     for line in fitted.verdict.sentences(fitted.unit):
         say(f"{line}\n")
-    print_verdict(fitted.kept, "limits: ")
+    print_verdict(fitted.limits_verdict, "limits: ")
     for row in fitted.limits:
         say(f"  {row.line(fitted.unit)}\n")
     for line in fitted.faults.lines():

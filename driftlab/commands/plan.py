@@ -1,102 +1,336 @@
-"""`driftlab plan`."""
+"""The chamber profile that tells most, before anything is recorded or after it: `driftlab plan`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+import numpy as np
 
-from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
-from driftlab.commands.session import load, print_json, say
+from driftlab.commands.console import say, terminal
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, config_of, recordings_of
+from driftlab.commands.result import Result, in_folder
+from driftlab.config import Config, paths_of
+from driftlab.family.file import load_family
+from driftlab.identification.candidates import check_kinds
+from driftlab.planning.chamber import Profile
+from driftlab.planning.continuation import Continuation, of_samples, read_parts
+from driftlab.planning.continuation import after as after_recordings
+from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
+from driftlab.planning.discrimination import DiscriminationCriterion, preferred
+from driftlab.planning.request import parse_request
+from driftlab.planning.search import SearchResult, search
+from driftlab.planning.short_soak import ShortSoakPlan, shortened
+from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
+from driftlab.planning.unit_model import fitted_map, twin_of
+from driftlab.reports import plan as plan_profile
+from driftlab.reports import plan_continuation, plan_effects, plan_short_soak
+from driftlab.reports.charts import Chart
+from driftlab.storage.folders import FILES
+from driftlab.storage.json import plain, write_json
+from driftlab.units import tracked_unit
+from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
+from fusion_core.faults import Faults
 
 if TYPE_CHECKING:
-    from driftlab.jobs.plan import PlanResult
-    from driftlab.jobs.plan_after import AfterResult
-    from driftlab.jobs.plan_family import PlanFamilyResult
+    from rich.table import Table
 
 
-def _option(name: str, metavar: str, text: str) -> Any:
-    return typer.Option(name, metavar=metavar, help=text)
+@dataclass(frozen=True)
+class _Presentation:
+    """A plan in words, as a table, a chart and a page."""
+
+    headline: str
+    lines: list[str]
+    document: dict[str, Any]
+    table: Callable[[], Table]
+    chart: Callable[[], Chart]
+    write_page: Callable[[Path, str], None]
 
 
-Hours = Annotated[float, _option("--hours", "H", "How long the chamber may take.")]
-Range = Annotated[str | None, _option("--range", "LOW..HIGH", "E.g. '-20..50 degC'; default: the config's.")]
-Rate = Annotated[str | None, _option("--rate", "RATE", "Fastest that the chamber can; default: 2 K/min.")]
-Lag = Annotated[str | None, _option("--lag", "TIME", "Of the unit behind the chamber; default: 10 min.")]
-Start = Annotated[str | None, _option("--start", "TEMPERATURE", "Where it begins; default: 25 degC.")]
-Walk = Annotated[str | None, _option("--walk", "WALK", "Of the unit's bias; default: the config's.")]
-Sigma = Annotated[str | None, _option("--sigma", "SIGMA", "Aim, e.g. '3 deg/h': says the shortest hours.")]
-Kind = Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")]
-Effects = Annotated[str | None, _option("--effects", "KIND,...", "Effects that the profile is to tell apart.")]
-Recorded = Annotated[
-    list[str] | None, _option("--after", "PATH[::START:STOP]", "What was recorded already; may be repeated.")
-]
-FamilyFile = Annotated[Path | None, _option("--family", "FAMILY.json", "Of a fleet: says how short a soak may be.")]
-Out = Annotated[Path | None, _option("--out", "DIR", "Folder for set points and report.")]
+class PlanResult(Result):
+    """A plan: `time` and `set_point` (M,) of the chosen profile, `temperature` (G,) and `sigma` (G, d) of its map.
+
+    After recordings `sigma` is of the map so far, NaN where nothing was seen, and `sigma_after` (G, d) with the further
+    profile. With a family, `without_family` (G, d) is the error of the best map without it after the same soak.
+
+    Attributes
+    ----------
+    found : SearchResult, Continuation or ShortSoakPlan
+        Every profile that was judged, and the chosen one.
+    outlook : DetectabilityReport or None
+        What the chosen profile would say of effects; None with a family.
+    seen : tuple of EffectEstimate
+        How large effects are in what was recorded.
+    headline : str
+        What to record, and what comes of it.
+    """
+
+    command = "plan"
+
+    def __init__(
+        self,
+        name: str,
+        rated: SearchResult | Continuation | ShortSoakPlan,
+        sigmas: Mapping[str, Array],
+        axes: Sequence[str],
+        si: str,
+        presentation: _Presentation,
+        read: Collection[Path],
+        outlook: DetectabilityReport | None = None,
+        seen: tuple[EffectEstimate, ...] = (),
+    ) -> None:
+        self.name, self.found, self.outlook, self.seen = name, rated, outlook, seen
+        self._presentation, self._read = presentation, read
+        self.headline = presentation.headline
+        profile: Profile = rated.chosen.profile
+        self._columns = {
+            "time": profile.time, "set_point": profile.temperature, "temperature": rated.chosen.temperature, **sigmas,
+        }  # fmt: skip
+        self.units = {"time": "s", "set_point": "degC", "temperature": "degC", **dict.fromkeys(sigmas, si)}
+        self.labels = dict.fromkeys(sigmas, tuple(axes))
+        self.summary = plain(presentation.document)
+
+    def lines(self) -> list[str]:
+        """Return why this profile, what is known so far, and on what the plan stands, a sentence each."""
+        return self._presentation.lines
+
+    def table(self) -> Table:
+        """Return the profiles for a terminal, the chosen one first."""
+        return self._presentation.table()
+
+    def _chart(self) -> Chart:
+        """Return the sigma that is expected over temperature; with a family, over the length of the soak."""
+        return self._presentation.chart()
+
+    def _write(self, folder: Path) -> None:
+        mark, setpoints, report = (folder / name for name in FILES["plan"])
+        plan_profile.write_profile(setpoints, self.found.chosen.profile)
+        self._presentation.write_page(report, self.name[0].upper() + self.name[1:])
+        write_json(mark, self.summary)
 
 
 def plan(
-    config: ConfigFile,
-    hours: Hours = 8.0,
-    range_: Range = None,
-    rate: Rate = None,
-    lag: Lag = None,
-    start: Start = None,
-    walk: Walk = None,
-    sigma: Sigma = None,
-    kind: Kind = None,
-    effects: Effects = None,
-    channel: Channel = None,
-    after: Recorded = None,
-    family: FamilyFile = None,
-    out: Out = None,
-    json: Json = False,
-) -> None:
-    """Find the chamber profile that tells most, or the shortest."""
-    from driftlab.jobs.plan import plan as job
-    from driftlab.jobs.plan_after import plan_further
-    from driftlab.jobs.plan_family import plan_with_family
-    from driftlab.storage.folders import FILES
+    config: ConfigLike,
+    hours: float = 8.0,
+    *,
+    range: str | tuple[float, float] | None = None,
+    rate: str | None = None,
+    lag: str | None = None,
+    start: str | None = None,
+    walk: str | None = None,
+    sigma: str | None = None,
+    kind: str | None = None,
+    effects: Sequence[str] = (),
+    channel: str | None = None,
+    after: DataLike = None,
+    family: Place | None = None,
+    out: Place | None = None,
+    progress: Progress | None = None,
+) -> PlanResult:
+    """Find the chamber profile that tells most, or the shortest.
 
-    given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
-    given |= {"kind": kind, "effects": [] if effects is None else [name.strip() for name in effects.split(",")]}
-    with progress("planning") as report:
-        loaded = load(config, channel=channel)
-        given |= {"out": out, "progress": report, "read": [config]}
-        result: PlanResult | AfterResult | PlanFamilyResult
-        if family is not None:
-            result = plan_with_family(loaded, family, hours, **_for_family(given, after))
-        else:
-            result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
-    if json:
-        print_json(result.summary)
-        return
-    _print(result, told=bool(given["effects"]))
-    if out is not None:
-        say(f"written to {out}/: {', '.join(FILES['plan'])}\n")
+    Parameters
+    ----------
+    config : as that of `run`
+        With a map, and a filter or a simulated unit, whose noise is reckoned with.
+    hours : float
+        How long the chamber may take.
+    range : str or (float, float), optional
+        E.g. '-20..50 degC'; default: the config's.
+        A pair is in degC. The config's is that of its fitted map, or of the chamber that its source simulates; after
+        recordings it is theirs, and with a family the family's.
+    rate : str, optional
+        Fastest that the chamber can; default: 2 K/min.
+    lag : str, optional
+        Of the unit behind the chamber; default: 10 min.
+    start : str, optional
+        Where it begins; default: 25 degC.
+    walk : str, optional
+        Of the unit's bias; default: the config's.
+    sigma : str, optional
+        Aim, e.g. '3 deg/h': says the shortest hours.
+    kind : str, optional
+        Kind of map, instead of the config's.
+    effects : sequence of str
+        Effects that the profile is to tell apart.
+        As `("hysteresis", "thermal_lag")`, in place of all that are installed; the profile is then the one that tells
+        them best among those whose sigma is nearly the best.
+    channel : as that of `run`
+    after : as `data` of `run`, or a list of them, optional
+        What was recorded already; may be repeated.
+        The result says what is still missing, and whether it is enough.
+    family : path, optional
+        Of a fleet: says how short a soak may be.
+        Its `family.json`; noise and walk are those of its units.
+    out : path, optional
+        Folder for set points and report.
+    progress : callable, optional
+        Called with texts.
+
+    Returns
+    -------
+    PlanResult
+        `time`, `set_point` (M,) of the chosen profile, `temperature` (G,) and `sigma` (G, d) that its map will have.
+        With `after`, `sigma` is of the map so far, and `sigma_after` (G, d) with the further profile; with `family`,
+        `sigma` is of the chosen short soak, and `without_family` (G, d) of the same without it.
+
+    Raises
+    ------
+    ConfigError, DataError, MapError
+        If what is asked cannot be meant, the hours are too few, a recording cannot be used, or the family is of another
+        sensor.
+    """
+    understood = config_of(config).tracking(channel)
+    request = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    inquiry = _Inquiry(understood, hours, range, request, effects, progress or (lambda *state: None))
+    if family is not None:
+        if after is not None or effects:
+            raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
+        return inquiry.with_family(Path(family), out)
+    check_kinds(effects, "--effects")
+    if after is not None:
+        return inquiry.after(recordings_of(after, None, "after"), out)
+    return inquiry.first(out)
 
 
-def _for_family(given: dict[str, Any], after: list[str] | None) -> dict[str, Any]:
-    """Return what is asked of a plan with a family; raises ConfigError where it is something else."""
-    if after or given["effects"]:
-        raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
-    return {name: value for name, value in given.items() if name != "effects"}
+@dataclass(frozen=True)
+class _Inquiry:
+    """The wishes for a plan; `request` are texts for `parse_request`."""
+
+    config: Config
+    hours: float
+    range: str | tuple[float, float] | None
+    request: Mapping[str, str | None]
+    effects: Sequence[str]
+    report: Progress
+
+    def first(self, out: Place | None) -> PlanResult:
+        """Plan what is recorded first."""
+        request, read = parse_request(self.config, self.hours, range=self.range, **self.request), self.config.files()
+        chamber = request.chamber
+
+        def result() -> PlanResult:
+            rated = search(request.subject, chamber, self.hours, request.target, self.report)
+            unit = UnrecordedUnit.of(request.subject, chamber.low, chamber.high, self.config.filter)
+            if self.effects:
+                rated = preferred(rated, DiscriminationCriterion(unit, chamber, self.hours, self.effects))
+            outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
+            lines = [*plan_profile.lines(rated, request.lag_of), *plan_effects.brief(outlook)]
+            presentation = _Presentation(
+                plan_profile.headline(rated),
+                lines,
+                plan_profile.document(rated, lines) | {"effects": plan_effects.document(outlook)},
+                partial(plan_profile.table, rated),
+                partial(plan_profile.sigma_chart, rated),
+                lambda path, title: plan_profile.write_report(path, rated, lines, title, outlook),
+            )
+            subject, name = rated.subject, f"plan of {rated.hours:g} h for the {rated.subject.channel}"
+            sigmas = {"sigma": rated.chosen.sigma}
+            return PlanResult(name, rated, sigmas, subject.axes, subject.unit.si, presentation, read, outlook)
+
+        return in_folder(out, "plan", read, result)
+
+    def after(self, recordings: Sequence[str], out: Place | None) -> PlanResult:
+        """Plan what is still missing after recordings."""
+        read = [*self.config.files(), *paths_of(recordings)]
+
+        def result() -> PlanResult:
+            self.report("reading what was recorded")
+            parts, dt = read_parts(self.config, recordings, Faults())
+            span = self.range or self._span(parts)
+            request = parse_request(self.config, self.hours, range=span, **self.request)
+            chamber = request.chamber
+            before = of_samples(parts, dt, request.subject, chamber)
+            rated = after_recordings(before, self.hours, request.target, self.report)
+            unit = UnrecordedUnit.of(before.subject, chamber.low, chamber.high, self.config.filter)
+            outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
+            seen, subject = effects_in(unit, before.parts, before.dt, self.effects), before.subject
+            lines = [
+                *plan_continuation.lines(rated),
+                *plan_effects.seen_lines(seen, subject.unit),
+                *plan_effects.brief(outlook),
+            ]
+            presentation = _Presentation(
+                plan_continuation.headline(rated),
+                lines,
+                plan_continuation.document(rated, lines) | {"effects": plan_effects.document(outlook)},
+                partial(plan_continuation.table, rated),
+                partial(plan_continuation.sigma_chart, rated),
+                lambda path, title: plan_continuation.write_report(path, rated, outlook, lines, title),
+            )
+            name = f"plan after {before.hours:.3g} h of the {subject.channel}"
+            sigmas = {"sigma": before.sigma, "sigma_after": rated.chosen.sigma}
+            return PlanResult(name, rated, sigmas, subject.axes, subject.unit.si, presentation, read, outlook, seen)
+
+        return in_folder(out, "plan", read, result)
+
+    def with_family(self, family: Path, out: Place | None) -> PlanResult:
+        """Plan a short soak of a unit whose family is known."""
+        if self.config.filter is None:
+            raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
+        tracked, unit = self.config.filter.tracked, tracked_unit(self.config.filter)
+        law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
+        read = [family, *self.config.files()]
+
+        def result() -> PlanResult:
+            request = parse_request(self.config, self.hours, range=self.range or law.knots.domain, **self.request)
+            noise, walk = np.asarray(request.subject.noise), np.asarray(request.subject.walk)
+            noise_of = "as the config says"
+            if law.bands is not None:
+                typical, noise_of = law.bands.noise, f"the median of {law.units} units"
+                noise = np.array(typical.white)
+                walk = walk if self.request.get("walk") else np.array(typical.walk)
+            self.report("parts of the range")
+            rated = shortened(law, request.chamber, self.hours, noise, walk, request.target)
+            lines = plan_short_soak.lines(rated, unit, noise_of)
+            presentation = _Presentation(
+                plan_short_soak.headline(rated, unit),
+                lines,
+                plan_short_soak.document(rated, unit, lines),
+                partial(plan_short_soak.table, rated, unit),
+                partial(plan_short_soak.hours_chart, rated, unit),
+                lambda path, title: plan_short_soak.write_report(path, rated, unit, lines, title),
+            )
+            sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.own}
+            name = f"plan of a short soak for the {law.channel}"
+            return PlanResult(name, rated, sigmas, law.axes, unit.si, presentation, read)
+
+        return in_folder(out, "plan", read, result)
+
+    def _outlook(self, unit: UnrecordedUnit, profile: Profile, lag: float) -> DetectabilityReport:
+        self.report("effects")
+        return predict_detectability(
+            unit, lambda t: profile.body(t, lag), profile.duration, self.effects, still_channels(self.config)
+        )
+
+    def _span(self, parts: Sequence[tuple[Array, Array]]) -> tuple[float, float] | None:
+        """Return the temperatures of the recordings, where the config says of no range."""
+        if fitted_map(self.config) is not None or twin_of(self.config) is not None:
+            return None
+        return min(float(T.min()) for T, _ in parts), max(float(T.max()) for T, _ in parts)
 
 
-def _print(result: PlanResult | AfterResult | PlanFamilyResult, *, told: bool) -> None:
-    """Print what a plan says; with `told`, which effects are told apart."""
-    from driftlab.jobs.plan import PlanResult
-    from driftlab.jobs.plan_after import AfterResult
-    from driftlab.reports import plan_effects
+def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Split the effects."""
+    names = arguments.get("effects")
+    return {**arguments, "effects": [] if names is None else [name.strip() for name in names.split(",")]}
 
+
+def show(result: PlanResult, given: Mapping[str, Any]) -> None:
+    """Print the plan; of effects that were named, which are told apart."""
     console = terminal()
     console.print(result.headline, soft_wrap=True)
     console.print(result.table())
     for line in result.lines():
         console.print(line, soft_wrap=True)
-    if told and isinstance(result, (PlanResult, AfterResult)):
+    if given["effects"] and result.outlook is not None:
         console.print(plan_effects.table(result.outlook))
         for line in plan_effects.lines(result.outlook):
             console.print(line, soft_wrap=True)
+    if given["out"] is not None:
+        say(f"written to {given['out']}/: {', '.join(FILES['plan'])}\n")

@@ -1,81 +1,249 @@
-"""`driftlab run`."""
+"""The filter of a config on a recording: `driftlab run`, and the files at the end of `driftlab live`."""
 
 from __future__ import annotations
 
-import sys
+import os
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Any
 
-import typer
+from numpy.typing import NDArray
 
-from driftlab.commands.common import (
-    Channel,
-    ConfigFile,
-    EnforceLimits,
-    Force,
-    Json,
-    Recording,
-    Resume,
-    check_limits,
-    leave_by_limits,
-    note_compiling,
-    print_verdict,
-    progress,
-    terminal,
-    title,
+from driftlab import __version__
+from driftlab.commands.console import keep_freed_memory, note_compiling, print_verdict, terminal
+from driftlab.commands.estimates import (
+    CHECKPOINT,
+    Columns,
+    EstimatesWriter,
+    Stored,
+    at_file_precision,
+    note_first_row,
+    units_of,
+    write_smoothed,
 )
-from driftlab.commands.session import load
+from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
+from driftlab.commands.result import Result
+from driftlab.config import Config
+from driftlab.evaluation.limits import verdict
+from driftlab.evaluation.overview import Overview, overview_of, survey
+from driftlab.evaluation.run_limits import averages_of, judged, map_of
+from driftlab.evaluation.summary import remarks, summarise
+from driftlab.filtering.run import Run
+from driftlab.filtering.segment import RunLog, RunSegment, joined
+from driftlab.recordings.identity import beforehand
+from driftlab.reports.charts import Chart
+from driftlab.reports.provenance import sheet_of
+from driftlab.reports.run import bias_chart, write_report
+from driftlab.reports.tables import yardstick_table
+from driftlab.storage.folders import output_folder
+from driftlab.storage.json import write_json
+from driftlab.units import unit_of
+from fusion_core.contracts import MeasurementModel
+from fusion_core.errors import ConfigError
+from fusion_core.host.provenance import participants
 
-if TYPE_CHECKING:
-    from driftlab.jobs.run import RunResult
+
+class RunResult(Result):
+    """A run: the columns of `estimates.h5` by name, and what the summary and the report say of it.
+
+    `t` (N,), `bias` and `bias_sigma` (N, d), `coast` and `coast_sigma` (N, d), `x` and `sigma` (N, n), and the rest of
+    `estimates.h5`. Of a run that was written to a folder, an array is read when it is asked for.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        model: MeasurementModel,
+        journal: RunLog,
+        survey_of: Callable[..., Overview],
+        columns: Columns,
+        recorded: Path | None = None,
+    ) -> None:
+        self.config, self.model, self.journal = config, model, journal
+        self.recorded = recorded  # the file in which a live run has kept what came
+        alignment, averages = journal.alignments[0], averages_of(config, journal.alignments[0])
+        overview = survey_of(model, alignment, first_row=journal.faults.first_row, averages=averages)
+        self.overview, self.judged = overview, judged(config, overview, alignment, averages)
+        self.limits_verdict = self.verdict = verdict(self.judged)
+        self.name = f"{config.file.stem}: {config.recording}" if config.file else config.recording
+        self.units, self._columns = units_of(model), columns
+        states, axes = tuple(model.labels), tuple(model.tracked.axes)
+        self.labels = {"x": states, "sigma": states, "innovations": states[: model.m], "white": states[: model.m]}
+        self.labels |= dict.fromkeys(("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration"), axes)
+        self.summary = {
+            "schema": 1,
+            "driftlab": __version__,
+            "recording": config.recording,
+            "plugins": participants(config),
+            "serial": config.serial,
+            "limits": [row.as_json(unit_of(model.tracked)) for row in self.judged],
+            **summarise(overview, model, journal),
+        }
+
+    def lines(self) -> list[str]:
+        """Return the notes on the run, a sentence each."""
+        return remarks(self.overview, self.model, self.journal)
+
+    @property
+    def smoothed(self) -> Mapping[str, NDArray[Any]]:
+        """States `x`, `sigma` (N, n) and `bias` (N, d) given all of the recording; empty where none was asked for."""
+        return Stored(self._columns.path, "smoothed") if isinstance(self._columns, Stored) else {}
+
+    def _chart(self) -> Chart:
+        """Return the bias, its prediction and the temperature over time, and the errors below."""
+        return bias_chart(self.overview, self.model, self.journal, errors=True)
+
+    def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
+        with output_folder(Path(out), read=self.config.files(), force=force) as folder:
+            estimates = EstimatesWriter(folder, self.config, self.journal)
+            estimates.open(self.model)
+            try:
+                estimates.add(dict(self))
+            finally:
+                estimates.close()
+            note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
+            self._write(folder)
+
+    def _write(self, folder: Path) -> None:
+        write_json(folder / "summary.json", self.summary)
+        recording = None if self.recorded is None else [str(self.recorded)]
+        write_report(
+            folder / "report.html",
+            self.overview,
+            self.summary,
+            title=self.name,
+            config=self.config.as_yaml(),
+            model=self.model,
+            journal=self.journal,
+            sheet=sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"]),
+            fitted=map_of(self.config),
+        )
 
 
 def run(
-    config: ConfigFile,
-    input: Recording = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
-    channel: Channel = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Add what is known given all of the recording (group `smoothed`).")
-    ] = False,
-    resume: Resume = False,
-    force: Force = False,
-    enforce_limits: EnforceLimits = False,
-    json: Json = False,
-) -> None:
+    config: ConfigLike,
+    data: DataLike = None,
+    *,
+    units: Units | None = None,
+    out: Place | None = None,
+    channel: str | None = None,
+    smooth: bool = False,
+    resume: bool = False,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
     """Run the filter on a recording.
 
     Writes estimates.h5, summary.json and report.html.
-    """
-    from driftlab.jobs.allocator import keep_freed_memory
-    from driftlab.jobs.run import run_to_folder
 
-    loaded = load(config, input, channel)
-    check_limits(loaded, enforce_limits)
+    Parameters
+    ----------
+    config : path, YAML text, dict or Config
+        The unit and its filter; `source` says how files are read, arrays need none.
+    data : path, mapping, data frame or Chunk, optional
+        The recording.
+        The config's own where it is left out. Of a mapping, each value is an array, time first, or a pair of an array
+        and its unit.
+    units : mapping of str to str, optional
+        Units of the channels that have none in `data`.
+    out : path, optional
+        Folder for the results.
+        Arrays are then read from there. Nothing is written where it is left out.
+    channel : str, optional
+        Sensor whose bias it is about, e.g. accel; default: the config's.
+    smooth : bool
+        Add what is known given all of the recording (group `smoothed`).
+        It is `smoothed` of the result, with `x`, `sigma` (N, n) and `bias` (N, d), and needs `out`.
+    resume : bool
+        Go on where the same run was broken off.
+        It needs `out`, in which that run left a checkpoint.
+    force : bool
+        Replace results that cannot be computed again.
+    progress : callable, optional
+        Called with the recording's time in s and the number of updates so far, or with a text.
+
+    Returns
+    -------
+    RunResult
+        `t` (N,), `bias`, `bias_sigma`, `coast`, `coast_sigma` (N, d), `x`, `sigma` (N, n), `nis` (N,), ... in SI.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the config or the recording cannot be used, the checkpoint is of another run, or `out` must not be replaced.
+    Unwritable
+        If the disk is full, or the like.
+    """
+    understood, journal = config_with(config, data, units).tracking(channel), RunLog()
+    if out is None:
+        if smooth:
+            raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
+        running = Run(understood, journal)
+        columns = at_file_precision(joined(_segments(running, journal, progress)))
+        return RunResult(understood, running.model, journal, partial(overview_of, columns), columns)
+    with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
+        estimates = EstimatesWriter(folder, understood, journal, smooth=smooth)
+        before = (estimates.load_checkpoint() or {}).get("run") if resume else None
+        running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
+        estimates.open(running.model)
+        hashed = beforehand(understood.source)
+        try:
+            with closing(_segments(running, journal, progress)) as segments:
+                for segment in segments:
+                    estimates.append(segment)
+        finally:
+            estimates.close()
+        if estimates.spool is not None:
+            write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
+        hashed()
+        return finish(folder, understood, running.model, journal, Path(out))
+
+
+def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Generator[RunSegment]:
+    """Yield the segments of a run, and report how far it is."""
+    count = 0
+    with closing(iter(running)) as segments:
+        for segment in segments:
+            yield segment
+            count += len(segment.epochs)
+            if progress is not None:
+                progress(journal.faults.since(float(segment.epochs.t[-1])), count)
+
+
+def finish(
+    folder: Path, config: Config, model: MeasurementModel, journal: RunLog, out: Path, recorded: Path | None = None
+) -> RunResult:
+    """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`.
+
+    `recorded` is the file in which a live run has kept what came.
+    """
+    estimates = folder / "estimates.h5"
+    note_first_row(estimates, journal.faults.first_row)
+    result = RunResult(config, model, journal, partial(survey, estimates), Stored(out / "estimates.h5"), recorded)
+    result._write(folder)
+    (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
+    return result
+
+
+def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments as they are; the command line's run is the first in its process, and large."""
     note_compiling()
     keep_freed_memory()
-    with progress("filtering") as report:
-        name = f"{config.stem}: {title(loaded)}"
-        how = {"resume": resume, "force": force, "smooth": smooth}
-        result = run_to_folder(loaded, out, title=name, progress=report, read=[config], **how)
-    if json:
-        sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
-    else:
-        show(result, config.stem, title(loaded), out)
-    leave_by_limits(result.verdict, enforce_limits)
+    return arguments
 
 
-def show(result: RunResult, name: str, recording: str, out: Path) -> None:
-    """Print what a run has found."""
-    from driftlab.reports.tables import yardstick_table
-    from driftlab.units import unit_of
-
-    console = terminal()
+def show(result: RunResult, given: Mapping[str, Any]) -> None:
+    """Print the verdict on the limits, the table of yardsticks and the notes."""
+    console, config = terminal(), result.config
     print_verdict(result.verdict)
     for row in result.judged:
         if row.verdict != "pass":
             console.print(f"  {row.line(unit_of(result.model.tracked))}", soft_wrap=True)
-    console.print(yardstick_table({name: result.overview.yardsticks}, recording, result.model.tracked))
+    name = config.file.stem if config.file else config.name
+    console.print(yardstick_table({name: result.overview.yardsticks}, config.recording, result.model.tracked))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
-    console.print(f"written to {out}/: estimates.h5, summary.json, report.html", soft_wrap=True)
+    console.print(f"written to {given['out']}/: estimates.h5, summary.json, report.html", soft_wrap=True)

@@ -31,6 +31,7 @@ from fusion_core.thermal.thermometer import NO_STEPS, Steps
 
 Progress = Callable[[float, int], None]
 
+USUAL = "spline"  # kind of a map where neither the config nor the user names one: it bends where the sensor does
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from driftlab.commands.console import say, terminal
+from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
 from driftlab.family.parallel import serial
 from driftlab.production.family import analyse
 from driftlab.production.manifest import read_manifest
+from driftlab.production.progress import fleet_progress
 from driftlab.production.report import FAMILY, REPORT, TABLE, is_written, write_fleet
 from driftlab.production.result import FleetResult
 from driftlab.production.store import MARK, UNITS, UnitStore, as_json, fleet_folder
@@ -33,43 +37,96 @@ ALONE = 100  # units for whose family no further process is begun
 
 
 def fleet(
-    config: Config, units: str, out: Path, wanted: FleetOptions | None = None, progress: FleetProgress | None = None
+    config: ConfigLike,
+    units: Place,
+    out: Place,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    explain: bool = False,
+    pages: Sequence[str] = (),
+    family: Place | None = None,
+    force: bool = False,
+    channel: str | None = None,
+    progress: FleetProgress | None = None,
 ) -> FleetResult:
-    """Do the units of a manifest that are not done, fit their family, and write tables and report into `out`.
+    """Calibrate the units of a line, and learn their family.
+
+    Finds the odd ones. The same command again goes on where it ended.
 
     Parameters
     ----------
-    config : Config
+    config : as that of `run`
         Of every unit; its source says how recordings are read.
-    units : str
-        A manifest, or a pattern of file names (`driftlab.production.manifest`).
-    out : Path
-        The fleet's folder. Units that were done there are not done again as long as they are the same.
-    wanted : FleetOptions, optional
+    units : str or path
+        Recordings, a unit each; or a table of unit, role and path.
+        A pattern of file names, or a manifest (`driftlab.production.manifest`).
+    out : path
+        Folder; what is done there is not done again.
+    workers : int, optional
+        Processes; default: one a processor.
+    scheduler : str, optional
+        Of Dask, e.g. tcp://host:8786: its workers do it.
+    explain : bool
+        Close the loop for each unit with recordings to train and to judge by.
+    pages : sequence of str
+        Units whose pages to write; may be repeated.
+        Names, patterns, or `all`.
+    family : path, optional
+        A family that is known: none is fitted.
+        Its `family.json`.
+    force : bool
+        Do every unit again.
+    channel : as that of `run`
     progress : callable, optional
-        Called with the stage that goes on.
+        Called with the `Stage` that goes on: `name`, `total`, `done`, `failed`, `text()`.
+
+    Returns
+    -------
+    FleetResult
+        Of the units that are done `unit`, `odd` (U,), `noise`, `walk`, `coast` (U, d), ...; `to_polars()` is the table.
 
     Raises
     ------
-    ConfigError
+    ConfigError, UnitError
         If the config or the manifest is wrong, or `out` must not be written to.
     DataError
         If not one unit could be done.
     """
-    wanted, report = wanted or FleetOptions(), progress or (lambda stage: None)
+    understood, report = config_of(config).tracking(channel), progress or (lambda stage: None)
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
     if wanted.scheduler is not None and wanted.workers is not None:
         raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
-    manifest = read_manifest(units)
-    with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])  # which refuses a source of no files
+    manifest = read_manifest(str(units))
+    # which refuses a source of no files
+    with_recording(understood, next(iter(manifest.units[0].recordings.values()))[0])
     wanted.check_pages(manifest)
-    with fleet_folder(out, [] if wanted.family is None else [wanted.family]) as folder:
-        jobs = UnitJobs(manifest, folder, config.as_yaml(), versions_of(config), wanted, report)
-        command = _Command(config, jobs)
+    with fleet_folder(Path(out), [] if wanted.family is None else [wanted.family]) as folder:
+        jobs = UnitJobs(manifest, folder, understood.as_yaml(), versions_of(understood), wanted, report)
+        command = _Command(understood, jobs)
         summary = command.all()
         if not command.status.done:
             first = command.status.failed[0]
             raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
-        return FleetResult(out, summary)
+        return FleetResult(Path(out), summary)
+
+
+@contextmanager
+def progress_of(arguments: Mapping[str, Any]) -> Iterator[FleetProgress]:
+    """Show the progress of the command; an interruption says how it goes on."""
+    try:
+        with fleet_progress() as report:
+            yield report
+    except KeyboardInterrupt:
+        out = arguments["out"]
+        raise KeyboardInterrupt(f"what is done is in {out}, and the same command goes on from there") from None
+
+
+def show(result: FleetResult, given: Mapping[str, Any]) -> None:
+    """Print the notes on the fleet."""
+    for line in result.lines():
+        terminal().print(line, soft_wrap=True)
+    say(f"written to {given['out']}/: {', '.join(result.written)}\n")
 
 
 @dataclass

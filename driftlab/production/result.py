@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.commands.result import Result
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.production.report import FAMILY, REPORT, TABLE
 from driftlab.production.store import UNITS, record_of
 from driftlab.production.tables import COLUMNS
-from driftlab.results import Result
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -80,6 +80,12 @@ class FleetResult(Result):
         names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
         pages = len(self.summary["pages"])
         return [*names, "units/", *([f"pages of {pages:,} in units/NAME/page/"] if pages else [])]
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status where limits are enforced: 1 where a unit fails one, 3 where one is not known to pass all."""
+        limits = self.summary["limits"]
+        return 1 if limits.get("fail") else 3 * (limits.get("pass", 0) < self.summary["counts"]["units"])
 
     @property
     def failed(self) -> dict[str, str]:

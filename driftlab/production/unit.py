@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 import time
 import traceback
 from collections.abc import Mapping, Sequence
@@ -21,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
+from driftlab.commands.explain import explain
 from driftlab.config import Config, part_of, paths_of, products, understood
 from driftlab.family.record import UnitRecord
 from driftlab.family.rows import rows_of, soaked_of
-from driftlab.jobs.explain_in_memory import explained
 from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
@@ -254,13 +253,11 @@ def loop_of(config: Config, recordings: Recordings, files: dict[str, bytes]) -> 
     roles = {role: recordings.get(role, ()) for role in (CALIBRATION, TRAIN, "holdout")}
     if not roles[TRAIN] or not roles["holdout"]:
         return {"why_not": MISSING}
-    with tempfile.TemporaryDirectory(prefix="driftlab-") as scratch:
-        out = Path(scratch) / "explained"
-        try:
-            result = explained(config, roles, out, None)
-        except FusionError as error:
-            return {"why_not": _message(error, recordings)}
-        files.update({f"explained/{path.name}": path.read_bytes() for path in sorted(out.iterdir())})
+    try:
+        result = explain(config, roles[CALIBRATION], roles[TRAIN], roles["holdout"])
+    except FusionError as error:
+        return {"why_not": _message(error, recordings)}
+    files.update({f"explained/{name}": content for name, content in result.files.items()})
     return {"verdict": result.verdict, "effects": result.summary["effects"]}
 
 

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftlab.commands.run import RunResult, run
 from driftlab.config import Config, with_recording
 from driftlab.evaluation.limits import SIDE
 from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
@@ -33,10 +34,8 @@ from driftlab.evaluation.scores import HORIZONS
 from driftlab.family.record import Figure
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.identification.config_edit import host_of, with_tracked
-from driftlab.jobs.fit_map import USUAL
-from driftlab.jobs.run import RunResult, run
 from driftlab.maps.assessment import MapVerdict, judge
-from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.storage.json import plain
 from driftlab.units import BiasUnit, tracked_unit

@@ -12,11 +12,11 @@ import cats
 from cats import PLACEMENTS, ROOT
 from coasts import DEG_H, coasts
 
+from driftlab.commands.explain import explain
+from driftlab.commands.run import run
 from driftlab.config import load_config
 from driftlab.evaluation.scores import over_axes
 from driftlab.identification.result import Identification
-from driftlab.jobs.explain import explain
-from driftlab.jobs.run import run_to_folder
 from driftlab.maps.fit import fit_map
 from driftlab.reports.tables import yardstick_table
 from fusion_core.faults import Faults
@@ -34,7 +34,7 @@ def recording() -> Path:
 
 def ask(which: str, known: list[str], judged: str, out: Path) -> Identification:
     """Ask what a declared model lacks, and print the answer and the error before and after."""
-    closed = explain(load_config(HERE / f"{which}.yaml"), known, known, [judged], out)
+    closed = explain(load_config(HERE / f"{which}.yaml"), known, known, [judged], out=out).closed
     console.print(f"   verdict: {closed.verdict.word.replace('_', ' ')}")
     for line in closed.lines:
         console.print(f"   {line}", highlight=False)
@@ -63,7 +63,7 @@ def main() -> None:
     for step, name in enumerate(("standard", "tczupt"), start=2):
         console.print(f"{step}. run the {name} filter on placement 3, which the map has not seen")
         config = load_config(HERE / f"{name}.yaml", third)
-        results[name] = run_to_folder(config, OUT / name, title=f"CATS placement 3, {name} filter")
+        results[name] = run(config, out=OUT / name)
         for line in results[name].lines():
             console.print(f"   note: {line}", highlight=False, soft_wrap=True)
     console.print()

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from driftlab.commands.export import inflations
+from driftlab.commands.run import run
 from driftlab.config import load_config
-from driftlab.jobs.inflation import inflations
-from driftlab.jobs.run import run_to_folder
 from fusion_core.contracts import Inflation
 
 AHEAD = 600  # s
@@ -28,7 +28,7 @@ AHEAD = 600  # s
 def measured(placement: str, folder: Path) -> tuple[np.ndarray, Inflation]:
     """Return the raw gyro (N, 3) of a placement at 1 Hz, and what the innovations of its run say."""
     config = load_config(HERE / "base.yaml", f"{recording()}{placement}")
-    result = run_to_folder(config, folder)
+    result = run(config, out=folder)
     return np.asarray(result["rate"]), inflations(folder)["gyro"]["raw"]
 
 

@@ -17,8 +17,8 @@ from rich.console import Console
 sys.path.insert(0, str(HERE.parent))
 from coasts import DEG_H, coasts, table
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
-from driftlab.jobs.explain import explain
 
 
 def same_map(folder: Path) -> bool:
@@ -35,7 +35,7 @@ def main() -> None:
             parts = [f"{recording()}{span}" for span in PLACEMENTS]
             judged = parts.pop(holdout - 1)
             out = OUT / "rotations" / f"{which}_{holdout}"
-            closed = explain(load_config(HERE / f"{which}.yaml"), parts, parts, [judged], out)
+            closed = explain(load_config(HERE / f"{which}.yaml"), parts, parts, [judged], out=out).closed
             rows.append((f"placement {holdout}", coasts(out)))
             kept = "; the map stays byte for byte" if which == "declared" and same_map(out) else ""
             console.print(f"{which}, placement {holdout}: {closed.verdict.word}{kept}", style="bold")

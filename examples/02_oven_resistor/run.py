@@ -15,8 +15,8 @@ from rich.console import Console
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from coasts import Coast, coasts, table
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
-from driftlab.jobs.explain import explain
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "data" / "oven_resistors"
@@ -41,7 +41,7 @@ def ask(which: str, judged: int, out: Path) -> Answer:
     """Explain a resistor on the two other ramps, in the order of time, and judge on one (1 to 3)."""
     parts = [f"{DATA / which}.csv{ramp}" for ramp in RAMPS]
     holdout = parts.pop(judged - 1)
-    closed = explain(load_config(HERE / CONFIGS[which]), [parts[0]], [parts[1]], [holdout], out)
+    closed = explain(load_config(HERE / CONFIGS[which]), [parts[0]], [parts[1]], [holdout], out=out).closed
     same = (out / "declared.json").read_bytes() == (out / "explained.json").read_bytes()
     return Answer(closed.verdict.word, closed.lines, closed.content["effects"], coasts(out), same)
 

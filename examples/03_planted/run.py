@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "01_cats"))
 from coasts import DEG_H, coasts, table
 from demo import PLACEMENTS, recording
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
 from driftlab.evaluation.scores import over_axes
-from driftlab.jobs.explain import explain
 
 HERE = Path(__file__).parent
 OUT = HERE.parent.parent / "demo_out" / "planted"
@@ -69,7 +69,7 @@ def main(holdout: int) -> None:
         folder = OUT / ("planted" if planted else "bed")
         parts = write(folder, planted=planted)
         judged = parts.pop(holdout - 1)
-        closed = explain(load_config(HERE / "declared.yaml"), parts, parts, [judged], folder / "explained")
+        closed = explain(load_config(HERE / "declared.yaml"), parts, parts, [judged], out=folder / "explained").closed
         rows.append((name, coasts(folder / "explained")))
         heading = name if planted else "the bed: the same, nothing planted"
         console.print(f"{heading}: {closed.verdict.word.replace('_', ' ')}", style="bold")

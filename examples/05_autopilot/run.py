@@ -26,12 +26,11 @@ import ways
 from coasts import DEG_H
 from days import DEVICE, HORIZONS, Errors, Placement, of_filter, of_firmware
 
+from driftlab.commands.explain import explain
+from driftlab.commands.export import export
+from driftlab.commands.fit_map import FitMapResult, fit_map
+from driftlab.commands.run import run
 from driftlab.config import Config, load_config
-from driftlab.jobs.explain import explain
-from driftlab.jobs.export import export as write_export
-from driftlab.jobs.export import exporter_of, of_config
-from driftlab.jobs.fit_map import FitMapResult, fit_map
-from driftlab.jobs.run import run
 
 HERE = Path(__file__).parent
 Span = tuple[float, float | None]
@@ -55,11 +54,11 @@ def fitted(which: str, folder: Path) -> tuple[FitMapResult, Config]:
 
 def exported(config: Config, folder: Path) -> dict[str, Path]:
     """Write the map in every form, and return their paths by kind."""
-    what, found = of_config(config), {}
+    found = {}
     for kind, name in ways.FORMS:
         given = {"device_id": str(DEVICE)} if kind == "px4" else {}
         found[kind] = folder / name
-        write_export(exporter_of(kind, given), what, found[kind], force=True, read=[])
+        export(kind, config, found[kind], settings=given, force=True)
     return found
 
 
@@ -118,8 +117,8 @@ def _explained(folder: Path, flown: Placement, console: Console) -> dict[str, Er
     """Ask what the map lacks, and return the errors with it, where anything is found."""
     known = [str(folder / f"soak{k}.bin") for k in (1, 2)]
     closed = explain(
-        load_config(HERE / "ardupilot.yaml"), known, known, [str(folder / "flight.bin")], folder / "explained"
-    )
+        load_config(HERE / "ardupilot.yaml"), known, known, [str(folder / "flight.bin")], out=folder / "explained"
+    ).closed
     effects = ", ".join(effect["kind"] for effect in closed.content["effects"])
     console.print(f"3. driftlab explain: {closed.verdict.word.replace('_', ' ')}; {effects or 'nothing is added'}")
     if not effects:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import driftlab
-from driftlab.arguments import config_of
-from driftlab.jobs.export import of_config
-from driftlab.jobs.fit_map import fit_map_to_file
+from driftlab.commands.export import of_config
+from driftlab.commands.fit_map import fit_map
+from driftlab.commands.inputs import config_of
 from fusion_core.errors import ConfigError, MapError
 
 G = 9.80665
@@ -116,7 +116,7 @@ def test_a_map_of_one_sensor_is_neither_planned_with_nor_lost_for_another(fitted
     named = {"kind": "polynomial", "path": str(folder / "accel.json")}
     config["filter"]["accel"]["calibration"] = named
     with pytest.raises(ConfigError, match="is read here, and would be lost"):
-        fit_map_to_file(config_of(config), [], folder / "accel.json", kind="polynomial")
+        fit_map(config_of(config), out=folder / "accel.json", kind="polynomial")
     config["filter"]["gyro"]["calibration"] = named
     with pytest.raises(MapError, match=r"filter.gyro: the map .* channel accel in m/s\^2"):
         driftlab.plan(config, 3.0, range="20..70 degC")

@@ -9,8 +9,8 @@ from dataflash_writer import write_log
 from typer.testing import CliRunner
 
 from driftlab.cli import app
+from driftlab.commands.fit_map import fit_map
 from driftlab.config import load_config
-from driftlab.jobs.fit_map import fit_map
 
 DEG, G = np.pi / 180, 9.80665
 TCAL = (25.0, 60.0, 40.0, np.array([[300.0, -150.0, 80.0], [4.0, 3.0, -2.0], [-0.1, 0.05, 0.02]]))

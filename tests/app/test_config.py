@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from written_configs import GOOD, load
 
-from driftlab.jobs.check import check
+from driftlab.commands.check import check
 from fusion_core.errors import ConfigError
 
 HELD = """

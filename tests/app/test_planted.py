@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
-from driftlab.jobs.explain import explain
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 RAMPS = ("::0:9300", "::9300:18300", "::18300:")  # s
@@ -43,7 +43,7 @@ def test_what_is_planted_is_named_and_what_is_left_is_the_bed(tmp_path, kind):
         config = {"extends": str(EXAMPLES / "02_oven_resistor" / "control.yaml"), "source": {"channels": channels}}
         (tmp_path / "declared.yaml").write_text(yaml.safe_dump(config))
         names = [[f"{path}{ramp}"] for ramp in RAMPS]
-        closed = explain(load_config(tmp_path / "declared.yaml"), *names, tmp_path / f"out_{name}")
+        closed = explain(load_config(tmp_path / "declared.yaml"), *names, out=tmp_path / f"out_{name}").closed
         (outcome,) = closed.outcomes
         errors[name] = float(np.std(outcome.after - outcome.reference))
         expected = [] if name == "bed" else [kind]

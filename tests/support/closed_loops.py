@@ -4,13 +4,13 @@ import h5py
 import numpy as np
 from units_with_effects import make_unit
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.config_edit import calibrated, with_map
 from driftlab.identification.cross_validation import LeftOutPart, error
 from driftlab.identification.least_squares import LeastSquares
 from driftlab.identification.records import gather
-from driftlab.jobs.explain import explain
 from driftlab.noise.local_level import LocalLevel
 
 AUXILIARY = ("voltage", "pressure", "flow")
@@ -20,7 +20,7 @@ TOLD = 8.5e-6  # rad/s an axis: the error of a model that is told the truth, on 
 def loop(folder, seed, effects, channels=AUXILIARY, out="out", **options):
     truth = make_unit(folder, seed, effects, channels, **options)
     names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(folder / "declared.yaml"), *names, folder / out)
+    closed = explain(load_config(folder / "declared.yaml"), *names, out=folder / out).closed
     with h5py.File(folder / out / "prediction.h5") as file, h5py.File(folder / "holdout.h5") as holdout:
         group, t = file["holdout"], holdout["time"][()]
         true = np.stack([np.interp(group["t"][()], t, axis) for axis in truth.T], axis=1)

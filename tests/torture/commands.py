@@ -15,7 +15,7 @@ MAIN = "from driftlab.cli import main; main()"
 # many small chunks with a pause after each, and a checkpoint after nearly every one: there is much to be killed in
 SLOWLY = """
 import time
-from driftlab.jobs import estimating
+from driftlab.commands import estimates as estimating
 from driftlab.filtering import run
 estimating.PERIOD = 0.05
 read = run.read

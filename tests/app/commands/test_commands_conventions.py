@@ -125,7 +125,7 @@ def on_a_terminal(*program, **environment):
 
 def test_no_color_is_obeyed():
     colour = re.compile(r"\x1b\[[0-9;]*(3[0-7]|9[0-7]|38;5;\d+)m")
-    red = "from driftlab.commands.common import terminal; terminal().print('text', style='red')"
+    red = "from driftlab.commands.console import terminal; terminal().print('text', style='red')"
     assert colour.search(on_a_terminal(sys.executable, "-c", red))
     assert not colour.search(on_a_terminal(sys.executable, "-c", red, NO_COLOR="1"))
 

@@ -14,8 +14,7 @@ from bench import live_bench, paced, unit_frames
 from playwright.sync_api import expect
 from typer.testing import CliRunner
 
-from driftlab.cli import app
-from driftlab.commands.live_web import PORT
+from driftlab.cli import PORT, app
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100
@@ -178,7 +177,7 @@ def test_the_port_may_be_left_out(bench, monkeypatch, args, port):
     class Refused(Exception):
         pass
 
-    def served(run, number, *_):
+    def served(run, number, _):
         asked.append(number)
         raise Refused
 

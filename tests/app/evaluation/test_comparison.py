@@ -96,13 +96,14 @@ filter:
 """
 
 
-def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path, capsys):
+def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path):
     """The unit moves, is not recorded for a fifth of the time, and one config declares another noise."""
     from html import unescape
 
     import h5py
+    from typer.testing import CliRunner
 
-    from driftlab.commands.compare import compare as command
+    from driftlab.cli import app
 
     unit = unit_at_rest(seconds=300, rate=10, walk=2.6e-7, seed=1)
     unit.gyro[1500:1550, 1] += 0.05 * (-1.0) ** np.arange(50)
@@ -114,10 +115,9 @@ def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path
     for name, noise in configs.items():
         (tmp_path / f"{name}.yaml").write_text(CONFIG.format(noise=noise))
     paths = [tmp_path / f"{name}.yaml" for name in configs]
-    command(paths, input=[str(tmp_path / "unit.h5")], out=tmp_path / "out", json=False)
-    terminal = capsys.readouterr().out
-    command(paths, input=[str(tmp_path / "unit.h5")], out=None, json=True)
-    printed = json.loads(capsys.readouterr().out)["configs"]
+    command = ["compare", *map(str, paths), "--input", str(tmp_path / "unit.h5")]
+    terminal = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "out")]).stdout
+    printed = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)["configs"]
     kept = json.loads((tmp_path / "out" / "summary.json").read_text())["configs"]
     page = unescape((tmp_path / "out" / "report.html").read_text())
     for name in configs:

@@ -6,12 +6,12 @@ import pytest
 import scipy.stats
 from units_at_rest import unit_at_rest
 
+from driftlab.commands.estimates import estimates_file
 from driftlab.config import Config
 from driftlab.evaluation.overview import survey
 from driftlab.evaluation.scores import moving_average, score
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
-from driftlab.jobs.estimates import estimates_file
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 

@@ -10,11 +10,11 @@ import pytest
 import yaml
 from units_at_rest import thermal_bias, unit_at_rest
 
+from driftlab.commands.run import run
 from driftlab.config import load_config
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog
-from driftlab.jobs.run import run_to_folder
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, ThermalMap
 from fusion_core.errors import ConfigError, PluginError, UnreadableFile
@@ -26,7 +26,7 @@ from fusion_core.model import State
 CHILD = """
 import sys
 from pathlib import Path
-from driftlab.jobs import estimating, run as filtering
+from driftlab.commands import estimates as estimating, run as filtering
 from driftlab.recordings import screening as intake
 from driftlab.filtering import run
 from driftlab.config import load_config
@@ -40,7 +40,7 @@ def say(*args):
 estimating.write_checkpoint = say
 config = load_config(Path("unit.yaml"), "recording.h5")
 print("begun", flush=True)
-filtering.run_to_folder(config, Path("killed"), title="", resume=True)
+filtering.run(config, out=Path("killed"), resume=True)
 """
 
 
@@ -101,7 +101,7 @@ def test_twenty_kills_change_nothing(recording):
     assert len(set(reached)) >= 5, "the kills came at moments that differ"
     subprocess.run([sys.executable, "-c", CHILD], cwd=recording, check=True, capture_output=True)
     config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
-    result = run_to_folder(config, recording / "whole", title="")
+    result = run(config, out=recording / "whole")
     assert len(result.summary["aligned_again_s"]) >= 1
     assert result.summary["motion_s"]
     assert {path.name for path in (recording / "killed").iterdir()} == {"estimates.h5", "summary.json", "report.html"}
@@ -127,10 +127,10 @@ def test_another_config_is_not_continued(recording):
     content = {"driftlab": "0", "config": config.as_yaml(), "rows": 0, "run": {}}
     write_checkpoint(recording / "out.partial" / "checkpoint.npz", content)
     with pytest.raises(ConfigError, match="was begun with another config, recording or version of driftlab; use the"):
-        run_to_folder(config, recording / "out", title="", resume=True)
+        run(config, out=recording / "out", resume=True)
     (recording / "out.partial" / "checkpoint.npz").write_bytes(b"PK\x03\x04 cut short")
     with pytest.raises(UnreadableFile, match=r"is not a checkpoint .*; begin anew without --resume"):
-        run_to_folder(config, recording / "out", title="", resume=True)
+        run(config, out=recording / "out", resume=True)
 
 
 @pytest.mark.parametrize("broken", [

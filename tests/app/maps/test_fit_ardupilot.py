@@ -14,7 +14,7 @@ import pytest
 from dataflash_writer import write_log
 
 import driftlab
-from driftlab.arguments import config_of
+from driftlab.commands.inputs import config_of
 
 ROOT = Path(__file__).parents[3]
 PACKAGE, MEMBER = "ardupilot-methodic-configurator==5.0.1", "ardupilot_methodic_configurator/tempcal_imu.py"

@@ -103,13 +103,9 @@ def write(path, *, samples=12_000, gap=None, jitter=0.0, kick=None):
 
 
 def command(*args):
-    import typer
+    from driftlab.cli import app
 
-    from driftlab.commands.allan import allan
-
-    app = typer.Typer()
-    app.command()(allan)
-    return CliRunner().invoke(app, [str(a) for a in args], env={"COLUMNS": "160"})
+    return CliRunner().invoke(app, ["allan", *map(str, args)], env={"COLUMNS": "160"})
 
 
 @pytest.fixture(scope="module")

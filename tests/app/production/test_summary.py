@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from driftlab.commands import fleet_progress
+from driftlab.production import progress as fleet_progress
 from driftlab.production.summary import Stage, duration
 
 

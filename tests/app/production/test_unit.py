@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from soaked_units import FAMILY, OVEN, compared, soaked
 
+from driftlab.commands.fit_map import fit_map
+from driftlab.commands.run import run
 from driftlab.config import load_config, understood
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.config_edit import with_map
-from driftlab.jobs.fit_map import fit_map_to_file
-from driftlab.jobs.run import run
 from driftlab.production import unit as module
 from driftlab.production.unit import Task, key_of, work
 from driftlab.storage.json import plain
@@ -80,7 +80,7 @@ def test_figures_are_as_far_from_the_truth_as_their_deviations_say(tmp_path) -> 
 
 def test_the_map_is_that_of_fit_map_to_the_byte(folder, tmp_path) -> None:
     found = done(folder)
-    fit_map_to_file(load_config(FAMILY), [str(folder / "soak.h5")], tmp_path / "map.json")
+    fit_map(load_config(FAMILY), [str(folder / "soak.h5")], out=tmp_path / "map.json")
     assert found.record.map_file == "map.json"
     own, other = (json.loads(text) for text in (found.files["map.json"], (tmp_path / "map.json").read_bytes()))
     assert own["record"]["provenance"].pop("fitted_at")

@@ -7,10 +7,10 @@ import pytest
 from browsers import colours, overflow
 from units_at_rest import unit_at_rest
 
+from driftlab.commands.compare import compare
 from driftlab.config import Config
 from driftlab.evaluation.comparison import verdict
 from driftlab.evaluation.scores import over_axes
-from driftlab.jobs.compare import compare
 from driftlab.reports.charts import LOOKS
 from driftlab.reports.compare import bias_chart, error_chart
 

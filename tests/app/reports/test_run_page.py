@@ -85,7 +85,7 @@ def test_the_summary_has_serial_and_limits(run):
 
 def test_the_terminal_begins_with_the_verdict(run, capsys):
     found, out = run
-    show(found, "unit", "data", out)
+    show(found, {"out": out})
     assert capsys.readouterr().out.startswith("FAIL: swing of the map (2 of 4 limits kept")
 
 

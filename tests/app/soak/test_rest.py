@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from driftlab.commands.fit_map import fit_map
 from driftlab.config import Config
 from driftlab.errors import SwingTooSmall
-from driftlab.jobs.fit_map import fit_map
 from driftlab.maps.fit import fit_gathered, gather
 from driftlab.soak.rest import Used, at_rest
 from driftlab.storage.in_memory import InMemoryName, in_memory_name

@@ -154,7 +154,7 @@ def test_after_a_defect_the_process_ends(bench):
 import sys, threading, time
 import h5py
 from h5py._objects import phil
-from driftlab.jobs import run as filtering
+from driftlab.commands import run as filtering
 from driftlab.cli import main
 def defect(*args, **how):
     file = h5py.File("soak.h5")
@@ -165,7 +165,7 @@ def defect(*args, **how):
     threading.Thread(target=busy, daemon=True).start()
     time.sleep(0.5)
     raise ZeroDivisionError("a defect")
-filtering.run_to_folder = defect
+filtering.run = defect
 sys.argv = ["driftlab", "run", "plain.yaml", "--input", "soak.h5", "--out", "defect"]
 main()
 """

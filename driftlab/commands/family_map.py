@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab import __version__
+from driftlab.commands.console import say, terminal
+from driftlab.commands.inputs import Progress
+from driftlab.commands.result import Result
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family
@@ -18,20 +20,15 @@ from driftlab.family.posterior_map import UnitPosterior, unit_posterior
 from driftlab.family.rows import rows_of
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
-from driftlab.jobs.fit_map import USUAL
-from driftlab.maps.fit import GatheredSoak, fit_gathered, gather, map_settings
+from driftlab.maps.fit import USUAL, fit_gathered, gather, map_settings
 from driftlab.reports import family_map as words
-from driftlab.results import Result
+from driftlab.reports.charts import Chart
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_place, save
 from driftlab.units import tracked_unit
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, DataError
 from fusion_core.faults import Faults
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
 
 
 class FamilyMapResult(Result):
@@ -52,10 +49,15 @@ class FamilyMapResult(Result):
     """
 
     def __init__(
-        self, config: Config, recordings: Sequence[str], family: tuple[Path, Family], known: UnitPosterior, own: _Own,
+        self,
+        config: Config,
+        recordings: Sequence[str],
+        family: tuple[Path, Family],
+        known: UnitPosterior,
+        own: FittedMap | None,
         faults: Faults,
-    ) -> None:  # fmt: skip
-        self.config, self.known, self.own, self.faults = config, known, own.fitted, faults
+    ) -> None:
+        self.config, self.known, self.own, self.faults = config, known, own, faults
         self.unit = tracked_unit(config.filter)
         self.written: tuple[Path, ...] = ()
         path, law = family
@@ -81,33 +83,17 @@ class FamilyMapResult(Result):
             }
         self.units = dict.fromkeys(self._columns, record.unit) | {"temperature": "degC"}
         self.labels = dict.fromkeys((name for name in self._columns if name != "temperature"), record.axes)
-        self._own_why = own.why
         self.summary = record.model_dump(mode="json") | {
-            "verdict": self.sentences(), "judged": plain(words.as_json(self)), "serial": config.serial
+            "verdict": words.sentences(self), "judged": plain(words.as_json(self)), "serial": config.serial
         }  # fmt: skip
-
-    @property
-    def why_no_own(self) -> str:
-        """Why the unit has no map of its own; empty where it has."""
-        return self._own_why
-
-    def sentences(self) -> list[str]:
-        """Return the verdict in words, the decisive one first."""
-        return words.sentences(self)
 
     def lines(self) -> list[str]:
         """Return the verdict, and what one should know of the recordings."""
-        return [*self.sentences(), *self.faults.lines()]
+        return [*words.sentences(self), *self.faults.lines()]
 
-    def table(self) -> Table:
-        """Return the deviations over the range for a terminal."""
-        return words.table(self)
-
-    def plot(self) -> Figure:
-        """Draw the map with its band, the unit's own map and the family's, and what each knows."""
-        from driftlab.reports.figures import figure_of
-
-        return figure_of(words.chart(self))
+    def _chart(self) -> Chart:
+        """Return the map with its band, the unit's own map and the family's, and what each knows."""
+        return words.chart(self)
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write the map to the file `out`; raises ConfigError, Unwritable or MapError."""
@@ -117,34 +103,19 @@ class FamilyMapResult(Result):
         self.written = (path,)
 
 
-class _Own:
-    """The unit's own map, or why there is none."""
-
-    def __init__(self, config: Config, found: GatheredSoak, faults: Faults) -> None:
-        self.fitted: FittedMap | None = None
-        self.why = ""
-        try:
-            self.fitted = fit_gathered(config, map_settings(config, None if config.tracked_maps() else USUAL), found)
-        except DataError as error:
-            self.why = str(error)
-            faults.note(f"no map of its own: {error}")
-
-
 def fit_family_map(
     config: Config,
     recordings: Sequence[str],
     family: Path,
-    *,
-    lot: str = "",
-    out: Path | None = None,
-    progress: Callable[..., None] | None = None,
-    read: Collection[Path] = (),
+    lot: str,
+    out: Path | None,
+    progress: Progress | None,
 ) -> FamilyMapResult:
     """Return the map that a unit's own soak and its family give; with `out`, write it there.
 
     Parameters
     ----------
-    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`)
+    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory
         At rest, over any part of the family's range.
     family : Path
         `family.json` of a fleet.
@@ -159,19 +130,32 @@ def fit_family_map(
     if config.filter is None:
         raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
     if out is not None:
-        check_place(out, [*read, family, *config.files_to_fit(), *paths_of(recordings)])
+        check_place(out, [family, *config.files_to_fit(), *paths_of(recordings)])
     tracked, faults = config.filter.tracked, Faults()
     law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
     if lot and lot not in law.lots:
         faults.note(f"lot {lot}: is not one of the family's ({', '.join(law.lots) or 'it has none'}); taken as unknown")
-    found = gather(config, recordings, faults, progress, keep=True)
-    rows = rows_of(found, tracked.channel)
+    soak = gather(config, recordings, faults, progress, keep=True)
+    own: FittedMap | None = None
+    try:
+        own = fit_gathered(config, map_settings(config, None if config.tracked_maps() else USUAL), soak)
+    except DataError as error:
+        faults.note(f"no map of its own: {error}")
+    rows = rows_of(soak, tracked.channel)
     noise = densities_of(rows, law.knots.step)
-    axes = tuple(tracked.axes)
-    soaked = UnitInformation.of("", axes, rows, noise.white, noise.likely, law.knots.step)
-    result = FamilyMapResult(
-        config, recordings, (family, law), unit_posterior(law, soaked, lot), _Own(config, found, faults), faults
-    )
+    information = UnitInformation.of("", tuple(tracked.axes), rows, noise.white, noise.likely, law.knots.step)
+    posterior = unit_posterior(law, information, lot)
+    result = FamilyMapResult(config, recordings, (family, law), posterior, own, faults)
     if out is not None:
         result.save(out)
     return result
+
+
+def show_family_map(result: FamilyMapResult) -> None:
+    """Print the verdict, the deviations over the range and the notes."""
+    for line in words.sentences(result):
+        say(f"{line}\n")
+    terminal().print(words.table(result))
+    for line in result.faults.lines():
+        say(f"note: {line}\n")
+    say(f"written to {', '.join(map(str, result.written))}\n")

@@ -7,9 +7,8 @@ from typer.testing import CliRunner
 
 from driftlab import api
 from driftlab.cli import app
+from driftlab.commands.export import inflations, of_config, with_inflation
 from driftlab.errors import ConfigError, UnreadableFile
-from driftlab.jobs.export import of_config
-from driftlab.jobs.inflation import inflations, with_inflation
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 NOISE, WALK = {"gyro": 1e-4, "accel": 1e-3}, {"gyro": 2e-6, "accel": 3e-5}

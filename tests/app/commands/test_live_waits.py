@@ -17,9 +17,8 @@ import h5py
 import pytest
 from bench import live_bench, paced, unit_frames
 
-from driftlab.commands.live import _reporting
+from driftlab.commands.live import Live, _reporting
 from driftlab.config import load_config
-from driftlab.jobs.live import Live
 from driftlab.live.status import Status
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
@@ -175,7 +174,7 @@ def test_at_the_end_each_note_is_said_once(bench):
     frames = unit_frames(60, RATE)
     run = Live(load_config(folder / "live.yaml"), duration=5.0)
     paced(device, [one for k, one in enumerate(frames) if k % 50], RATE)
-    result = run.to_folder(folder / "out", title="a device")
+    result = run.to_folder(folder / "out")
     assert len(run.status.lines()) == len(set(run.status.lines())) > 0
     assert set(run.status.lines()) <= set(result.lines())
 

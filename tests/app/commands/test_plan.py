@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 import driftlab
-from driftlab.arguments import config_of
 from driftlab.cli import app
+from driftlab.commands.inputs import config_of
 from driftlab.errors import ConfigError
 from driftlab.planning.chamber import Chamber, Profile
 from driftlab.planning.request import parse_request

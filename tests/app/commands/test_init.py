@@ -17,9 +17,9 @@ from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
 from driftlab.cli import app
+from driftlab.commands.init import init
+from driftlab.commands.simulate import simulate
 from driftlab.config import load_config
-from driftlab.jobs.init import init
-from driftlab.jobs.simulate import simulate
 from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -47,7 +47,7 @@ def table(names, gyro="rad/s", accel="m/s^2", time="s"):
 def written(tmp_path, content, **more):
     file = tmp_path / "rec.csv"
     pl.DataFrame(content).write_csv(file)
-    return init(file, tmp_path / "rec.yaml", **more)
+    return init(file, out=tmp_path / "rec.yaml", **more)
 
 
 LOGS = {
@@ -108,7 +108,7 @@ def test_hdf5_takes_the_units_of_the_file(tmp_path):
             file[name] = values
             file[name].attrs["units"] = unit
         file["note"] = np.array([b"of the bench"])
-    done = init(tmp_path / "log.h5", tmp_path / "log.yaml")
+    done = init(tmp_path / "log.h5", out=tmp_path / "log.yaml")
     assert done.asked == ()
     assert done.text.count("# guess") == 4  # noise and walk of both
     got = samples(done.path)
@@ -121,7 +121,7 @@ def test_parquet_and_mat_are_read_as_they_were_written(tmp_path):
     imu = {"t": UNIT.t[:, None], "gyro": np.rad2deg(UNIT.gyro), "acc": UNIT.accel / 9.80665, "temp": UNIT.temperature}
     savemat(tmp_path / "log.mat", {"imu": imu, "unit": "bench 7"})
     for file, kind in (("log.parquet", "parquet"), ("log.mat", "mat")):
-        done = init(tmp_path / file, tmp_path / f"{kind}.yaml")
+        done = init(tmp_path / file, out=tmp_path / f"{kind}.yaml")
         assert f"  kind: {kind}\n" in done.text
         got = samples(done.path)
         np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-9)
@@ -136,7 +136,7 @@ def test_an_autopilots_log_takes_three_lines(tmp_path):
     topics += [sensor("sensor_accel", 0, UNIT.t + 1, UNIT.accel, UNIT.temperature, 1310988)]
     write_ulog(tmp_path / "vehicle.ulg", topics)
     for file, product in (("vehicle.bin", "ardupilot_log"), ("vehicle.ulg", "px4_log")):
-        done = init(tmp_path / file, tmp_path / f"{product}.yaml")
+        done = init(tmp_path / file, out=tmp_path / f"{product}.yaml")
         config = [line for line in done.text.splitlines() if not line.startswith("#")]
         assert config == [f"extends: {product}", f"source: {{path: {file}}}"]
         np.testing.assert_allclose(samples(done.path)["gyro"], UNIT.gyro, rtol=1e-5, atol=1e-9)
@@ -146,7 +146,7 @@ def test_an_autopilots_log_takes_three_lines(tmp_path):
 def test_a_bag_is_told_by_the_types_of_its_messages(tmp_path, kind):
     bags = pytest.importorskip("bags")  # which needs rosbags
     made = bags.write(tmp_path / "bag", kind, bags.unit)
-    done = init(made, tmp_path / "bag.yaml")
+    done = init(made, out=tmp_path / "bag.yaml")
     channels = done.text.partition("channels:")[2].partition("filter:")[0]
     assert channels.count("# as the file says") == 4
     got = samples(done.path)
@@ -157,8 +157,8 @@ def test_a_bag_is_told_by_the_types_of_its_messages(tmp_path, kind):
 @pytest.mark.parametrize("ending", ["csv", "h5"])
 def test_a_simulated_recording_says_its_units_itself(tmp_path, ending):
     (tmp_path / "twin.yaml").write_text("source: {kind: synthetic, duration: 60 s, rate: 20 Hz}\n")
-    simulate(load_config(tmp_path / "twin.yaml"), tmp_path / f"sim.{ending}")
-    done = init(tmp_path / f"sim.{ending}", tmp_path / "sim.yaml")
+    simulate(load_config(tmp_path / "twin.yaml"), out=tmp_path / f"sim.{ending}")
+    done = init(tmp_path / f"sim.{ending}", out=tmp_path / "sim.yaml")
     channels = done.text.partition("channels:")[2].partition("filter:")[0]
     assert channels.count("# as the file says") == 4
     assert "# guess" not in channels
@@ -206,11 +206,11 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
         ("mti", b"".join(one(k, 20.0, gyro=xyz[0]) for k, xyz in enumerate(noisy))),
     ):
         (tmp_path / f"{name}.bin").write_bytes(data)
-    done = init(tmp_path / "vn.bin", tmp_path / "vn.yaml")
+    done = init(tmp_path / "vn.bin", out=tmp_path / "vn.yaml")
     assert "extends: vectornav_imu " in done.text
     assert done.asked == ()
     assert len(samples(done.path)) == 600
-    done = init(tmp_path / "mti.bin", tmp_path / "mti.yaml")
+    done = init(tmp_path / "mti.bin", out=tmp_path / "mti.yaml")
     assert "extends: xsens_mtdata2 " in done.text
     assert done.asked == ("the noise of accel: no quiet stretch with a known time was found",)
     (tmp_path / "unknown.bin").write_bytes(b"".join(map(frame, range(50))))
@@ -218,7 +218,7 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
     with pytest.raises(
         UnreadableFile, match=r"no installed source reads it.* describe its frames under source\.framing"
     ):
-        init(tmp_path / "unknown.bin", tmp_path / "unknown.yaml")
+        init(tmp_path / "unknown.bin", out=tmp_path / "unknown.yaml")
 
 
 def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
@@ -245,7 +245,7 @@ def test_nothing_is_replaced_and_wrong_units_are_refused(tmp_path):
 def test_a_bag_of_several_topics_is_about_the_first_inertial_unit(tmp_path):
     """Its rows are that unit's; the thermometer of another topic is taken by its unit, not by its counter or stamp."""
     bag(tmp_path / "bag", "mcap", lambda types: unit(types, 3000))
-    done = init(tmp_path / "bag", tmp_path / "bag.yaml")
+    done = init(tmp_path / "bag", out=tmp_path / "bag.yaml")
     config = load_config(done.path)
     assert config.source.channels["time"].paths == (FIELDS["time"]["path"],)
     assert [p.partition(".")[0] for p in config.source.channels["gyro"].paths] == [FIELDS["time"]["path"]] * 3

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 
 from driftlab.cli import app
-from driftlab.jobs.export import read_map
-from driftlab.jobs.import_calibration import import_to_file
+from driftlab.commands.export import read_map
+from driftlab.commands.import_map import import_map
 from fusion_core.errors import ConfigError
 from fusion_plugins.exporters.ardupilot import Ardupilot
 from fusion_plugins.exporters.px4 import Px4
@@ -31,10 +31,15 @@ def called(*args, status=0):
     return done.output
 
 
+def imported(exporter, name, folder, out="map.json", **more):
+    settings = {"device_id": DEVICE} if exporter.kind == "px4" else {}
+    return import_map(exporter.kind, folder / name, folder / out, settings=settings, **more)
+
+
 @targets
 def test_what_comes_back_is_what_the_firmware_holds(exporter, name, tmp_path):
     exporter.export(unit(fitted()), tmp_path / name)
-    found = import_to_file(exporter, tmp_path / name, tmp_path / "map.json")
+    found = imported(exporter, name, tmp_path)
     held = read_map(tmp_path / "map.json")
     T = np.linspace(-10, 50, 999)
     # to the rounding of single precision at the largest offset, 4e-3 rad/s, of some four operations
@@ -48,7 +53,7 @@ def test_what_comes_back_is_what_the_firmware_holds(exporter, name, tmp_path):
 @targets
 def test_a_cubic_goes_round(exporter, name, tmp_path):
     exporter.export(unit(cubic()), tmp_path / name)
-    import_to_file(exporter, tmp_path / name, tmp_path / "map.json")
+    imported(exporter, name, tmp_path)
     T = np.linspace(-10, 50, 999)
     np.testing.assert_allclose(read_map(tmp_path / "map.json").bias(T), cubic().bias(T), atol=3e-9)
 
@@ -56,19 +61,19 @@ def test_a_cubic_goes_round(exporter, name, tmp_path):
 def test_another_kind_of_map_and_a_channel_that_is_not_there(tmp_path):
     exporter, name = EXPORTERS[0]
     exporter.export(unit(fitted()), tmp_path / name)
-    found = import_to_file(exporter, tmp_path / name, tmp_path / "map.json", kind="spline")
+    found = import_map(exporter.kind, tmp_path / name, tmp_path / "map.json", map_kind="spline")
     assert found.map.record.kind == "spline"
     with pytest.raises(ConfigError, match=r"--channel accel: .*a.params has a thermal calibration of gyro alone; name"):
-        import_to_file(exporter, tmp_path / name, tmp_path / "map.json", channel="accel")
+        import_map(exporter.kind, tmp_path / name, tmp_path / "map.json", channel="accel")
     with pytest.raises(ConfigError, match=r"--kind splin: did you mean spline"):
-        import_to_file(exporter, tmp_path / name, tmp_path / "map.json", kind="splin")
+        import_map(exporter.kind, tmp_path / name, tmp_path / "map.json", map_kind="splin")
 
 
 def test_the_parameters_are_not_overwritten_by_the_map(tmp_path):
     exporter, name = EXPORTERS[0]
     exporter.export(unit(fitted()), tmp_path / name)
     with pytest.raises(ConfigError, match="is read here, and would be lost"):
-        import_to_file(exporter, tmp_path / name, tmp_path / name)
+        imported(exporter, name, tmp_path, name)
 
 
 def test_a_form_that_cannot_be_read_back(tmp_path):

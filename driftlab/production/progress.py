@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from driftlab.commands.common import terminal
-from driftlab.commands.session import session
+from driftlab.commands.console import session, terminal
 from driftlab.production.summary import FleetProgress, Stage
 from fusion_core.escaping import line
 
@@ -19,11 +18,11 @@ EVERY = 30.0  # s between lines of a log
 def fleet_progress() -> Iterator[FleetProgress]:
     """Show the stages of a fleet on standard error, with units done and failed, and an estimate of the end."""
     console = terminal(stderr=True)
-    shown = _Bar() if console.is_terminal and not session().quiet else _Log(quiet=session().quiet)
+    reporter = _Bar() if console.is_terminal and not session().quiet else _Log(quiet=session().quiet)
     try:
-        yield shown
+        yield reporter
     finally:
-        shown.close()
+        reporter.close()
 
 
 class _Log:
@@ -31,14 +30,14 @@ class _Log:
 
     def __init__(self, *, quiet: bool) -> None:
         self.quiet, self.stage = quiet, Stage("")
-        self.said = time.monotonic()
+        self.written = time.monotonic()
 
     def __call__(self, stage: Stage) -> None:
         if stage is not self.stage:
             self._note()
             self.stage = stage
-        if not self.quiet and time.monotonic() - self.said >= EVERY:
-            self.said = time.monotonic()
+        if not self.quiet and time.monotonic() - self.written >= EVERY:
+            self.written = time.monotonic()
             sys.stderr.write(f"{line(stage.text())}\n")
             sys.stderr.flush()
 

@@ -4,9 +4,10 @@ import re
 
 import h5py
 import pytest
+from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 
-from driftlab.commands.compare import compare as command
+from driftlab.cli import app
 
 CONFIG = """
 source:
@@ -30,12 +31,14 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture
-def printed(bench, monkeypatch, capsys):
+def printed(bench, monkeypatch):
     def printed(count, *, columns=80, paper=False):
         monkeypatch.setenv("COLUMNS", str(columns))
         paths = [bench / f"{name}.yaml" for name in NAMES[:count]]
-        command(paths, input=[str(bench / "unit.h5")], out=None, paper=paper, json=False)
-        return capsys.readouterr().out
+        more = ["--paper"] if paper else []
+        done = CliRunner().invoke(app, ["compare", *map(str, paths), "--input", str(bench / "unit.h5"), *more])
+        assert done.exit_code == 0, done.output
+        return done.stdout
 
     return printed
 

@@ -9,11 +9,11 @@ from closed_loops import AUXILIARY, TOLD, assert_same_coast, kinds, left_out, lo
 from threadpoolctl import threadpool_limits
 from units_with_effects import CONFIG, make_unit
 
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
 from driftlab.identification.config_edit import with_map
 from driftlab.identification.records import gather
 from driftlab.identification.search import search
-from driftlab.jobs.explain import explain
 from driftlab.maps.fit import fit_map
 from fusion_core.faults import Faults
 
@@ -123,7 +123,7 @@ def test_recordings_with_undeclared_effects(recordings, tmp_path, unit, expected
     path = tmp_path / "declared.yaml"
     path.write_text(CONFIG.format(channels=named).replace("accel, unit: m/s^2", "accel, unit: g"))
     names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(path), *names, tmp_path / "out")
+    closed = explain(load_config(path), *names, out=tmp_path / "out").closed
     assert kinds(closed) == expected
     truth = np.load(folder / "holdout_bias_truth.npy")
     with h5py.File(tmp_path / "out" / "prediction.h5") as file, h5py.File(folder / "holdout.h5") as holdout:
@@ -169,7 +169,7 @@ def test_a_resistor_in_an_oven_lags_behind_its_thermometer(recordings, tmp_path)
     path = tmp_path / "declared.yaml"
     path.write_text(OVEN)
     names = [[f"{tmp_path / 'oven.h5'}{ramp}"] for ramp in RAMPS]
-    closed = explain(load_config(path), *names, tmp_path / "out")
+    closed = explain(load_config(path), *names, out=tmp_path / "out").closed
     assert kinds(closed) == ["relaxation"]
     assert closed.search.model[0].free
     (effect,) = load_config(tmp_path / "out" / "explained.yaml").filter.gyro.bias.effects
@@ -204,7 +204,7 @@ def test_a_resistor_is_explained_in_its_own_unit(recordings, tmp_path):
     path = tmp_path / "declared.yaml"
     path.write_text(HELD)
     names = [[f"{recordings / 'data' / 'oven_resistors' / 'lagging.csv'}{ramp}"] for ramp in RAMPS]
-    closed = explain(load_config(path), *names, tmp_path / "out")
+    closed = explain(load_config(path), *names, out=tmp_path / "out").closed
     content = closed.content
     assert kinds(closed) == ["relaxation"]
     assert content["unit"] == "1"

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
+from driftlab.commands.simulate import simulate, simulation
 from driftlab.config import load_config
-from driftlab.jobs.simulate import simulate, simulation
 from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.faults import Faults
@@ -41,7 +41,7 @@ def whole(source):
 
 
 def test_hdf5_is_read_back_with_units_from_the_file(config, tmp_path):
-    written = simulate(config, tmp_path / "twin.h5")
+    written = simulate(config, out=tmp_path / "twin.h5")
     assert (written.rows, written.span, written.lines()) == (600, (0.0, 29.95), [])
     source = Hdf5(path=tmp_path / "twin.h5", channels={name: {"path": name} for name in ("time", *CHANNELS)})
     got, made = whole(source), whole(config.source)
@@ -56,7 +56,7 @@ def test_hdf5_is_read_back_with_units_from_the_file(config, tmp_path):
 
 def test_csv_is_read_back_as_its_comments_say(config, tmp_path):
     path = tmp_path / "twin.csv"
-    simulate(config, path)
+    simulate(config, out=path)
     comments = [line.removeprefix("# ") for line in path.read_text().splitlines() if line.startswith("#")]
     settings = yaml.safe_load("\n".join(comments[1:-1]))["source"]
     got, made = whole(Csv.model_validate({**settings, "path": path})), whole(config.source)
@@ -69,7 +69,7 @@ def test_csv_is_read_back_as_its_comments_say(config, tmp_path):
 def test_a_recording_of_several_chunks_is_one_file(config, tmp_path):
     source = simulation(config, None, "1 h")
     for name, kind in (("long.h5", Hdf5), ("long.csv", Csv)):
-        simulate(config, tmp_path / name, duration="1 h")
+        simulate(config, out=tmp_path / name, duration="1 h")
         fields = {"time": {"path": "time", "unit": "s"}, "temperature": {"path": "temperature", "unit": "degC"}}
         got = whole(kind(path=tmp_path / name, channels=fields))
         assert len(got) == 72_000
@@ -100,9 +100,9 @@ def test_a_wrong_seed_or_duration_is_named(config, seed, duration, message):
 @pytest.mark.parametrize("name", ["twin.h5", "twin.csv"])
 def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, name):
     out = tmp_path / name
-    simulate(config, out)
+    simulate(config, out=out)
     first = out.read_bytes()
-    simulate(config, out, seed=9)
+    simulate(config, out=out, seed=9)
     assert out.read_bytes() != first
     edited = out.read_bytes()[:-100] + out.read_bytes()[-90:]
     out.write_bytes(edited)
@@ -111,7 +111,7 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     assert out.read_bytes() == edited
     out.write_text("time,gx\n0,1\n")
     with pytest.raises(ConfigError, match="is not a simulated recording; name another file, or remove it"):
-        simulate(config, out)
+        simulate(config, out=out)
     assert out.read_text() == "time,gx\n0,1\n"
     simulate(config, tmp_path / "edited.h5")
     with h5py.File(tmp_path / "edited.h5", "r+") as file:
@@ -121,7 +121,7 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     with h5py.File(tmp_path / "measured.h5", "w") as file:
         file["gyro"] = [1.0]
     with pytest.raises(ConfigError, match="is not a simulated recording"):
-        simulate(config, tmp_path / "measured.h5")
+        simulate(config, out=tmp_path / "measured.h5")
 
 
 def test_a_run_that_dies_leaves_the_final_name_alone(config, tmp_path):
@@ -129,7 +129,7 @@ def test_a_run_that_dies_leaves_the_final_name_alone(config, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(config, tmp_path / "twin.h5", progress=stop)
+        simulate(config, out=tmp_path / "twin.h5", progress=stop)
     assert not (tmp_path / "twin.h5").exists()
     with h5py.File(tmp_path / "twin.h5.partial") as file:
         assert len(file["time"]) == 600
@@ -137,10 +137,10 @@ def test_a_run_that_dies_leaves_the_final_name_alone(config, tmp_path):
 
 def test_what_cannot_be_written_is_said(config, tmp_path):
     with pytest.raises(ConfigError, match=r"ends in '.mat'; write a name that ends in .h5, .hdf5 or .csv"):
-        simulate(config, tmp_path / "twin.mat")
+        simulate(config, out=tmp_path / "twin.mat")
     (tmp_path / "file").write_text("")
     with pytest.raises(FusionError, match="cannot be written"):
-        simulate(config, tmp_path / "file" / "twin.h5")
+        simulate(config, out=tmp_path / "file" / "twin.h5")
 
 
 def test_a_source_that_reads_a_file_does_not_simulate(tmp_path):
@@ -155,7 +155,7 @@ def test_a_source_that_reads_a_file_does_not_simulate(tmp_path):
 def test_an_earth_that_stands_still_is_noticed(tmp_path):
     (tmp_path / "a.yaml").write_text(TWIN.replace("30 s, latitude: 40.9 deg", "30 s"))
     config = load_config(tmp_path / "a.yaml")
-    written = simulate(config, tmp_path / "a.h5")
+    written = simulate(config, out=tmp_path / "a.h5")
     assert written.lines() == [
         "the recording has no Earth rate, and latitude is 40.9 deg in the rest of the config; write the same under "
         "source.latitude"

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from units_with_effects import make_unit
 
 from driftlab.cli import app
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
-from driftlab.jobs.explain import explain
 from fusion_core.errors import ConfigError, EmptyRecording
 
 
@@ -154,14 +154,14 @@ def test_what_cannot_be_explained_is_refused(hysteresis, tmp_path, change, messa
     holdout = f"{change.get('holdout', 'holdout')}.h5{change.get('span', '')}"
     roles = ["soak.h5"], change.get("train", ["train.h5"]), [holdout]
     with pytest.raises(ConfigError, match=message):
-        explain(load_config(path), *[[str(folder / name) for name in names] for names in roles], tmp_path / "out")
+        explain(load_config(path), *[[str(folder / name) for name in names] for names in roles], out=tmp_path / "out")
 
 
 def test_recordings_that_end_with_the_alignment_teach_nothing(tmp_path):
     make_unit(tmp_path, 7, (), (), hours=(0.018, 0.018, 0.04))
     names = [[str(tmp_path / f"{name}.h5")] for name in ("soak", "train", "holdout")]
     with pytest.raises(EmptyRecording, match="nothing is left to predict; record longer"):
-        explain(load_config(tmp_path / "declared.yaml"), *names, tmp_path / "out")
+        explain(load_config(tmp_path / "declared.yaml"), *names, out=tmp_path / "out")
 
 
 def read(folder):
@@ -173,7 +173,7 @@ def test_a_recording_may_serve_as_calibration_and_train(hysteresis, tmp_path):
     folder, _, _ = hysteresis
     shutil.copy(folder / "soak.h5", tmp_path / "again.h5")
     names = [str(folder / "soak.h5")], [str(tmp_path / "again.h5")], [str(folder / "holdout.h5")]
-    closed = explain(load_config(folder / "declared.yaml"), *names, tmp_path / "out")
+    closed = explain(load_config(folder / "declared.yaml"), *names, out=tmp_path / "out").closed
     assert len(closed.search.columns.evidence.records) == 1
     assert len(closed.left_out) == 5
     assert kinds(closed) == ["hysteresis"]
@@ -186,7 +186,7 @@ def test_without_a_map_temperature_is_a_channel_like_any_other(hysteresis, tmp_p
     bias = "bias: {kind: random_walk, walk: 0.02 deg/h/sqrt(s)}"
     path.write_text(re.sub(r"bias: {kind: thermal_derivative.*", bias, read(folder), count=1))
     names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(path), *names, tmp_path / "out")
+    closed = explain(load_config(path), *names, out=tmp_path / "out").closed
     assert "curve" in kinds(closed)
     content = closed.content
     before, after = (np.linalg.norm(content[when]["coast_rmse_rad_s"]) for when in ("before", "after"))
@@ -213,6 +213,6 @@ def test_the_standard_filter_can_be_explained_too(hysteresis, tmp_path):
     path = tmp_path / "standard.yaml"
     path.write_text(re.sub(r"bias: {kind: thermal_derivative.*", standard, text, count=1))
     names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(path), *names, tmp_path / "out")
+    closed = explain(load_config(path), *names, out=tmp_path / "out").closed
     assert kinds(closed) == ["hysteresis"]
     assert "kind: thermal_derivative" in (tmp_path / "out" / "explained.yaml").read_text()

@@ -1,23 +1,31 @@
-"""What a function of the Python API gives: arrays by name, with units, as tables, figures and files."""
+"""The result of a command: arrays by name, with units, as tables, figures and files."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
-from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from driftlab.evaluation.limits import EXIT, outcome
+from driftlab.reports.charts import Chart
+from driftlab.reports.figures import figure_of
+from driftlab.storage.folders import output_folder
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
 Units = Mapping[str, str | tuple[str, ...]]
+
+
+R = TypeVar("R", bound="Result")
 
 
 class Result(Mapping[str, NDArray[Any]]):
@@ -33,29 +41,50 @@ class Result(Mapping[str, NDArray[Any]]):
         What the columns of each (N, d) array are called.
     summary : dict
         What a program may want to know, in SI; the content of the command's JSON.
+    limits_verdict : str
+        Whether the limits of the config are kept, in one line; empty where there are none.
+    command : str
+        Whose folder of files it is.
     """
 
     name: str
-    units: Units
-    labels: Mapping[str, tuple[str, ...]]
+    units: Units = {}  # noqa: RUF012 - read alone
+    labels: Mapping[str, tuple[str, ...]] = {}
     summary: dict[str, Any]
-    _columns: Mapping[str, NDArray[Any]]
+    limits_verdict: str = ""
+    command: ClassVar[str] = ""
+    _columns: Mapping[str, Any]
+    _read: Collection[Path] = ()  # files that it was made from: none of them may be in the folder that it is saved to
 
-    @abstractmethod
     def plot(self) -> Figure:
-        """Draw what there is to see, with units on every axis."""
+        """Draw the chart of the result, with units on every axis."""
+        return figure_of(self._chart())
 
-    @abstractmethod
+    def _chart(self) -> Chart:
+        raise NotImplementedError
+
     def save(self, out: str | PathLike[str]) -> None:
-        """Write what the command writes, under the same rules; raises ConfigError or Unwritable."""
+        """Write the files of the command into the folder `out`, under its rules; raises ConfigError or Unwritable."""
+        with output_folder(Path(out), self.command, self._read) as folder:
+            self._write(folder)
+
+    def _write(self, folder: Path) -> None:
+        """Write the files into a folder that is there."""
+        raise NotImplementedError
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command where limits are enforced."""
+        return EXIT[outcome(self.limits_verdict)]
 
     def lines(self) -> list[str]:
-        """Return what one should know of it, a sentence each."""
+        """Return the notes on it, a sentence each."""
         return []
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         try:
-            return self._columns[name]
+            values: NDArray[Any] = self._columns[name]
+            return values
         except KeyError:
             raise KeyError(f"{name}; there are {', '.join(self._columns)}") from None
 
@@ -68,7 +97,7 @@ class Result(Mapping[str, NDArray[Any]]):
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name.startswith("_") or name not in self._columns:
             raise AttributeError(f"{type(self).__name__} has no '{name}'; its arrays are {', '.join(self)}")
-        return self._columns[name]
+        return self[name]
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *self})
@@ -81,7 +110,7 @@ class Result(Mapping[str, NDArray[Any]]):
         """
         import polars as pl
 
-        found: dict[str, NDArray[Any]] = {}
+        columns: dict[str, NDArray[Any]] = {}
         arrays = dict(self._columns)
         N = len(next(reversed(arrays.values()), ()))
         for name, values in ((name, values) for name, values in arrays.items() if len(values) == N):
@@ -90,14 +119,15 @@ class Result(Mapping[str, NDArray[Any]]):
             units = unit if isinstance(unit, tuple) else (unit,) * d
             labels = self.labels.get(name) or tuple(str(k) for k in range(d))
             names = [name] if values.ndim == 1 else [f"{name}_{label}" for label in labels]
-            found |= dict(zip(map(_column, names, units), np.atleast_2d(values.T), strict=True))
-        return pl.DataFrame({name: np.ascontiguousarray(values) for name, values in found.items()})
+            titles = [f"{title} [{unit}]" if unit else title for title, unit in zip(names, units, strict=True)]
+            columns |= dict(zip(titles, np.atleast_2d(values.T), strict=True))
+        return pl.DataFrame({name: np.ascontiguousarray(values) for name, values in columns.items()})
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
         arrays = "".join(f"<li>{html.escape(line)}</li>" for line in self._arrays())
         return (
-            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{picture(self.plot())}"
+            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{_picture(self.plot())}"
             f"<details><summary>{len(self)} arrays</summary><ul>{arrays}</ul></details>"
         )
 
@@ -106,24 +136,30 @@ class Result(Mapping[str, NDArray[Any]]):
         return "\n  ".join([f"{type(self).__name__}: {self.name}", *self._arrays(), *notes])
 
     def _arrays(self) -> list[str]:
-        """Return what each array is called, its columns and its unit."""
-        found = []
+        """Return the name of each array, with its columns and its unit."""
+        texts = []
         for name in self:
             unit, labels = self.units.get(name), self.labels.get(name)
-            shown = unit if isinstance(unit, str) or unit is None else ", ".join(unit)
-            found.append(name + (f" ({', '.join(labels)})" if labels else "") + (f" [{shown}]" if shown else ""))
-        return found
+            text = unit if isinstance(unit, str) or unit is None else ", ".join(unit)
+            texts.append(name + (f" ({', '.join(labels)})" if labels else "") + (f" [{text}]" if text else ""))
+        return texts
 
     # two results are the same where they are one: arrays have no truth value
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
 
-def _column(name: str, unit: str | None) -> str:
-    return f"{name} [{unit}]" if unit else name
+def in_folder(out: str | PathLike[str] | None, command: str, read: Collection[Path], make: Callable[[], R]) -> R:
+    """Make a result; with `out`, write its files into that folder, which is looked at before anything is computed."""
+    if out is None:
+        return make()
+    with output_folder(Path(out), command, read) as folder:
+        result = make()
+        result._write(folder)
+    return result
 
 
-def picture(figure: Figure) -> str:
+def _picture(figure: Figure) -> str:
     """Return a figure as an element of a page."""
     drawing = io.BytesIO()
     figure.savefig(drawing, format="png", dpi=80)

@@ -10,8 +10,8 @@ from supplied_resistors import STEP, table, unit, write
 from typer.testing import CliRunner
 
 from driftlab.cli import app
+from driftlab.commands.explain import explain
 from driftlab.config import load_config
-from driftlab.jobs.explain import explain
 from fusion_core.errors import ConfigError
 
 
@@ -21,7 +21,7 @@ def linear(u):
 
 def explained(folder, *args, **options):
     config, *recordings = unit(folder, *args, **options)
-    return explain(load_config(config), *recordings, folder / "out", read=[config])
+    return explain(config, *recordings, out=folder / "out").closed
 
 
 def by_command(folder, *args, **options):
@@ -134,4 +134,4 @@ def test_one_recording_under_two_names_is_refused(tmp_path, how):
         rows[:, 0] = STEP * np.arange(len(rows))
     again = write(tmp_path / "again.csv", rows, digits)
     with pytest.raises(ConfigError, match="was given for fitting, and cannot judge it"):
-        explain(load_config(config), soak, train, [again], tmp_path / "out")
+        explain(load_config(config), soak, train, [again], out=tmp_path / "out")

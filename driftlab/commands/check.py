@@ -1,0 +1,160 @@
+"""Configs as they are understood, and plugins: `driftlab check`, `driftlab plugins`, and `driftlab schema`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+
+from driftlab.commands.console import print_json, say, terminal
+from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
+from driftlab.config import Config, maps_of
+from driftlab.filtering.setup import check_channels, loaded_map, prior
+from driftlab.maps.fit import map_lines
+from driftlab.recordings.screening import head
+from fusion_core.host.config import quantities
+from fusion_core.host.registry import Entry, registry
+from fusion_core.host.schema import config_schema
+from fusion_core.testing import laws
+from fusion_core.units import Quantity
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """A config that can be used: every quantity with its place, and what is to be known, a sentence each."""
+
+    config: Config
+    quantities: dict[str, Quantity]
+    remarks: tuple[str, ...]
+
+
+def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = None) -> CheckResult:
+    """Check a config, its maps and the head of its recording.
+
+    Prints the config as it is understood.
+
+    Parameters
+    ----------
+    config, data, units : as those of `run`
+
+    Returns
+    -------
+    CheckResult
+        `config` as it is understood, `quantities` by their place, and `remarks`.
+
+    Raises
+    ------
+    DataError, ConfigError
+        If they cannot be used, or not together.
+    """
+    understood = config_with(config, data, units)
+    if understood.filter is not None:
+        prior(understood.filter)  # says what is wrong with deviations
+    first = head(understood)
+    if first is not None and understood.filter is not None:
+        check_channels(understood.filter, first.chunk)
+    remarks = [*_map_remarks(understood), *(() if first is None else first.lines)]
+    return CheckResult(understood, dict(quantities(understood)), tuple(remarks))
+
+
+def _map_remarks(config: Config) -> list[str]:
+    remarks = []
+    for sensor in () if config.filter is None else reversed(config.filter.sensors):
+        for settings in maps_of(sensor):
+            if settings.path is None:
+                remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
+            elif not settings.path.exists():
+                remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
+            else:
+                remarks += map_lines(loaded_map(settings, sensor), sensor)
+    return remarks
+
+
+def content_of(result: CheckResult, given: Mapping[str, Any]) -> Any:
+    """Return the config as it is understood, with its quantities."""
+    values = {at: {"text": q.text, "value": float(q), "unit": _unit(q)} for at, q in result.quantities.items()}
+    return {**result.config.model_dump(mode="json", exclude_none=True), "quantities": values}
+
+
+def show(result: CheckResult, given: Mapping[str, Any]) -> None:
+    """Print the config as YAML, with its quantities and the remarks as comments."""
+    say(result.config.as_yaml())
+    for at, quantity in result.quantities.items():
+        say(f"# {at}: {quantity.text} = {float(quantity):.6g} {_unit(quantity)}\n")
+    for line in result.remarks:
+        say(f"# {line}\n")
+
+
+def _unit(quantity: Quantity) -> str:
+    return (quantity.unit or "").replace("delta_degC", "K")
+
+
+def plugins(*, json: bool = False, check: bool = False) -> None:
+    """List every plugin with its distribution, version and state.
+
+    Parameters
+    ----------
+    json : bool
+        Print JSON for programs instead of text.
+    check : bool
+        Hold each to the laws of its family.
+    """
+    from rich.table import Table
+
+    if check:
+        _print_laws(json)
+        return
+    entries = sorted(registry().entries, key=lambda e: (e.error is not None, e.family, e.kind))
+    if json:
+        fields = ("family", "kind", "distribution", "version", "module", "error")
+        print_json([{name: getattr(e, name) for name in fields} for e in entries])
+        return
+    table = Table("family", "kind", "distribution", "version", "state")
+    for e in entries:
+        table.add_row(e.family, e.kind, e.distribution, e.version, "ok" if e.error is None else f"broken: {e.error}")
+    terminal().print(table)
+
+
+def schema() -> None:
+    """Print the JSON schema of the config.
+
+    Every installed plugin is in it.
+    """
+    print_json(config_schema(Config.model_json_schema()))
+
+
+def law_checks(entry: Entry) -> list[tuple[str, str | None]]:
+    """Return every law of a plugin that gives examples, and why it does not hold, None where it does."""
+    if entry.plugin is None:  # broken, or no class: a product is a file
+        return [] if entry.error is None else [("loads", entry.error)]
+    try:
+        examples = laws(entry.plugin)
+    except Exception as error:
+        return [("gives examples", f"{type(error).__name__}: {error}")]
+    names = (str(law).partition(": ")[2] if law.of == entry.kind else str(law) for law in examples)
+    return [(name, law.broken()) for name, law in zip(names, examples, strict=True)]
+
+
+def _print_laws(json: bool) -> None:
+    """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
+    from rich.table import Table
+
+    entries = sorted(registry().entries, key=lambda e: (e.family, e.kind))
+    checks = [(entry, law_checks(entry)) for entry in entries]
+    broken = [(entry.kind, law, error) for entry, results in checks for law, error in results if error is not None]
+    if json:
+        keys = ("family", "kind", "law", "error")
+        print_json([dict(zip(keys, (e.family, e.kind, *one), strict=True)) for e, results in checks for one in results])
+    else:
+        table = Table("family", "kind", "laws kept")
+        for entry, results in checks:
+            held = sum(error is None for _, error in results)
+            none = "none: it gives no examples" if entry.plugin is not None else "none: it is a file"
+            table.add_row(entry.family, entry.kind, f"{held} of {len(results)}" if results else none)
+        terminal().print(table)
+        for kind, law, error in broken:
+            say(f"{kind}: {law}: {error}\n")
+    if broken:
+        raise typer.Exit(1)

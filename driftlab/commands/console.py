@@ -1,0 +1,239 @@
+"""The console of a command: what every command takes, what it prints, and progress for people.
+
+`-q`: nothing but errors and what a program asked for. `-v`: on standard error, how long each stage took and which
+plugins took part.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING, Any
+
+from fusion_core.escaping import json_text, line, lines
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from driftlab.config import Config
+
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+COLOURS = {"pass": "green", "fail": "bold red", "undecided": "bold magenta", "unknown": "bold yellow"}
+COMPILED = 1.0  # s of compiling, after which it is announced
+
+
+@dataclass
+class Session:
+    """One command in progress.
+
+    Attributes
+    ----------
+    quiet, verbose : bool
+    settings : list of str
+        Keys to set beside each config, as `KEY=VALUE`.
+    configs : list of Config
+        Those that were loaded.
+    stages : list of (str, float)
+        What was done, and for how long, s.
+    """
+
+    quiet: bool = False
+    verbose: bool = False
+    settings: list[str] = field(default_factory=list)
+    configs: list[Config] = field(default_factory=list)
+    stages: list[tuple[str, float]] = field(default_factory=list)
+    begun: float = field(default_factory=time.monotonic)
+
+    def lines(self) -> list[str]:
+        """Return the report of `-v`."""
+        took = [*self.stages, ("in all", time.monotonic() - self.begun)]
+        width = max(len(what) for what, _ in took)
+        lines = [f"{what:<{width}}  {seconds:8.2f} s" for what, seconds in took]
+        return lines + [f"plugin: {plugin}" for plugin in self._plugins()]
+
+    def _plugins(self) -> list[str]:
+        """Return family, kind and distribution of every plugin that the configs name."""
+        from fusion_core.host.provenance import participants
+
+        values = [item for config in self.configs for item in participants(config)]
+        lines = (f"{p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in values)
+        return list(dict.fromkeys(lines))
+
+
+CURRENT: ContextVar[Session] = ContextVar("session")
+
+
+def session() -> Session:
+    """Return the command in progress; a fresh one where none is, as in a test of a part."""
+    return CURRENT.get(None) or Session()
+
+
+@contextmanager
+def in_session(quiet: bool, verbose: bool, settings: list[str] | None) -> Iterator[None]:
+    """Let a command be the one in progress; at its end say how long the stages took, where that is asked."""
+    now = Session(quiet, verbose, settings or [])
+    token = CURRENT.set(now)
+    try:
+        yield
+    finally:
+        if verbose:
+            sys.stderr.write("".join(f"{line(text)}\n" for text in now.lines()))
+        CURRENT.reset(token)
+
+
+def say(text: str) -> None:
+    """Print text for people, a line or several; a name in it that is a stranger's acts on no terminal."""
+    if not session().quiet:
+        sys.stdout.write(lines(text))
+
+
+def print_json(content: Any, indent: int | None = 2) -> None:
+    """Print JSON for programs; a text is JSON already."""
+    sys.stdout.write((content if isinstance(content, str) else json_text(content, indent)) + "\n")
+
+
+def load(path: Path, recordings: list[str] | None = None, channel: str | None = None) -> Config:
+    """Read a config, with recording, keys and tracked sensor of the command line in place of its own.
+
+    Raises
+    ------
+    ConfigError
+        If the config is wrong, has no sensor of that channel, or more than one recording is given.
+    """
+    from driftlab.config import load_config
+    from fusion_core.errors import ConfigError
+
+    if recordings and len(recordings) > 1:
+        raise ConfigError(f"--input: is given {len(recordings)} times, one recording was expected; run one at a time")
+    now, begun = session(), time.monotonic()
+    config = load_config(path, recordings[0] if recordings else None, now.settings).tracking(channel)
+    now.configs.append(config)
+    now.stages.append((f"reading {path.name}", time.monotonic() - begun))
+    return config
+
+
+def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
+    """Return the console for people: no text is markup (a path may look like it, `o[final]`), none acts on it."""
+    from rich.console import Console
+    from rich.segment import Segment
+
+    class Plain(Console):
+        def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+            for part in super().render(renderable, options):
+                yield part if part.control else Segment(lines(part.text), part.style)
+
+    return Plain(stderr=stderr, width=width, quiet=session().quiet, markup=False, emoji=False, highlight=False)
+
+
+def pairs(given: list[str], option: str, form: str, example: str) -> dict[str, str]:
+    """Return the values of an option that may be repeated, as KEY=VALUE, by key; raises ConfigError."""
+    from fusion_core.errors import ConfigError
+
+    values = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"{option} {text}: is not {form}; write e.g. {option} {example}")
+        values[key.strip()] = value.strip()
+    return values
+
+
+def print_verdict(line: str, before: str = "") -> None:
+    """Print whether the limits are kept, in the colour of the outcome; nothing where there are none."""
+    from rich.text import Text
+
+    from driftlab.evaluation.limits import outcome
+
+    if line:
+        text = Text.assemble(before, (line, COLOURS[outcome(line)]))
+        terminal().print(text, soft_wrap=True)
+
+
+def check_limits(config: Config, enforced: bool) -> None:
+    """Raise ConfigError where limits are to be enforced and the config has none."""
+    from fusion_core.errors import ConfigError
+
+    if enforced and (config.limits is None or not config.limits.declared):
+        raise ConfigError("--enforce-limits: the config has no limits, nothing would be enforced; set limits in it")
+
+
+def note_compiling() -> None:
+    """Announce once, on standard error, that loops are compiled: for an installation, or another processor."""
+    from numba.core import event
+
+    console = terminal(stderr=True)
+
+    class Notice(event.Listener):  # type: ignore[misc]
+        seconds, announced = 0.0, False
+
+        def on_start(self, event: Any) -> None:
+            if self.seconds > COMPILED and not self.announced:
+                self.announced = True
+                console.print(
+                    "compiling the filter for this processor, up to some minutes; it is kept for the next time",
+                    soft_wrap=True,
+                )
+            self.since = time.monotonic()
+
+        def on_end(self, event: Any) -> None:
+            self.seconds += time.monotonic() - self.since
+
+    event.register("numba:compile", Notice())
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[..., None]]:
+    """Show progress on standard error from the first second on, where a person is looking.
+
+    What is given is called with the seconds from the first row and the number of samples so far, or with a text.
+    """
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = terminal(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, transient=True)
+    task = bar.add_task(what, total=None)
+    stage, since = what, time.monotonic()
+    # by a clock of its own: what takes long need not say so
+    delayed = Timer(1.0, bar.start if console.is_terminal else bool)
+    delayed.daemon = True
+    delayed.start()
+
+    def done() -> None:
+        session().stages.append((stage, time.monotonic() - since))
+
+    def report(state: float | str, count: int = 0) -> None:
+        nonlocal stage, since
+        if isinstance(state, str):
+            done()
+            stage, since = f"{what}: {state}", time.monotonic()
+        text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
+        bar.update(task, description=f"{what}: {text}")
+
+    try:
+        yield report
+    finally:
+        done()
+        delayed.cancel()
+        delayed.join()
+        if bar.live.is_started:
+            bar.stop()
+
+
+def keep_freed_memory() -> None:
+    """Ask the C library to keep what is freed, where it is glibc: a run asks for the same blocks thousands of times.
+
+    It gives large blocks back to the system at once, and the system hands them out again page by page, each cleared: a
+    third of the steady method's time, an eighth of a whole run's.
+    """
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "gnu_get_libc_version"):
+        library = ctypes.CDLL(None)
+        library.mallopt(TRIM_THRESHOLD, 1 << 30)
+        library.mallopt(MMAP_THRESHOLD, 1 << 25)

@@ -1,1 +1,0 @@
-"""What each command does, as a function that leaves a folder of results."""
