@@ -14,7 +14,6 @@ its interval of 95 %, by the spread of the shares of single units.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 import numpy as np
 from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, soak
@@ -41,7 +40,7 @@ def soaked(kind: Kind, unit: Made, program: str, seed: int) -> UnitInformation:
 
 def family_of(kind: Kind, seed: int) -> Family:
     units = [(soaked(kind, unit, "whole", seed), "") for unit in kind.units(UNITS, seed)]
-    return replace(fit_family(units), bands=measure_bands(units, fit_family))
+    return fit_family(units).model_copy(update={"bands": measure_bands(units, fit_family)})
 
 
 def own_maps(found: UnitInformation, T: np.ndarray) -> Maps:

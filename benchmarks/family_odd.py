@@ -18,7 +18,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import foreign_families as foreign
@@ -170,7 +170,7 @@ def known(units: list[Dealt]) -> Family:
     pairs = [soaked(unit) for unit in units]
     family = fit_family([(one, "") for one, _ in pairs])
     found = find_outliers(family, [(one, "") for one, _ in pairs], [record for _, record in pairs])
-    return replace(family, laws=found.laws)
+    return family.model_copy(update={"laws": found.laws})
 
 
 def interval(k: int, n: int) -> str:

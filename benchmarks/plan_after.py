@@ -19,7 +19,7 @@ from common import Row, show
 
 from driftlab.config import load_config
 from driftlab.planning.chamber import Chamber, Profile, ramps
-from driftlab.planning.continuation import after, jointly, of_samples, read_parts
+from driftlab.planning.continuation import continuation_of, jointly, of_samples, read_parts
 from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_core.faults import Faults
@@ -50,7 +50,7 @@ def one(seed):
     rng = np.random.default_rng(seed)
     noise = WALK * np.cumsum(rng.normal(size=(longest, 3)), axis=0) + WHITE * rng.normal(size=(longest, 3))
     before = of_samples([(T_1, curve(T_1) + noise[: len(T_1)])], 1.0, subject, CHAMBER)
-    foretold = after(before, HOURS, None).chosen
+    foretold = continuation_of(before, HOURS, None).chosen
     T_2 = foretold.profile.samples(CHAMBER.lag, int(foretold.profile.duration))[1]
     own = noise[len(T_1) : len(T_1) + len(T_2)]
     parts = [before.parts[0], (T_2[: len(own)], curve(T_2)[: len(own)] + own)]

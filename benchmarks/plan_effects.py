@@ -87,13 +87,13 @@ class Case:
 
 def unit():
     """Return what the plan is told of the unit."""
-    from driftlab.planning.simulated_search import UnrecordedUnit
+    from driftlab.planning.unit_model import UnitModel
     from driftlab.units import BiasUnit
     from fusion_plugins.thermal_maps.spline import Spline
 
     of_all = lambda T: np.stack([curve(T)] * d, axis=1)  # noqa: E731
     noise = np.full(d, WHITE), np.full(d, WALK)
-    return UnrecordedUnit(Spline(), "gyro", ("x", "y", "z"), BiasUnit("rad/s", "deg/h"), *noise, of_all, 1.0, 60.0)
+    return UnitModel("gyro", ("x", "y", "z"), BiasUnit("rad/s", "deg/h"), Spline(), *noise, "", of_all, "")
 
 
 def temperature(profile):
@@ -131,7 +131,7 @@ def recording(case, effect, size):
     chunk = Chunk(means[0], {"temperature": means[1], "gyro": means[2]}, sensors=frozenset({"gyro"}))
     number = np.floor((chunk.t - chunk.t[0] + 1e-6) / interval)
     record = Record("made up", True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0)))
-    return Evidence((record,), "gyro", ("x", "y", "z"), unit().shown, interval, 60.0)
+    return Evidence((record,), "gyro", ("x", "y", "z"), unit().unit, interval, 60.0)
 
 
 def answer(case, effect, size):
@@ -171,7 +171,7 @@ def main():
         own = {t: [a for c, a in found if (c.profile, c.kind, c.times) == (profile, kind, t)] for t in (2.0, 0.5)}
         hits = {t: sum(kind in a or any(kind in v for v in a.values()) for a in answers) for t, answers in own.items()}
         others = ", ".join(sorted({str(set(a) | {n for v in a.values() for n in v}) for a in own[2.0]}))
-        size = one.found_from * unit().shown.factor
+        size = one.found_from * unit().unit.factor
         print(
             f"| {profile} | {kind} | {size:.2f} | {hits[2.0]}/{given.seeds} | {others} | {hits[0.5]}/{given.seeds} | "
             f"{', '.join(one.confused_with) or '-'} |",

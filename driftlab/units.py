@@ -69,6 +69,11 @@ class BiasUnit:
 RATE = BiasUnit("rad/s", "deg/h")
 
 
+def default_unit(si: str) -> BiasUnit:
+    """Return the unit of a bias in an SI unit: of a rate, and where there is none, shown in deg/h; else in SI."""
+    return RATE if si in ("", RATE.si) else BiasUnit(si, si)
+
+
 def unit_of(sensor: Sensor) -> BiasUnit:
     """Return the unit of the bias of a sensor."""
     return BiasUnit(sensor.unit, sensor.shown)

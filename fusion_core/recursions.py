@@ -1,6 +1,19 @@
-"""Recursions, compiled: a play (backlash), a lag, causal rates of a coarse signal, the mean of a state."""
+"""Recursions, compiled: a play (backlash), a lag, causal rates of a coarse signal, the mean of a state.
+
+A first-order lag tau dT/dt = u - T behind a chain of straight lines, u = u_i + s_i (t - t_i) on piece i, has the closed
+form (`LaggedLines`)
+
+::
+
+    T(t) = u(t) - s_i tau + c_i exp(-(t - t_i) / tau),    c_i = T(t_i) - u_i + s_i tau
+
+so it needs neither a step nor a memory.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numba import njit
@@ -161,3 +174,48 @@ def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, 
         variances[k] = variance
     memory[:] = np.array([one, two, count, step, variance])
     return steps, variances
+
+
+@dataclass(frozen=True)
+class LaggedLines:
+    """A chain of straight lines and the lag behind it, in S pieces; the last one lasts for ever.
+
+    Attributes
+    ----------
+    t, u, s, c : (S,) arrays
+        Beginning of each piece in s; the line there and its slope a second; the transient of the lag there.
+    tau : float
+        The lag in s.
+    """
+
+    t: Array
+    u: Array
+    s: Array
+    c: Array
+    tau: float
+
+    @classmethod
+    def behind(cls, t: Array, u: Array, tau: float) -> Self:
+        """Return the lag behind the points t, u (S,), in balance at the first; the last is held."""
+        s, c = np.append(np.diff(u) / np.diff(t), 0.0), np.empty(len(t))
+        T = u[0]
+        for i, length in enumerate(np.append(np.diff(t), 0.0)):
+            c[i] = T - u[i] + s[i] * tau
+            T = u[i] + s[i] * (length - tau) + (c[i] * np.exp(-length / tau) if tau else 0.0)
+        return cls(t, u, s, c, tau)
+
+    def piece(self, t: Array) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Return the index (N,) of the piece that holds each time t (N,) in s; before the first, that of the first."""
+        return np.maximum(np.searchsorted(self.t, t, side="right") - 1, 0)
+
+    def line(self, t: Array) -> Array:
+        """Return the lines (N,) at t (N,) in s."""
+        i = self.piece(t)
+        return np.asarray(self.u[i] + self.s[i] * (t - self.t[i]))
+
+    def lagged(self, t: Array) -> Array:
+        """Return the lag (N,) at t (N,) in s."""
+        i, line = self.piece(t), self.line(t)
+        if self.tau == 0:
+            return line
+        return np.asarray(line - self.s[i] * self.tau + self.c[i] * np.exp(-(t - self.t[i]) / self.tau))

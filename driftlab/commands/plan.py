@@ -17,15 +17,14 @@ from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
 from driftlab.identification.candidates import check_kinds
 from driftlab.planning.chamber import Profile
-from driftlab.planning.continuation import Continuation, of_samples, read_parts
-from driftlab.planning.continuation import after as after_recordings
+from driftlab.planning.continuation import Continuation, continuation_of, of_samples, read_parts
 from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
 from driftlab.planning.discrimination import DiscriminationCriterion, preferred
 from driftlab.planning.request import parse_request
 from driftlab.planning.search import SearchResult, search
 from driftlab.planning.short_soak import ShortSoakPlan, shortened
-from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
-from driftlab.planning.unit_model import fitted_map, twin_of
+from driftlab.planning.simulated_search import still_channels
+from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
 from driftlab.reports import plan as plan_profile
 from driftlab.reports import plan_continuation, plan_effects, plan_short_soak
 from driftlab.reports.charts import Chart
@@ -216,7 +215,7 @@ class _Inquiry:
 
         def result() -> PlanResult:
             rated = search(request.subject, chamber, self.hours, request.target, self.report)
-            unit = UnrecordedUnit.of(request.subject, chamber.low, chamber.high, self.config.filter)
+            unit = request.subject.with_curve(chamber.low, chamber.high)
             if self.effects:
                 rated = preferred(rated, DiscriminationCriterion(unit, chamber, self.hours, self.effects))
             outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
@@ -246,8 +245,8 @@ class _Inquiry:
             request = parse_request(self.config, self.hours, range=span, **self.request)
             chamber = request.chamber
             before = of_samples(parts, dt, request.subject, chamber)
-            rated = after_recordings(before, self.hours, request.target, self.report)
-            unit = UnrecordedUnit.of(before.subject, chamber.low, chamber.high, self.config.filter)
+            rated = continuation_of(before, self.hours, request.target, self.report)
+            unit = before.subject.with_curve(chamber.low, chamber.high)
             outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
             seen, subject = effects_in(unit, before.parts, before.dt, self.effects), before.subject
             lines = [
@@ -296,13 +295,13 @@ class _Inquiry:
                 partial(plan_short_soak.hours_chart, rated, unit),
                 lambda path, title: plan_short_soak.write_report(path, rated, unit, lines, title),
             )
-            sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.own}
+            sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.without_family}
             name = f"plan of a short soak for the {law.channel}"
             return PlanResult(name, rated, sigmas, law.axes, unit.si, presentation, read)
 
         return in_folder(out, "plan", read, result)
 
-    def _outlook(self, unit: UnrecordedUnit, profile: Profile, lag: float) -> DetectabilityReport:
+    def _outlook(self, unit: UnitModel, profile: Profile, lag: float) -> DetectabilityReport:
         self.report("effects")
         return predict_detectability(
             unit, lambda t: profile.body(t, lag), profile.duration, self.effects, still_channels(self.config)

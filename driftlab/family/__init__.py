@@ -1,1 +1,1 @@
-"""What units of one type have in common: their maps as draws from one law, and what follows for each unit."""
+"""Mixed model of the units of one type: their maps as draws from one law, outliers, and effects that they share."""

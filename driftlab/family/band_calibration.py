@@ -1,16 +1,16 @@
-"""How wide the bands of posterior maps must be: measured on units that their family was not fitted on.
+"""Calibration of the bands of posterior maps on units that their family was not fitted on.
 
 A posterior's deviation is right in the mean of the squares whatever the family's law; that 95 of 100 lie within 1.96
-of it is so for a Gaussian law alone. So units are left out of the family in folds, each is looked at as if a part of
-its range had been soaked, and the map that follows is held against the one of its whole soak::
+of it is so for a Gaussian law alone. So units are left out of the family in folds, each is taken as if a part of its
+range had been soaked, and the map that follows is compared with the one of its whole soak::
 
     z(T) = B(T) (c_part - c_whole) / s(T),    s^2 = B (C_part - C_whole) B'
 
-the whole soak's data holding the part's (C are the posterior covariances). The share p of |z| at temperatures that the
-part did not see is below its p-quantile; as a multiple f of a Gaussian's it says how wide the bands there are (split
+the whole soak's data including the part's (C are the posterior covariances). The share p of |z| at temperatures that
+the part did not see is below its p-quantile; as a multiple f of a Gaussian's it is the width of the bands there (split
 conformal prediction: Lei et al., Distribution-free predictive inference for regression, J. Am. Stat. Assoc. 113, 2018).
-What the whole soak leaves is noise that both maps share, of which nothing can be told: of the part's variance V only
-the share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, all is taken as it is. d axes.
+The rest after the whole soak is noise that both maps share, and cannot be measured: of the part's variance V only the
+share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, all is taken as it is. d axes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import NormalDist
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,21 +33,20 @@ PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.
 """Lower and upper end of what a left-out unit is taken to have seen, as shares of the family's range."""
 FOLDS = 5
 FAR = 0.01  # of the units left out have a larger distance than `far`
-FEWEST = 10  # units, below which nothing is measured
-MOST = 200  # units that are left out, so that the time does not grow with the family
+MIN_UNITS = 10  # below which nothing is measured
+MAX_LEFT_OUT = 200  # units, so that the time does not grow with the family
 ONE_AXIS = 50  # units from which on an axis has factors of its own
 SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
 GRID = 2  # temperatures an interval
 ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk, that passes ask for
-LEAST = 0.05  # of a variance, that the whole soak must have taken away
-
+GAINED = 0.05  # of a variance, that the whole soak must have taken away
 SAMPLE = 400  # units of a larger family that the folds are of
 
 Pairs = Sequence[tuple[UnitInformation, str]]
 
 
 def sample_of(count: int) -> set[int]:
-    """Return the places of the units that are looked at, of so many."""
+    """Return the places of the sampled units, of so many."""
     return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
 
 
@@ -59,40 +57,29 @@ def measure_bands(every: FamilyUnits, fit: Callable[[Pairs], Family], each: Para
 
     Parameters
     ----------
-    every : Units
-        The family's; SAMPLE of them are looked at where there are more.
-    fit : function of a list of pairs of Soaked and lot
+    every : FamilyUnits
+        The family's; SAMPLE of them are taken where there are more.
+    fit : function of a list of pairs of UnitInformation and lot
         Returns the family of these units, of which it is not given the rows.
-    each : Each, optional
-        Who goes through the folds.
+    each : ParallelMap, optional
+        Goes through the folds.
     """
-    chosen = sample_of(len(every))
-    units = [pair for k, pair in enumerate(every) if k in chosen]
+    sample = sample_of(len(every))
+    units = [pair for k, pair in enumerate(every) if k in sample]
     whole = _domain(units)
     long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
-    if len(long) < FEWEST:
+    if len(long) < MIN_UNITS:
         return None
-    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MOST)).astype(int))]
-    found = [_Measured([], []) for _ in PARTS]
-    for of_fold in each(partial(_measured, fit, whole), _folds(units, long), at_once=1):
-        for own, more in zip(found, of_fold, strict=True):
-            own.scores.extend(more.scores)
-            own.distances.extend(more.distances)
-    seen = {part: own for part, own in zip(PARTS, found, strict=True) if own.distances}
-    if not seen:
-        return None
-    return Bands(
-        units=len(long), parts=tuple(seen), factors=tuple(_factors(own.scores, len(long)) for own in seen.values()),
-        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in seen.values()),
-        noise=_typical([soaked for soaked, _ in units]),
-    )  # fmt: skip
-
-
-class _Measured(NamedTuple):
-    """Of one part: z and g of each unit, and its distance."""
-
-    scores: list[Array]
-    distances: list[Array]
+    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
+    folds = list(each(partial(_measured, fit, whole), _folds(units, long), at_once=1))
+    parts, factors, far = [], [], []
+    for k, part in enumerate(PARTS):
+        if measured := [pair for fold in folds for pair in fold[k]]:
+            parts.append(part)
+            factors.append(_factors([scores for scores, _ in measured], len(long)))
+            far.append(tuple(np.quantile([distances for _, distances in measured], 1 - FAR, axis=0).tolist()))
+    noise = _typical([soaked for soaked, _ in units])
+    return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
 def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
@@ -103,51 +90,45 @@ def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
         yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
 
 
-def _measured(fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[_Measured]:
-    """Return, of each part, what is measured on the units that were left out of their family in a fold."""
-    found = [_Measured([], []) for _ in PARTS]
-    family = fit(fold[0])
+def _measured(
+    fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]
+) -> list[list[tuple[Array, Array]]]:
+    """Return, of each part, z and g of the units that were left out of their family in a fold, and their distances."""
+    family, measured = fit(fold[0]), [list[tuple[Array, Array]]() for _ in PARTS]
     for soaked, lot in fold[1]:
-        _measure(family, soaked, lot, whole, found)
-    return found
-
-
-def _measure(
-    family: Family, soaked: UnitInformation, lot: str, whole: tuple[float, float], found: list[_Measured]
-) -> None:
-    more = family.posterior(soaked, lot)
-    for part, own in zip(PARTS, found, strict=True):
-        low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
-        short = soaked.between(low, high)
-        if short is not None:
-            T, scores = _scores(family, soaked, family.posterior(short, lot), more)
-            own.scores.append(scores[(low > T) | (high < T)])
-            own.distances.append(distance(family, short, lot))
+        more = family.posterior(soaked, lot)
+        for part, pairs in zip(PARTS, measured, strict=True):
+            low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
+            short = soaked.between(low, high)
+            if short is not None:
+                T, scores = _scores(family, soaked, family.posterior(short, lot), more)
+                pairs.append((scores[(low > T) | (high < T)], distance(family, short, lot)))
+    return measured
 
 
 def distance(family: Family, soaked: UnitInformation, lot: str) -> Array:
-    """Return how far (d,) what a unit's own soak says is from its family, noise reckoned with.
+    """Return the distance (d,) of a unit from its family by its own soak, noise included.
 
-    The mean square of what is seen of the coefficients, in as many directions as the soak tells more of than the
-    family does; 1 is expected of a Gaussian family.
+    The mean square of the coefficients in the directions on which the soak has more information than the family; 1 is
+    expected of a Gaussian family.
     """
-    before, (J, h) = family.marginal(lot), family.said(soaked)
-    found = np.ones(len(family.axes))
+    before, (J, h) = family.marginal(lot), family.information_of(soaked)
+    distances = np.ones(len(family.axes))
     for axis, C in enumerate(before.covariance):
         values, vectors = np.linalg.eigh(C)
         L = vectors * np.sqrt(np.maximum(values, 0.0))
-        told, U = np.linalg.eigh(L.T @ J[axis] @ L)
+        gain, U = np.linalg.eigh(L.T @ J[axis] @ L)
         a = U.T @ L.T @ (h[axis] - J[axis] @ before.c[axis])
-        seen = told > 1.0
+        seen = gain > 1.0
         if np.any(seen):
-            found[axis] = np.mean(a[seen] ** 2 / (told[seen] + told[seen] ** 2))
-    return found
+            distances[axis] = np.mean(a[seen] ** 2 / (gain[seen] + gain[seen] ** 2))
+    return distances
 
 
 def _typical(units: Sequence[UnitInformation]) -> Typical:
-    """Return the noise of units: of the walk, which a soak may hardly show, what some of them have in common.
+    """Return the noise of units; their walk, which a soak may hardly show, as some of them have it alike.
 
-    Where their passes ask for a larger walk than is likely by neighbouring rows, that is in it too.
+    Where their sweeps need a larger walk than is likely by neighbouring rows, that is in it too.
     """
     tiny = np.finfo(float).tiny
     logs = {name: np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny)) for name in ("white", "walk")}
@@ -178,7 +159,7 @@ def _share(soaked: UnitInformation, whole: tuple[float, float]) -> float:
 
 
 def _scores(family: Family, soaked: UnitInformation, less: Posterior, more: Posterior) -> tuple[Array, Array]:
-    """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
+    """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of a part of its soak.
 
     z is not a number where the part knew nearly as much as the whole.
     """
@@ -187,22 +168,22 @@ def _scores(family: Family, soaked: UnitInformation, less: Posterior, more: Post
     B = family.knots.values(at)
     own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
     gained = np.maximum(own - after, 0.0)
-    known = np.where(gained > LEAST * own, gained, np.nan)
+    known = np.where(gained > GAINED * own, gained, np.nan)
     return at, np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
     """Return the factors (3, d) of z and g (n, d, 2), of all axes alike where units are few; 1 where there are none."""
-    found = np.concatenate(scores)
-    if not len(found):
-        return ((1.0,) * found.shape[1],) * len(LEVELS)
+    both = np.concatenate(scores)
+    if not len(both):
+        return ((1.0,) * both.shape[1],) * len(LEVELS)
     if units < ONE_AXIS:
-        found = np.broadcast_to(found.reshape(-1, 1, 2), (found[..., 0].size, found.shape[1], 2))
-    share = np.mean(found[..., 1], axis=0)
+        both = np.broadcast_to(both.reshape(-1, 1, 2), (both[..., 0].size, both.shape[1], 2))
+    share = np.mean(both[..., 1], axis=0)
     rows = []
     for level in LEVELS:
         order = min(level * (units + 1) / units, 1.0)  # of the units left out and the new one
-        wide = np.array([_quantile(np.abs(own[np.isfinite(own)]), order, level, units) for own in found[..., 0].T])
+        wide = np.array([_quantile(np.abs(own[np.isfinite(own)]), order, level, units) for own in both[..., 0].T])
         rows.append(tuple(np.sqrt(wide**2 * share + 1 - share).tolist()))
     return tuple(rows)
 

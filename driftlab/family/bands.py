@@ -1,4 +1,4 @@
-"""How wide the bands of posterior maps must be, as it was measured (`driftlab.family.band_calibration`). d axes."""
+"""Widths of the bands of posterior maps, as measured (`driftlab.family.band_calibration`). d axes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVELS = (0.68, 0.95, 0.997)
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """What a posterior's deviation is multiplied by outside of low to high degC: `factors` (3, d), one a level.
+    """Factors (3, d) of a posterior's deviation outside of low to high degC, one a level.
 
     Between them, and of what was never measured, 1.
     """
@@ -45,16 +45,16 @@ class Typical(BaseModel):
 
 
 class Bands(BaseModel):
-    """What was measured on units left out of their family, as `family.json` has it.
+    """Measurements on units left out of their family, as `family.json` has them.
 
     Attributes
     ----------
     units : int
-        How many were left out in turn.
+        Number that were left out in turn.
     levels : tuple of float
         Shares that are to lie within.
     parts : (P, 2)
-        What was taken to be seen, as shares of the family's range.
+        Ranges that were taken to be seen, as shares of the family's.
     factors : (P, 3, d)
         At temperatures outside of it.
     far : (P, d)
@@ -72,11 +72,11 @@ class Bands(BaseModel):
     noise: Typical
 
     def band(self, domain: tuple[float, float], seen: tuple[float, float]) -> Band:
-        """Return what was measured where about as much was seen of the family's domain, degC."""
+        """Return the band of a unit by the part that is most like the range it saw of the family's domain, degC."""
         return Band(seen[0], seen[1], np.array(self.factors[self._nearest(domain, seen)]))
 
     def far_of(self, domain: tuple[float, float], seen: tuple[float, float]) -> Array:
-        """Return the distance (d,) of one unit in a hundred, where about as much was seen of the domain, degC."""
+        """Return the distance (d,) that one unit in a hundred exceeds, by the part most like the range seen, degC."""
         return np.array(self.far[self._nearest(domain, seen)])
 
     def _nearest(self, domain: tuple[float, float], seen: tuple[float, float]) -> int:
@@ -94,3 +94,8 @@ def deviation(B: Array, covariance: Array) -> Array:
     """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
     variance = np.einsum("nq,dqp,np->nd", B, covariance, B, optimize=True)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def variance_of_curve(B: Array, covariance: Array) -> Array:
+    """Return the variance (N,) of a curve B (N, q) c on one axis, c of the covariance (q, q)."""
+    return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))

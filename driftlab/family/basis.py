@@ -1,7 +1,7 @@
-"""The basis in which the maps of a family are compared: cubic B-splines whose knots every unit shares.
+"""Basis in which the maps of a family are compared: cubic B-splines whose knots every unit shares.
 
-The knots lie at whole multiples of a step, so what one unit says of a coefficient, whatever range it saw, is about the
-same coefficient as what any other says. Coefficient k, of the spline that peaks at the knot k step, is about the value
+The knots lie at whole multiples of a step, so the information of one unit, whatever range it saw, is about the same
+coefficients as that of any other. Coefficient k, of the spline that peaks at the knot k step, is about the value
 of the curve there. q splines, N temperatures.
 """
 
@@ -40,6 +40,11 @@ class SplineBasis:
         first = int(np.floor(low / step + 1e-9))
         return cls(first, max(int(np.ceil(high / step - 1e-9)) - first, 1), step)
 
+    @classmethod
+    def over(cls, T: Array, step: float = STEP) -> SplineBasis:
+        """Return the fewest intervals that hold the temperatures T (N,), degC."""
+        return cls.covering(float(T.min()), float(T.max()), step)
+
     @property
     def domain(self) -> tuple[float, float]:
         """Lowest and highest temperature, degC."""
@@ -64,7 +69,7 @@ class SplineBasis:
         return np.asarray(BSpline.design_matrix(np.clip(T, low, high), edges, DEGREE).toarray())
 
     def within(self, wider: SplineBasis) -> slice:
-        """Return which of the coefficients of a wider domain are those of this one.
+        """Return the coefficients of a wider domain that are those of this one.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What one unit shows of each effect, once a curve of its own is taken off.
+"""Contrasts of one unit for each effect, a curve of its own taken off.
 
 Rows of a unit and an axis, whitened by the unit's own noise (`driftlab.noise.local_level`), are
 
@@ -9,11 +9,11 @@ With Q an orthonormal basis of B and Z_0, r = y - QQ'y and e = z - QQ'z, general
     c = e'r / e'e,      var c = 1 / e'e
 
 The curve is free: nothing that a map could be, of the unit or of the family, counts for an effect. An effect of several
-coefficients an axis is taken apart one after the other, each beside those before: what they show is then independent.
+coefficients an axis is taken apart one after the other, each beside those before: their contrasts are independent.
 
 Neither noise is ever exactly white and walk. So each e has PLACEBOS: itself, times cosines of few half waves over the
-soak, without what they share with Q, e and one another. They are as smooth as e, and lie where it lies; what r shows
-along them is what noise shows, whatever its colour and wherever it grows.
+soak, orthogonal to Q, e and one another. They are as smooth as e, and lie where it lies; r along them is noise,
+whatever its colour and wherever it grows.
 
 R rows, d axes, K columns of all effects on one axis, J placebos.
 """
@@ -24,10 +24,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.unit_information import SoakRows, UnitInformation
-from driftlab.noise.local_level import whitened
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
@@ -43,7 +43,7 @@ LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and
 
 @dataclass(frozen=True, eq=False)
 class EffectContrasts:
-    """What units show of effects, a column a coefficient.
+    """Contrasts of units for effects, a column a coefficient.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class EffectContrasts:
     information : (..., d, K) array
         1 / variance of each under the unit's own noise.
     placebos : (..., d, K, J) array
-        What noise shows along each placebo, in its own deviation; 0 where nothing of it is its own.
+        Noise along each placebo, in its own deviation; 0 where nothing of it is its own.
     """
 
     c: Array
@@ -63,6 +63,12 @@ class EffectContrasts:
         """Return some of the columns."""
         return EffectContrasts(self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :])
 
+    def flat(self, units: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array, Array]:
+        """Return coefficients, information (n, d K) and placebos (n, d K, J) of some units, axis by axis."""
+        c, placebos = self.c[units], self.placebos[units]
+        shape = len(c), c.shape[1] * c.shape[2]
+        return c.reshape(shape), self.information[units].reshape(shape), placebos.reshape(*shape, placebos.shape[-1])
+
 
 def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     """Return the recordings as effects read them, the thermometer's noise taken off.
@@ -72,38 +78,41 @@ def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     return [Chunk(rows.t, {**rows.channels, "temperature": without_noise(rows.T)}) for rows in soaked.recordings]
 
 
-def shown(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
-    """Return what an effect shows in each recording (R, d, q), a coefficient of 1 each; of a lag, what 1 is.
+def signatures(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
+    """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
 
-    A lag has no coefficient: it is the curve at the temperature that the element has, less that at the thermometer's,
-    with the unit's own curve. That curve's error is independent of what is left beside it.
+    A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's, with
+    the unit's own curve. That curve's error is independent of the residual beside it.
 
     Raises
     ------
     MissingChannel
-        If the unit's recordings have not what the effect reads.
+        If the unit's recordings lack a channel of the effect.
     """
-    parts = []
-    curve = own_curve(soaked) if effect.acts_on_input else None
-    for chunk in chunks:
-        if curve is not None:
-            splines = [soaked.knots.values(T) for T in (effect.input(chunk, None)[0], chunk["temperature"])]
-            parts.append(((splines[0] - splines[1]) @ curve.T)[:, :, None])
-        else:
-            parts.append(of_each_axis(effect.signature(chunk, None)[0]))
-    return parts
+    if not effect.acts_on_input:
+        return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks]
+    curve = own_curve(soaked).T
+    temperatures = [(effect.input(chunk, None)[0], chunk["temperature"]) for chunk in chunks]
+    return [((soaked.knots.values(T) - soaked.knots.values(at)) @ curve)[:, :, None] for T, at in temperatures]
+
+
+def columns_of(effects: Sequence[Effect], soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
+    """Return the signatures of effects side by side (R, d, K), of each recording."""
+    none = [np.zeros((len(rows.t), len(soaked.axes), 0)) for rows in soaked.recordings]
+    parts = zip(none, *(signatures(effect, soaked, chunks) for effect in effects), strict=True)
+    return [np.concatenate(part, axis=2) for part in parts]
 
 
 def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
     """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
-    found = []
+    temperatures = []
     for rows in soaked.recordings:
         chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
         for effect in effects:
             if effect.acts_on_input:
                 chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-        found.append(chunk["temperature"])
-    return found
+        temperatures.append(chunk["temperature"])
+    return temperatures
 
 
 def of_each_axis(signature: Array) -> Array:
@@ -114,58 +123,50 @@ def of_each_axis(signature: Array) -> Array:
 
 
 def own_curve(soaked: UnitInformation) -> Array:
-    """Return the coefficients (d, q) that the unit's own rows say, hardly smoothed where they say nothing."""
+    """Return the coefficients (d, q) by the unit's own rows, hardly smoothed where there are none."""
     D = np.diff(np.eye(soaked.knots.q), n=2, axis=0)
-    found = []
-    for J, h in zip(soaked.J, soaked.h, strict=True):
-        ridge = 1e-4 * np.trace(J) / len(J)
-        found.append(np.linalg.solve(J + ridge * (D.T @ D + 1e-4 * np.eye(len(J))), h))
-    return np.stack(found)
+    ridge = D.T @ D + 1e-4 * np.eye(soaked.knots.q)
+    scales = 1e-4 * np.trace(soaked.J, axis1=1, axis2=2) / soaked.knots.q
+    solved = [np.linalg.solve(J + s * ridge, h) for J, s, h in zip(soaked.J, scales, soaked.h, strict=True)]
+    return np.stack(solved)
 
 
 class EffectColumns:
-    """Rows of a unit under its own noise, and what effects show in them.
+    """Rows of a unit under its own noise, and effects in them.
 
     Parameters
     ----------
-    soaked : Soaked
+    soaked : UnitInformation
     beside : effects
         Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
-        self.soaked, self.chunks, d = soaked, chunks_of(soaked), len(soaked.axes)
+        self.soaked, self.chunks = soaked, chunks_of(soaked)
         low, high = soaked.knots.domain
         knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
-        named = [
-            shown(effect, soaked, self.chunks)
-            for effect in beside
-            if set(effect.requires) <= have and not effect.acts_on_input
-        ]
-        none = [np.zeros((len(rows.t), d, 0)) for rows in soaked.recordings]
-        fixed = [np.concatenate(parts, axis=2) for parts in zip(none, *named, strict=True)]
+        linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]
+        fixed = columns_of(linear, soaked, self.chunks)
         self.Q = [_orthonormal(X) for X in self._white(fixed, curves)]
-        self.r = [
-            y[:, 0] - Q @ (Q.T @ y[:, 0])
-            for Q, y in zip(self.Q, self._white([rows.bias[:, :, None] for rows in soaked.recordings]), strict=True)
-        ]
+        bias = self._white([rows.bias[:, :, None] for rows in soaked.recordings])
+        self.r = [y[:, 0] - Q @ (Q.T @ y[:, 0]) for Q, y in zip(self.Q, bias, strict=True)]
 
     def contrasts(self, effects: Sequence[Effect], sizes: Sequence[int]) -> EffectContrasts:
-        """Return what effects show, `sizes` coefficients an axis each; nothing of those whose channels are missing."""
+        """Return the contrasts for effects, `sizes` coefficients an axis each; 0 where their channels are missing."""
         recordings, d, K = self.soaked.recordings, len(self.soaked.axes), sum(sizes)
         parts = [np.zeros((len(rows.t), d, K)) for rows in recordings]
         at = 0
         for effect, size in zip(effects, sizes, strict=True):
             try:
-                for part, values in zip(parts, shown(effect, self.soaked, self.chunks), strict=True):
+                for part, values in zip(parts, signatures(effect, self.soaked, self.chunks), strict=True):
                     part[:, :, at : at + size] = values
             except MissingChannel:
                 pass
             at += size
-        found = [self._of_axis(Q, r, Z, sizes) for Q, r, Z in zip(self.Q, self.r, self._white(parts), strict=True)]
-        return EffectContrasts(*(np.stack(values) for values in zip(*found, strict=True)))
+        axes = [self._of_axis(Q, r, Z, sizes) for Q, r, Z in zip(self.Q, self.r, self._white(parts), strict=True)]
+        return EffectContrasts(*(np.stack(values) for values in zip(*axes, strict=True)))
 
     def estimates(self, effect: Effect) -> tuple[Array, Array]:
         """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
@@ -173,20 +174,12 @@ class EffectColumns:
         Raises
         ------
         MissingChannel
-            If the unit's recordings have not what the effect reads.
+            If the unit's recordings lack a channel of the effect.
         """
-        found, covariances = [], []
-        for Q, r, Z in zip(self.Q, self.r, self._white(shown(effect, self.soaked, self.chunks)), strict=True):
-            e = Z - Q @ (Q.T @ Z)
-            N, scale = e.T @ e, np.linalg.norm(Z, axis=0)
-            scaled = N / np.outer(scale, scale) if np.all(scale > 0) else np.zeros_like(N)
-            if np.linalg.eigvalsh(scaled)[0] > LEFT:
-                covariances.append(np.linalg.inv(N))
-                found.append(covariances[-1] @ (e.T @ r))
-            else:
-                covariances.append(np.diag(np.full(len(N), np.inf)))
-                found.append(np.zeros(len(N)))
-        return np.stack(found), np.stack(covariances)
+        signature = self._white(signatures(effect, self.soaked, self.chunks))
+        estimates = [_least_squares(Q, r, Z) for Q, r, Z in zip(self.Q, self.r, signature, strict=True)]
+        c, covariances = (np.stack(values) for values in zip(*estimates, strict=True))
+        return c, covariances
 
     def _of_axis(self, Q: Array, r: Array, Z: Array, sizes: Sequence[int]) -> tuple[Array, Array, Array]:
         e = Z - Q @ (Q.T @ Z)
@@ -209,20 +202,26 @@ class EffectColumns:
 
         `alike` (R, q) of each recording are the same on every axis.
         """
-        short = [
-            averaged(rows, *both)
-            for rows, both in zip(
-                self.soaked.recordings, zip(parts, *([alike] if alike else []), strict=True), strict=True
-            )
-        ]
-        found = []
-        for axis in range(len(self.soaked.axes)):
-            blocks = []
-            for k, (rows, (own, *same)) in enumerate(short):
-                noise = rows.variances(self.soaked.white[axis], self.soaked.walk[axis], free=k > 0)
-                blocks.append(whitened(np.column_stack([*same, own[:, axis]]), *noise))
-            found.append(np.concatenate(blocks))
-        return found
+        columns = zip(parts, *([alike] if alike else []), strict=True)
+        short = [averaged(rows, *of_rows) for rows, of_rows in zip(self.soaked.recordings, columns, strict=True)]
+        white = []
+        for axis, noise in enumerate(zip(self.soaked.white, self.soaked.walk, strict=True)):
+            blocks = [
+                rows.whitened(np.column_stack([*same, own[:, axis]]), *noise, free=k > 0)[0]
+                for k, (rows, (own, *same)) in enumerate(short)
+            ]
+            white.append(np.concatenate(blocks))
+        return white
+
+
+def _least_squares(Q: Array, r: Array, Z: Array) -> tuple[Array, Array]:
+    """Return the coefficients (q,) of columns Z (R, q), and their covariance (q, q); infinite where unseen."""
+    e = Z - Q @ (Q.T @ Z)
+    N, scale = e.T @ e, np.linalg.norm(Z, axis=0)
+    if np.any(scale == 0) or np.linalg.eigvalsh(N / np.outer(scale, scale))[0] <= LEFT:
+        return np.zeros(len(N)), np.diag(np.full(len(N), np.inf))
+    covariance = np.asarray(np.linalg.inv(N), dtype=np.float64)
+    return covariance @ (e.T @ r), covariance
 
 
 def without_noise(T: Array) -> Array:
@@ -270,7 +269,7 @@ def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:
-    """Return what r (R,) shows along the placebos (K, J) of e (R, K), each in its own deviation."""
+    """Return r (R,) along the placebos (K, J) of e (R, K), each in its own deviation."""
     R, K = e.shape
     waves = np.cos(np.pi * np.outer((np.arange(R) + 0.5) / R, np.arange(1, PLACEBOS + 1)))
     square = e * e
@@ -293,5 +292,5 @@ def _orthonormal(X: Array) -> Array:
     from scipy.linalg import qr
 
     Q, upper, _ = qr(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300), mode="economic", pivoting=True)
-    kept = np.abs(np.diag(upper)) > 1e-7
-    return np.ascontiguousarray(Q[:, : len(kept)][:, kept])
+    independent = np.abs(np.diag(upper)) > 1e-7
+    return np.ascontiguousarray(Q[:, : len(independent)][:, independent])

@@ -1,45 +1,49 @@
-"""A family fitted to its units.
+"""The family of units of one type, c_i ~ N(mu + lot, Sigma) for each axis: fitted to its units, and its posteriors.
 
 Sigma and the spread of the lots are those of `driftlab.family.reml`, of all units or of a seeded sample of SAMPLE of
-them; mu and the lots' shifts are of all units under that law, one unit at a time. d axes, q coefficients, G lots.
-
-The law of a family of units: c_i ~ N(mu + lot, Sigma) for each axis, and what follows for a unit.
-
-It is fitted by `driftlab.family.mixed_model.fit_family`. A unit that saw part of the range has no information on the
-rest, which is then what the family says of a unit like it. d axes, q coefficients.
+them; mu and the lots' shifts are of all units under these, one unit at a time. A unit that saw part of the range has no
+information on the rest: its posterior there is that of a unit like it. d axes, q coefficients, G lots.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationInfo,
+    field_serializer,
+    model_validator,
+)
 
+from driftlab import __version__
 from driftlab.family.bands import Bands
 from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.reml import Fitted, Index, Means, VarianceComponents, fit_axis, means_of, outlier_weights
+from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
+from driftlab.family.reml import AxisFit, Index, Means, VarianceComponents, fit_axis, means_of, outlier_weights
 from driftlab.family.tail_law import TailLaws
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
+from fusion_core.thermal.fitted_map import COLDEST, HOTTEST
+from fusion_core.thermal.map_file import expect_covariance
+from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 
-__all__ = ["Family", "FamilyUnits", "LotEffect", "Posterior", "fit_family"]
+FROM_FILE = "file"  # context of validation: a family that this process has not fitted
 
+Count = Annotated[int, Field(ge=0, le=10**12)]
+Share = Annotated[float, Field(ge=0, le=1e30)]
 
 SAMPLE = 1500  # units that Sigma is of, where there are more
-FEWEST = 3  # units that saw a temperature, for it to be in the family's domain
-SHARE = 0.02  # of all units, likewise
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What the units have in common: knots and axes; and the lot of each."""
-
-    knots: SplineBasis
-    axes: tuple[str, ...]
-    lots: list[str]
+MIN_UNITS = 3  # that saw a temperature, for it to be in the family's domain
+MIN_SHARE = 0.02  # of all units, likewise
 
 
 def fit_family(
@@ -49,53 +53,50 @@ def fit_family(
 
     Parameters
     ----------
-    units : Units
+    units : FamilyUnits
     channel, bias_unit : str
         Whose bias, and its SI unit.
     seed : int
         Of the sample of SAMPLE units that Sigma is of, where there are more.
-    each : Each, optional
-        Who fits the axes.
+    each : ParallelMap, optional
+        Goes through the axes.
 
     Raises
     ------
     ValueError
-        If there are fewer than FEWEST units, they differ in axes or in the step of their knots, or no temperature was
-        seen by FEWEST of them.
+        If there are fewer than MIN_UNITS units, they differ in axes or in the step of their knots, or no temperature
+        was seen by MIN_UNITS of them.
     """
-    found = surveyed(units)
-    n, d = len(found.lots), len(found.axes)
+    knots, axes, lots = _survey(units)
+    n, d, numbers = len(lots), len(axes), numbered(lots)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
-    numbers = numbered(found.lots)
-    lot = np.array([numbers[found.lots[k]] for k in chosen])
-    present, lot = np.unique(lot, return_inverse=True)
-    J, h, names = _sample(units, found.knots, set(chosen.tolist()))
-    of_axes = ((J[:, axis], h[:, axis], lot, found.knots.peaks) for axis in range(d))
-    fits = list(each(_fit, of_axes, at_once=1))
+    present, lot = np.unique([numbers[lots[k]] for k in chosen], return_inverse=True)
+    J, h, names = _sample(units, knots, set(chosen.tolist()))
+    fits = list(each(_fit, ((J[:, axis], h[:, axis], lot, knots.peaks) for axis in range(d)), at_once=1))
     w = np.stack([fit.w for fit in fits], axis=1)
     if n > SAMPLE:
         del J, h
-        means = _means_of_all(units, found, fits, present, numbers)
+        means = _means_of_all(units, knots, fits, present, [numbers[name] for name in lots])
     else:
-        means = [fit.found.means for fit in fits]
-    low = {name: w[k] for k, name in enumerate(names) if np.any(w[k] < 0.5)}
+        means = [fit.expected.means for fit in fits]
     return Family(
-        found.knots, found.axes, channel, bias_unit, np.stack([m.mu for m in means]),
-        _symmetric([m.covariance for m in means]), np.stack([fit.law.Sigma for fit in fits]),
-        _symmetric([fit.law.Lambda for fit in fits]), _lots(found.lots, numbers, means), n, len(chosen), low,
-         np.array([fit.steps for fit in fits]),
-        np.array([fit.moved for fit in fits]),
+        channel=channel, bias_unit=bias_unit, axes=axes, first=knots.first, intervals=knots.intervals,
+        step=knots.step, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
+        mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
+        Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, numbers, means),
+        weights={name: w[k].tolist() for k, name in enumerate(names) if np.any(w[k] < 0.5)},
+        steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
     )  # fmt: skip
 
 
-def _fit(of_axis: tuple[Array, Array, Index, Array]) -> Fitted:
+def _fit(of_axis: tuple[Array, Array, Index, Array]) -> AxisFit:
     return fit_axis(*of_axis)
 
 
-def surveyed(units: FamilyUnits) -> Survey:
-    """Return knots over the temperatures that enough units saw, the axes, and each unit's lot.
+def _survey(units: FamilyUnits) -> tuple[SplineBasis, tuple[str, ...], list[str]]:
+    """Return the knots over the temperatures that enough units saw, the axes, and each unit's lot.
 
     Raises
     ------
@@ -112,20 +113,21 @@ def surveyed(units: FamilyUnits) -> Survey:
                 f"unit {soaked.unit} has axes {', '.join(soaked.axes)} and knots {soaked.knots.step} K apart, others "
                 f"{', '.join(axes)} and {step} K; a family is of one type of unit, soaked alike"
             )
-    if axes is None or len(lots) < FEWEST:
-        raise ValueError(f"a family of {len(lots)} units; at least {FEWEST} are needed to know how units differ")
+    if axes is None or len(lots) < MIN_UNITS:
+        raise ValueError(f"a family of {len(lots)} units; at least {MIN_UNITS} are needed to know how units differ")
     first = min(span[0] for span in spans)
     seen = np.zeros(max(sum(span) for span in spans) - first, dtype=int)
     for start, count in spans:
         seen[start - first : start - first + count] += 1
-    enough = np.flatnonzero(seen >= max(FEWEST, SHARE * len(lots)))
+    least = max(MIN_UNITS, MIN_SHARE * len(lots))
+    enough = np.flatnonzero(seen >= least)
     if len(enough) == 0:
         raise ValueError(
-            f"no temperature was seen by {max(FEWEST, int(np.ceil(SHARE * len(lots))))} of {len(lots)} units; soak the "
-            "units of a family over one range"
+            f"no temperature was seen by {int(np.ceil(least))} of {len(lots)} units; soak the units of a family over "
+            "one range"
         )
     knots = SplineBasis(first + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
-    return Survey(knots, axes, lots)
+    return knots, axes, lots
 
 
 def numbered(lots: list[str]) -> dict[str, int]:
@@ -136,30 +138,24 @@ def numbered(lots: list[str]) -> dict[str, int]:
 
 def _sample(units: FamilyUnits, knots: SplineBasis, chosen: set[int]) -> tuple[Array, Array, list[str]]:
     """Return J (n, d, q, q), h (n, d, q) and the names of the chosen units."""
-    J, h, names = [], [], []
-    for k, (soaked, _) in enumerate(units):
-        if k in chosen:
-            said = brought(soaked, knots)
-            J.append(said[0])
-            h.append(said[1])
-            names.append(soaked.unit)
-    return np.stack(J), np.stack(h), names
+    sample = ((soaked.unit, *marginalised(soaked, knots)) for k, (soaked, _) in enumerate(units) if k in chosen)
+    names, J, h = zip(*sample, strict=True)
+    return np.stack(J), np.stack(h), list(names)
 
 
 def _means_of_all(
-    units: FamilyUnits, found: Survey, fits: list[Fitted], present: Array, numbers: dict[str, int]
+    units: FamilyUnits, knots: SplineBasis, fits: list[AxisFit], present: Array, lot: list[int]
 ) -> list[Means]:
-    """Return the means of all units, of which the fits are a sample with the lots numbered `present`."""
-    d, q, G = len(found.axes), found.knots.q, max(numbers.values()) + 1
+    """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
+    d, q, G = len(fits), knots.q, max(lot) + 1
     roots = [fit.law.root() for fit in fits]
     centres = np.zeros((d, G, q))
     for axis, fit in enumerate(fits):
-        centres[axis] = fit.found.means.mu
-        centres[axis, present] += fit.found.means.shifts
+        centres[axis] = fit.expected.means.mu
+        centres[axis, present] += fit.expected.means.shifts
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
-    for soaked, lot in units:
-        J, h = brought(soaked, found.knots)
-        g = numbers[lot]
+    for g, (soaked, _) in zip(lot, units, strict=True):
+        J, h = marginalised(soaked, knots)
         for axis, (L, inverse, _) in enumerate(roots):
             A, a = L.T @ J[axis] @ L, L.T @ h[axis]
             K = np.eye(q) - np.linalg.inv(A + np.eye(q))
@@ -173,22 +169,23 @@ def _means_of_all(
 
 
 def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, LotEffect]:
-    """Return what is known of each lot that has a name, or is the only one."""
+    """Return the effects of the lots that have a name, or of the only one."""
     if len(set(numbers.values())) < len(numbers):
         return {}
-    found = {}
-    for name, g in numbers.items():
-        shift = np.stack([m.shifts[g] for m in means])
-        sigma = np.sqrt(np.stack([np.diag(m.shifts_covariance[g]) for m in means]))
-        if name or len(numbers) == 1:
-            found[name] = LotEffect(shift, sigma, _symmetric([m.of_lot[g] for m in means]), lots.count(name))
-    return found
+    return {
+        name: LotEffect(
+            units=lots.count(name), shift=np.stack([m.shifts[g] for m in means]),
+            sigma=np.sqrt(np.stack([np.diag(m.shifts_covariance[g]) for m in means])),
+            mean_covariance=_symmetric([m.of_lot[g] for m in means]),
+        )
+        for name, g in numbers.items() if name or len(numbers) == 1
+    }  # fmt: skip
 
 
 def _symmetric(matrices: list[Array]) -> Array:
     """Return matrices (d, q, q) without what rounding made of their symmetry."""
-    found = np.stack(matrices)
-    return (found + found.transpose(0, 2, 1)) / 2
+    stacked = np.stack(matrices)
+    return (stacked + stacked.transpose(0, 2, 1)) / 2
 
 
 class FamilyUnits(Protocol):
@@ -207,72 +204,125 @@ class Posterior:
     covariance: Array
 
 
-@dataclass(frozen=True, eq=False)
-class LotEffect:
-    """By how much the mean of a lot is off the family's: `shift` (d, q), its `sigma`, and how many units it has.
+class LotEffect(BaseModel):
+    """Deviation of the mean of a lot from the family's: `shift` (d, q), its `sigma`, and the number of its units.
 
     `mean_covariance` (d, q, q) is that of the family's mean and the shift together.
     """
 
-    shift: Array
-    sigma: Array
-    mean_covariance: Array
-    units: int
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    units: Count
+    shift: Numbers
+    sigma: Numbers
+    mean_covariance: RoundedCovariances
 
 
-@dataclass(frozen=True, eq=False)
-class Family:
-    """What the units of one type have in common.
+class Family(BaseModel):
+    """The family as `family.json` has it: of a symmetric matrix the upper triangle, row by row; all in SI.
 
     Attributes
     ----------
-    knots : Knots
-        Over the temperatures that enough of the units saw.
-    axes : tuple of str
     channel, bias_unit : str
         Whose bias, and its SI unit.
+    axes : tuple of str
+    first, intervals, step : int, int, float
+        Of the knots, over the temperatures that enough of the units saw: `first` times `step` is the lower end, degC.
+    units, sampled : int
+        Number of the units, and of those that Sigma is of.
     mu, mu_covariance : (d, q) and (d, q, q) arrays
+        Mean; `mu_sigma` in the file are its deviations.
     Sigma, Lambda : (d, q, q) arrays
         Covariance of units about their lot's mean, and of the lots' means about the family's.
-    lots : dict of str to Lot
-    units, sampled : int
-        How many there were, and how many of them Sigma is of.
-    weights : dict of str to (d,) array
+    lots : dict of str to LotEffect
+    weights : dict of str to (d,)
         Of the units that were weighted down in Sigma and mu.
-    steps, moved : (d,) arrays
+    steps, moved : (d,)
         Of EM, and by what share of its deviations Sigma changed in the last.
+    map_kind, config : str
+        Kind of the units' own maps, and the config (YAML).
     bands : Bands or None
-        How wide bands must be, as measured on units left out (`driftlab.family.bands`).
-    laws : Laws or None
-        What is usual of its units, by which a new one is judged (`driftlab.family.outliers`).
+        Widths of the bands, as measured on units left out (`driftlab.family.bands`).
+    common_effects : dict or None
+        Effects that the units share (`driftlab.family.shared_effects`), in whose presence mu and Sigma are.
+    odd_lots : tuple of str
+        Why lots are off the others as a whole, a sentence each.
+    laws : TailLaws or None
+        Laws of the units' curves and figures, by which a new one is judged (`driftlab.family.outliers`).
     """
 
-    knots: SplineBasis
-    axes: tuple[str, ...]
-    channel: str
-    bias_unit: str
-    mu: Array
-    mu_covariance: Array
-    Sigma: Array
-    Lambda: Array
-    lots: dict[str, LotEffect]
-    units: int
-    sampled: int
-    weights: dict[str, Array] = field(default_factory=dict)
-    steps: Array = field(default_factory=lambda: np.zeros(0))
-    moved: Array = field(default_factory=lambda: np.zeros(0))
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    driftlab: Plain = __version__
+    channel: Name
+    bias_unit: SiUnit
+    axes: Annotated[AxisNames, Field(min_length=1)]
+    first: int
+    intervals: int
+    step: FiniteFloat
+    units: Count
+    sampled: Count
+    mu: Numbers
+    mu_sigma: Any = None
+    mu_covariance: Covariances
+    Sigma: Covariances
+    Lambda: Covariances
+    lots: dict[Plain, LotEffect]
+    weights: dict[Plain, tuple[Share, ...]] = {}
+    steps: tuple[Count, ...] = ()
+    moved: Numbers = Field(default_factory=lambda: np.zeros(0))
+    map_kind: Plain = ""
+    config: str = ""
     bands: Bands | None = None
+    common_effects: Annotated[dict[str, Any], AfterValidator(check_tree)] | None = None
+    odd_lots: tuple[Plain, ...] = ()
     laws: TailLaws | None = None
 
+    @model_validator(mode="after")
+    def _shapes(self) -> Family:
+        if self.intervals < 1 or self.step <= 0:
+            raise ValueError("knots have no width")
+        if not COLDEST <= self.first * self.step < (self.first + self.intervals) * self.step <= HOTTEST:
+            raise ValueError(f"its knots are beyond {COLDEST:g} to {HOTTEST:g} °C")
+        d, q, lots = len(self.axes), self.knots.q, self.lots.values()
+        vectors = [self.mu, *(part for lot in lots for part in (lot.shift, lot.sigma))]
+        matrices = [self.mu_covariance, self.Sigma, self.Lambda, *(lot.mean_covariance for lot in lots)]
+        if any(part.shape != (d, q) for part in vectors) or any(part.shape != (d, q, q) for part in matrices):
+            raise ValueError(f"what it has does not fit {d} axes of {q} coefficients")
+        return self
+
+    @model_validator(mode="after")
+    def _covariances(self, info: ValidationInfo) -> Family:
+        """Check those of a file; a fit of few units may have rounded one below zero in some direction."""
+        if info.context != FROM_FILE:
+            return self
+        if np.linalg.eigvalsh(self.Sigma).min() <= 0:
+            raise ValueError("Sigma is no covariance")
+        expect_covariance("mu_covariance", self.mu_covariance)
+        expect_covariance("Lambda", self.Lambda)
+        for lot in self.lots.values():
+            expect_covariance("mean_covariance", lot.mean_covariance, 1e3 * 10.0**-LOT_DIGITS)
+        return self
+
+    @field_serializer("mu_sigma")
+    def _deviations_of_mu(self, _: Any) -> Any:
+        return np.sqrt(np.diagonal(self.mu_covariance, axis1=1, axis2=2)).tolist()
+
+    @property
+    def knots(self) -> SplineBasis:
+        """Over the family's domain."""
+        return SplineBasis(self.first, self.intervals, self.step)
+
     def marginal(self, lot: str = "") -> Posterior:
-        """Return what is known of a new unit before it is soaked: of a lot of the family, or of one unheard of."""
+        """Return the law of a new unit before it is soaked: of a lot of the family, or of an unknown one."""
         if lot in self.lots:
             own = self.lots[lot]
             return Posterior(self.mu + own.shift, self.Sigma + own.mean_covariance)
         return Posterior(self.mu, self.Sigma + self.Lambda + self.mu_covariance)
 
     def posterior(self, soaked: UnitInformation | None, lot: str = "") -> Posterior:
-        """Return what is known of a unit of a lot, by the family and by its own soak.
+        """Return the law of a unit of a lot, by the family and by its own soak.
 
         The unit is taken as a new one: of a unit that the family was fitted on, its own data count in mu once more,
         with a weight of one unit of all.
@@ -285,7 +335,7 @@ class Family:
         before = self.marginal(lot)
         if soaked is None:
             return before
-        J, h = self.said(soaked)
+        J, h = self.information_of(soaked)
         c, covariance = np.empty_like(before.c), np.empty_like(before.covariance)
         for k in range(len(self.axes)):
             L, _, _ = VarianceComponents(before.covariance[k], before.covariance[k]).root()
@@ -294,7 +344,7 @@ class Family:
             covariance[k] = L @ V @ L.T
         return Posterior(c, covariance)
 
-    def said(self, soaked: UnitInformation) -> tuple[Array, Array]:
+    def information_of(self, soaked: UnitInformation) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) of a soak on the family's knots.
 
         Raises
@@ -307,25 +357,25 @@ class Family:
                 f"unit {soaked.unit} has axes {', '.join(soaked.axes)} and knots {soaked.knots.step} K apart, the "
                 f"family {', '.join(self.axes)} and {self.knots.step} K; soak units of one family alike"
             )
-        return brought(soaked, self.knots)
+        return marginalised(soaked, self.knots)
 
 
-def brought(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Array]:
-    """Return J (d, q, q) and h (d, q) of a soak on other knots; what it says of temperatures beyond them is let go."""
+def marginalised(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Array]:
+    """Return J (d, q, q) and h (d, q) of a soak on other knots, the temperatures beyond them marginalised."""
     wide = soaked.knots.joined(knots)
     J, h = soaked.on(wide)
     if wide == knots:
         return J, h
     part = knots.within(wide)
-    rest = np.ones(wide.q, dtype=bool)
-    rest[part] = False
-    keep = np.flatnonzero(~rest)
-    beyond = np.flatnonzero(rest & np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0))
+    outside = np.ones(wide.q, dtype=bool)
+    outside[part] = False
+    keep = np.flatnonzero(~outside)
+    beyond = np.flatnonzero(outside & np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0))
     Jk, hk = J[:, keep][:, :, keep], h[:, keep]
     if len(beyond) == 0:
         return Jk, hk
     across, inner = J[:, keep][:, :, beyond], J[:, beyond][:, :, beyond]
     inner = inner + 1e-9 * np.max(np.diagonal(inner, axis1=1, axis2=2), axis=1)[:, None, None] * np.eye(len(beyond))
     taken = across @ np.linalg.inv(inner)
-    found = Jk - taken @ across.transpose(0, 2, 1)
-    return (found + found.transpose(0, 2, 1)) / 2, hk - np.einsum("dij,dj->di", taken, h[:, beyond])
+    rest = Jk - taken @ across.transpose(0, 2, 1)
+    return (rest + rest.transpose(0, 2, 1)) / 2, hk - np.einsum("dij,dj->di", taken, h[:, beyond])

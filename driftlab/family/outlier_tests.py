@@ -1,37 +1,156 @@
-"""What of each unit of a family is compared with the others, and how seldom a value so far out is.
+"""Tests of each unit of a family against the others, and the probability of a value so far out.
 
-Of the curves: `driftlab.family.curve_statistics`. The figures of a record in a scale in which they are about
-normal, each with its own sigma.
-The usual values of each follow a law that a file holds (`TailLaws`), so that a single new unit can be judged by a
-known family. n units, d axes.
+Figures are those of a record, in a scale in which they are about normal, each with its own sigma. Curves are compared
+by the distance from their family's, in the law of the other units, and along shapes. With r the unit's own coefficients
+less its lot's mean, and Q the inverse of their covariance, family's and own::
+
+    T^2 = z'z / tr K,   z = L' Q r,  K = 1 - M^-1 = L' Q L       over all shapes, by the soak's information on each
+    t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
+
+with Sigma = L L' and M of `driftlab.family.reml`. Shapes are a level, a scale (g the mean curve), bumps of four
+widths at all temperatures on which the soak has information (the logarithm of the largest |t| counts). Of a unit that
+the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
+
+    t_-g = t_g / sqrt((1 - h) (1 - h + w t_g^2 / N)),    h = w z'z / N
+
+The usual values of each test follow a law that a file holds (`TailLaws`), so that a single new unit can be judged by a
+known family. n units, d axes, q coefficients.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from driftlab.family.curve_statistics import CurveStatistics
 from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.record import UnitRecord
+from driftlab.family.reml import WEIGHT, VarianceComponents
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
+from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
 
+KNOWN = 1e-2  # of the family's variance: a soak with less information on an axis has none
+WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
+SEEN = 1e-6  # of the largest information of a soak on a bump: on one with less it has none
+MAX_OWN = 0.9  # of Sigma, that a unit may have been
 CURVES = ("level", "scale", "bump", "curve")  # statistics of the curve of an axis
 FIGURES = ("residual", "noise", "walk", "coast", "hysteresis", "soaks")  # not the swing: it is the curve's
 TWO_SIDED = ("level", "scale", "noise")  # a sensor may be too quiet; of other figures less is only better
-OF_NOISE = ("hysteresis", "soaks")  # what noise alone lets expect is known, where other units do not say what is usual
-SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than it is said to be
-LOT_FEWEST, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
+OF_NOISE = ("hysteresis", "soaks")  # compared with noise alone, where other units do not show the usual
+SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than its estimate
+MIN_UNITS_OF_LOT, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
 LOGARITHMIC, FLOOR = ("noise",), 0.1  # of the median: a figure may be estimated as 0
-REACH = 2.0  # times the usual: what the noise of a unit may be
+REACH = 2.0  # times the usual: range of the noise of a unit
+
+
+@dataclass(frozen=True, eq=False)
+class CurveDeviation:
+    """Coefficients of an axis less its lot's mean: z (q,), and K (q, q).
+
+    `w` is the unit's weight in Sigma over the sum of all, 0 of a new unit.
+    """
+
+    z: Array
+    K: Array
+    w: float
+
+    @cached_property
+    def h(self) -> float:
+        """Share of Sigma that is the unit's own."""
+        return min(self.w * float(self.z @ self.z), MAX_OWN)
+
+    def squared(self) -> float:
+        """Return the squared distance as a Gaussian deviation (Wilson and Hilferty), NaN where nothing is known."""
+        known = float(np.trace(self.K))
+        if known < KNOWN:
+            return np.nan
+        dof = known**2 / float(np.sum(self.K * self.K))
+        share = float(self.z @ self.z) / known * (1 - self.w) / (1 - self.h)
+        return float((np.cbrt(share) - 1 + 2 / (9 * dof)) / np.sqrt(2 / (9 * dof)))
+
+    def apart(self, t: Array) -> Array:
+        """Return t with the unit's own part taken out of Sigma."""
+        return np.asarray(t / np.sqrt((1 - self.h) * (1 - self.h + self.w * t**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationShapes:
+    """Of one lot and axis: mean c (q,), L (q, q), and the shapes g in L's coordinates, (q, shapes)."""
+
+    c: Array
+    L: Array
+    level: Array
+    scale: Array
+    bumps: Array
+
+
+class CurveStatistics:
+    """Statistics of units under a family.
+
+    Parameters
+    ----------
+    family : Family
+    fitted : bool
+        Whether the units are those that it was fitted on: each is then taken out of it again.
+    """
+
+    def __init__(self, family: Family, *, fitted: bool) -> None:
+        self.family, self._fitted = family, fitted
+        self._shapes: dict[str, list[DeviationShapes]] = {}
+        self.at, self._bumps = _bumps(family)
+
+    def of(self, soaked: UnitInformation, lot: str) -> Array:
+        """Return the statistics of a unit (CURVES, d)."""
+        J, h = self.family.information_of(soaked)
+        total, weights = self.family.sampled + WEIGHT, self.family.weights.get(soaked.unit, (1.0,) * len(h))
+        table = np.empty((len(CURVES), len(h)))
+        for axis, shape in enumerate(self.shapes(lot)):
+            V = np.linalg.inv(np.eye(len(shape.c)) + shape.L.T @ J[axis] @ shape.L)
+            z = V @ (shape.L.T @ (h[axis] - J[axis] @ shape.c))
+            own = CurveDeviation(z, np.eye(len(z)) - V, float(weights[axis]) / total if self._fitted else 0.0)
+            curve = own.squared()
+            silent, bumps = np.nan if np.isnan(curve) else 1.0, shape.bumps[:, self.seen(J[axis])]
+            t = silent * own.apart(_along(own, np.column_stack([shape.level, shape.scale, bumps])))
+            bump = float(np.log(np.max(np.abs(t[2:]), initial=0.0))) if len(t) > 2 else np.nan
+            table[:, axis] = t[0], t[1], bump, curve
+        return table
+
+    def seen(self, J: Array) -> npt.NDArray[np.bool_]:
+        """Return the bumps (B,) on which a soak with J (q, q) has information: not those where it has no samples."""
+        information = np.einsum("ib,ij,jb->b", self._bumps, J, self._bumps, optimize=True)
+        return np.asarray((information > SEEN * np.max(information)) & (information > 0))
+
+    def shapes(self, lot: str) -> list[DeviationShapes]:
+        """Return the shapes of a lot, of each axis."""
+        if lot not in self._shapes:
+            before, self._shapes[lot] = self.family.marginal(lot), []
+            for c, P in zip(before.c, before.covariance, strict=True):
+                L, inverse, _ = VarianceComponents(P, P).root()
+                level, scale, bumps = inverse @ np.ones(len(c)), inverse @ c, inverse @ self._bumps
+                self._shapes[lot].append(DeviationShapes(c, L, level, scale, bumps))
+        return self._shapes[lot]
+
+
+def _bumps(family: Family) -> tuple[Array, Array]:
+    """Return the temperatures of the bumps (B,), degC, and their coefficients (q, B)."""
+    peaks, step = family.knots.peaks, family.knots.step
+    at = np.tile(peaks[1:-1], len(WIDTHS))
+    width = np.repeat(WIDTHS, len(peaks) - 2) * step
+    return at, np.exp(-(((peaks[:, None] - at) / width) ** 2))
+
+
+def _along(own: CurveDeviation, g: Array) -> Array:
+    """Return t of shapes g (q, G) in the coordinates of L."""
+    return np.asarray(g.T @ own.z / np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", g, own.K, g, optimize=True), 1e-300)))
 
 
 @dataclass(frozen=True, eq=False)
 class Tests:
-    """What was tested of units `names`.
+    """Tests of units `names`.
 
     Attributes
     ----------
@@ -39,8 +158,7 @@ class Tests:
         One of CURVES or FIGURES, and the axis, of each of the m tests.
     p, values : (n, m) arrays
         NaN where there is no test; values in SI, of the statistics of curves in deviations.
-    laws : Laws
-        What is usual.
+    laws : TailLaws
     """
 
     names: list[str]
@@ -51,54 +169,48 @@ class Tests:
 
 
 def tests_of(
-    family: Family,
-    statistics: CurveStatistics,
-    units: FamilyUnits,
-    records: Iterable[UnitRecord],
+    family: Family, statistics: CurveStatistics, units: FamilyUnits, records: Iterable[UnitRecord],
     laws: TailLaws | None,
-) -> Tests:
+) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
     of = {record.unit: record for record in records if record.state == "done"}
-    d = len(family.axes)
-    names, lots, rows, curves = [], [], [], []
+    d, names, lots, rows, curves = len(family.axes), [], [], [], []
     for soaked, lot in units:
         names.append(soaked.unit)
         lots.append(lot)
         curves.append(statistics.of(soaked, lot))
         rows.append(row_of(of.get(soaked.unit), d))
-    table = np.array(rows).reshape(len(rows), len(FIGURES), 2, d)
-    what, p, values = [], [], []
-    known, figures = {}, {}
-    for name in CURVES:
-        own = np.array([curve[name] for curve in curves]).reshape(-1, d)
+    figures = np.array(rows).reshape(-1, len(FIGURES), 2, d)
+    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, :, 0].swapaxes(0, 1)]
+    of_curves: dict[str, TailLaw] = {}
+    of_figures: dict[str, FigureLaw] = {}
+    p = []
+    for name, own in zip(CURVES, values, strict=False):
         law = TailLaw.of(own) if laws is None else laws.curves.get(name)
-        if law is not None:
-            known[name] = law
+        of_curves |= {} if law is None else {name: law}
         p.append(_chance(law, own, name))
-        values.append(own)
     for k, name in enumerate(FIGURES):
-        usual = figure_law(name, table[:, k], lots)[0] if laws is None else laws.figures.get(name)
-        if usual is not None:
-            figures[name] = usual
-        p.append(_of_figure(usual, name, table[:, k], lots, shifted=laws is None))
-        values.append(table[:, k, 0])
-    what = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
+        usual, off = figure_law(name, figures[:, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
+        of_figures |= {} if usual is None else {name: usual}
+        p.append(_of_figure(usual, name, figures[:, k], lots, off))
+    tests = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
     return Tests(
-        names, what, np.concatenate(p, axis=1), np.concatenate(values, axis=1), TailLaws(curves=known, figures=figures)
-    )
+        names, tests, np.concatenate(p, axis=1), np.concatenate(values, axis=1),
+        TailLaws(curves=of_curves, figures=of_figures),
+    )  # fmt: skip
 
 
 def row_of(record: UnitRecord | None, d: int) -> Array:
     """Return value and sigma (figures, 2, d) of a unit."""
-    found = np.full((len(FIGURES), 2, d), np.nan)
+    row = np.full((len(FIGURES), 2, d), np.nan)
     for k, name in enumerate(FIGURES):
         if record is not None and name in record.figures and len(record.figures[name].value) == d:
-            found[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
-    return found
+            row[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
+    return row
 
 
 def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLaw | None, list[dict[str, float]]]:
-    """Return what is usual of a figure, and of each axis the lots that are off as a whole.
+    """Return the law of a figure, and of each axis the lots that are off as a whole.
 
     Parameters
     ----------
@@ -134,22 +246,23 @@ def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLa
     law = TailLaw.of(u)
     if law is None:
         return None, off
-    columns_of = (tuple(map(float, column)) for column in zip(*rows, strict=True))
-    return FigureLaw(**dict(zip(("usual", "sure", "centre", "width"), columns_of, strict=True)), law=law), off
+    usual_of, sure_of, centre_of, width_of = (tuple(map(float, column)) for column in zip(*rows, strict=True))
+    return FigureLaw(usual=usual_of, sure=sure_of, centre=centre_of, width=width_of, law=law), off
 
 
-def _of_figure(law: FigureLaw | None, name: str, columns: Array, lots: Sequence[str], *, shifted: bool) -> Array:
-    """Return p-values (n, d) of a figure with value and sigma (n, 2, d)."""
+def _of_figure(
+    law: FigureLaw | None, name: str, columns: Array, lots: Sequence[str], off: Sequence[dict[str, float]]
+) -> Array:
+    """Return p-values (n, d) of a figure with value and sigma (n, 2, d), of lots that are `off` as a whole."""
     if law is None:
         return _of_noise(columns, MARGIN) if name in OF_NOISE else np.full(columns[:, 0].shape, np.nan)
     u = np.full(columns[:, 0].shape, np.nan)
-    off = figure_law(name, columns, lots)[1] if shifted else [{}] * columns.shape[2]
     for axis, shifts in enumerate(off):
         x, own = scaled(name, columns[:, 0, axis], columns[:, 1, axis], law.usual[axis])
         shift = np.array([shifts.get(lot, 0.0) for lot in lots])
         u[:, axis] = (x - shift - law.centre[axis]) / np.hypot(law.width[axis], np.fmax(own, law.sure[axis]))
-    found = _chance(law.law, u, name)
-    return np.fmax(found, _of_noise(columns, 1.0)) if name in OF_NOISE else found  # a walk makes a loop, too
+    p = _chance(law.law, u, name)
+    return np.fmax(p, _of_noise(columns, 1.0)) if name in OF_NOISE else p  # a walk makes a loop, too
 
 
 def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array, Array]:
@@ -171,7 +284,7 @@ def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array,
 
 
 def unscaled(name: str, x: float, usual: float) -> float:
-    """Return what `scaled` was given, of an ordinary unit."""
+    """Return the figure of an ordinary unit, of one in the scale of `scaled`."""
     return usual * (float(np.exp(x)) if name in LOGARITHMIC else max(x, 0.0) ** 1.5)
 
 
@@ -200,12 +313,12 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
 
 
 def _off(u: Array, lots: Sequence[str]) -> dict[str, float]:
-    """Return by how many widths the lots are off that are off as a whole."""
-    found = {}
+    """Return the shift, in widths, of each lot that is off as a whole."""
+    shifts = {}
     for lot in sorted(set(lots)):
         own = u[np.array([other == lot for other in lots]) & np.isfinite(u)]
-        if LOT_FEWEST <= len(own) <= len(u) / 2:
+        if MIN_UNITS_OF_LOT <= len(own) <= len(u) / 2:
             middle = float(np.median(own))
             if abs(middle) > max(1.0, LOT_OFF * 1.2533 / np.sqrt(len(own))):
-                found[lot] = middle
-    return found
+                shifts[lot] = middle
+    return shifts

@@ -1,24 +1,20 @@
 """Units of a family that are not as the others, with the reason in words, at a false discovery rate.
 
-Of each unit and axis the curve and the figures of its record are held against those of the other units
+Of each unit and axis the curve and the figures of its record are compared with those of the other units
 (`driftlab.family.outlier_tests`). A unit's tests are taken together as Simes (1986) has it, Benjamini & Hochberg
 (1995) choose the units at FALSE, and of a chosen unit those tests are reported that pass at FALSE times the share of
 units that were chosen (Benjamini & Bogomolov 2014). A new unit of a family that is known is one more of that family's
-units, which are held to be ordinary. A lot that is off as a whole is the lot's matter: its units are held against one
-another. Which of a reversed sign, swapped axes, a scale, a level or a local deviation a curve has is what makes it
-likeliest (`driftlab.family.outliers`). d axes.
+units, which are taken as ordinary. A lot that is off as a whole is reported as a lot (`find_odd_lots`): its units are
+compared with one another.
 
-Lots of a family that are off as a whole: a matter of the lot, not of each of its units.
-
-What is wrong with a curve that is not as its family's: of a few hypotheses the one under which it is likeliest.
-
-Each hypothesis is a law of the coefficients, and with J, h what the soak says::
+The reason of an odd curve is the hypothesis under which it is likeliest. Each is a law of the coefficients, and with
+the soak's information J, h::
 
     - 2 log p = c'Jc - 2 h'c - a'M^-1 a + log det M + price,   a = L'(h - J c),  M = 1 + L'J L
 
 Of a reversed sign c is the mean with the other sign, of swapped axes c and L are each other's; a scale of the mean
-(with a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of what
-was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
+(with a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of the
+number of trials. A hypothesis holds if with it the curve is an ordinary one of the family. d axes, q coefficients.
 """
 
 from __future__ import annotations
@@ -30,13 +26,15 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.curve_statistics import CurveDeviation, CurveStatistics
+from driftlab.family.bands import variance_of_curve
 from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.outlier_tests import (
     CURVES,
     FIGURES,
-    LOT_FEWEST,
     LOT_OFF,
+    MIN_UNITS_OF_LOT,
+    CurveDeviation,
+    CurveStatistics,
     Tests,
     figure_law,
     row_of,
@@ -45,7 +43,7 @@ from driftlab.family.outlier_tests import (
 )
 from driftlab.family.record import UnitRecord
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
-from driftlab.units import RATE, BiasUnit, axis_name
+from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
@@ -54,12 +52,12 @@ FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")),
     "hysteresis": ("walk", "residual", "coast"),
 }
-"""What a figure that is odd makes odd too, and is not said again: a joint fit takes it for a walk."""
+"""Tests that an odd figure makes odd too, and that are not reported: a joint fit takes it for a walk."""
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """What of a unit is not as in its family.
+    """A test of a unit that is not as in its family.
 
     Attributes
     ----------
@@ -75,7 +73,7 @@ class Outlier:
         Of a curve: where it is off most, degC.
     sentence : str
     as_family : tuple of str
-        What else of the unit was tested, and is as in the family.
+        The other tests of the unit, which are as in the family.
     """
 
     unit: str
@@ -103,14 +101,10 @@ class Outliers:
 
 
 def find_outliers(
-    family: Family,
-    units: FamilyUnits,
-    records: Iterable[UnitRecord],
-    *,
-    shown: BiasUnit | None = None,
+    family: Family, units: FamilyUnits, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None,
     fitted: bool = True,
-) -> Outliers:
-    """Return what is odd of each unit of which anything is.
+) -> Outliers:  # fmt: skip
+    """Return the odd units with their reasons.
 
     Parameters
     ----------
@@ -128,18 +122,17 @@ def find_outliers(
     tests = tests_of(family, statistics, units, records, None if fitted else family.laws)
     if not tests.names:
         return Outliers({})
-    unit = shown or (RATE if family.bias_unit == RATE.si else BiasUnit(family.bias_unit, family.bias_unit))
-    chosen_tests = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
-    found: dict[str, tuple[Outlier, ...]] = {}
-    words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
-    for k, (soaked, lot) in enumerate(units):
-        if np.any(chosen_tests[k]):
-            found[soaked.unit] = words.of(k, chosen_tests[k], *family.said(soaked), lot)
-    return Outliers(found, tests.laws, _not_judged(family, tests, known=not fitted))
+    reported = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
+    words = _Words(family, tests, CurveReasons(statistics, tests.laws), shown or default_unit(family.bias_unit))
+    odd = {
+        soaked.unit: words.of(k, reported[k], *family.information_of(soaked), lot)
+        for k, (soaked, lot) in enumerate(units) if np.any(reported[k])
+    }  # fmt: skip
+    return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted))
 
 
 def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
-    """Return which units or figures were not judged, and why."""
+    """Return the units or figures that were not judged, and why."""
     n = len(tests.names)
     if not tests.laws.curves:
         few = f"{n:,} unit{'s are' if n != 1 else ' is'} too few to judge one by the others, {MIN_UNITS} will do"
@@ -151,29 +144,30 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
 
 
 def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
-    """Return why a unit is odd, in a sentence."""
+    """Return the reasons of an odd unit, in a sentence."""
     fine = odd[0].as_family
     rest = f"; {', '.join(fine[:-1])}{' and ' if len(fine) > 1 else ''}{fine[-1]} as the family" if fine else ""
     return f"unit {unit}: {'; '.join(one.sentence for one in odd)}{rest}"
 
 
 def chosen(p: Array, ordinary: int = 0) -> npt.NDArray[np.bool_]:
-    """Return which tests (n, m) are reported, of p-values (n, m), NaN where there is no test.
+    """Return the tests (n, m) that are reported, of p-values (n, m), NaN where there is no test.
 
     `ordinary` further units are known to be as they should.
     """
     of_unit = simes(p)
-    n = int(np.sum(np.isfinite(of_unit))) + ordinary
-    ordered = np.sort(of_unit[np.isfinite(of_unit)])
-    passed = np.flatnonzero(ordered <= FALSE * np.arange(1, len(ordered) + 1) / max(n, 1))
-    share = FALSE * (int(passed[-1]) + 1 if len(passed) else 0) / max(n, 1)
-    found = np.zeros(p.shape, dtype=bool)
+    share = _level(of_unit[np.isfinite(of_unit)], FALSE, int(np.sum(np.isfinite(of_unit))) + ordinary)
+    reported = np.zeros(p.shape, dtype=bool)
     for k in np.flatnonzero(of_unit <= share):
-        own = np.nan_to_num(p[k], nan=2.0)
-        order = np.sort(own[own <= 1])
-        inside = np.flatnonzero(order <= share * np.arange(1, len(order) + 1) / len(order))
-        found[k] = own <= order[inside[-1]]
-    return found
+        known = p[k][np.isfinite(p[k])]
+        reported[k] = p[k] <= _level(known, share, len(known))
+    return reported
+
+
+def _level(p: Array, false: float, n: int) -> float:
+    """Return the level of Benjamini and Hochberg for p-values (m,) of n tests; 0 where none passes."""
+    passed = np.flatnonzero(np.sort(p) <= false * np.arange(1, len(p) + 1) / max(n, 1))
+    return false * (int(passed[-1]) + 1 if len(passed) else 0) / max(n, 1)
 
 
 def simes(p: Array) -> Array:
@@ -191,7 +185,7 @@ class _Words:
         self.family, self.tests, self.reasons, self.unit = family, tests, reasons, unit
 
     def of(self, k: int, reported: npt.NDArray[np.bool_], J: Array, h: Array, lot: str) -> tuple[Outlier, ...]:
-        """Return what is odd of unit k, of which the tests `reported` (m,) passed."""
+        """Return the outliers of unit k, of which the tests `reported` (m,) passed."""
         tests = self.tests
         p = {one: float(tests.p[k, j]) for j, one in enumerate(tests.what) if reported[j]}
         named = {what for what, _ in p}
@@ -206,15 +200,15 @@ class _Words:
             axis: min(value for (what, own), value in p.items() if own == axis and what in CURVES)
             for axis in sorted({axis for what, axis in p if what in CURVES and what not in silent})
         }
-        found = [
+        outliers = [
             self._of_curve(tests.names[k], reason, min(of_curve.get(axis, 1.0) for axis in reason.axes), fine)
             for reason in self.reasons.of(J, h, lot, tuple(of_curve))
             if not self._of_loop(k, p, reason)
         ]
         for (what, axis), value in p.items():
             if what in FIGURES and what not in silent:
-                found.append(self._of_figure(k, what, axis, value, fine))
-        return tuple(sorted(found, key=lambda odd: odd.p))
+                outliers.append(self._of_figure(k, what, axis, value, fine))
+        return tuple(sorted(outliers, key=lambda odd: odd.p))
 
     def _of_loop(self, k: int, p: Mapping[tuple[str, int], float], reason: Reason) -> bool:
         """Whether a curve is off by no more than what its hysteresis is, which ends where the temperature turns."""
@@ -255,13 +249,13 @@ class _Words:
         )
 
     def _axis(self, axis: int) -> str:
-        """Return what an axis is called: by its letter, or as its channel where it is the only one."""
+        """Return the name of an axis: its letter, or its channel where it is the only one."""
         family = self.family
         return family.axes[axis] if len(family.axes) > 1 else axis_name(family.channel, family.axes[axis])
 
 
 def _usual(what: str, law: FigureLaw, axis: int) -> tuple[float, float, float]:
-    """Return what a figure of an axis is in most units, from, in the middle, and to; SI."""
+    """Return a figure of an axis in most units: from, in the middle, and to; SI."""
     width = float(np.hypot(law.width[axis], law.sure[axis]))
     low, middle, high = (unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 0, 2))
     return low, middle, high
@@ -289,26 +283,28 @@ def find_odd_lots(
 ) -> tuple[LotOutlier, ...]:
     """Return the lots whose mean curve, or whose figures, are off those of the others.
 
-    By more than is as seldom as LOT_OFF deviations of what lots differ by and their means are uncertain by, and by more
-    than MATTERS of the units' spread; of lots of at least LOT_FEWEST units, and not more than half of all. `shown` is
-    the unit of sentences, of a rate deg/h where it is None.
+    By more than is as seldom as LOT_OFF deviations of the lots' spread and of the uncertainty of their means, and by
+    more than MATTERS of the units' spread; of lots of at least MIN_UNITS_OF_LOT units, and not more than half of all.
+    `shown` is the unit of sentences, of a rate deg/h where it is None.
     """
-    unit = shown or (RATE if family.bias_unit == RATE.si else BiasUnit(family.bias_unit, family.bias_unit))
     done = [record for record in records if record.state == "done"]
-    return (*_curves(family, unit), *_figures(family, done))
+    return (
+        *_odd_curves(family, shown or default_unit(family.bias_unit)),
+        *(_odd_figures(family, done) if done else ()),
+    )
 
 
-def _curves(family: Family, unit: BiasUnit) -> list[LotOutlier]:
-    found = []
+def _odd_curves(family: Family, unit: BiasUnit) -> list[LotOutlier]:
+    odd: list[LotOutlier] = []
     B = family.knots.values(family.knots.peaks[1:-1])
     if len(family.lots) < MIN_LOTS:
-        return []
+        return odd
     for name, lot in family.lots.items():
-        if not LOT_FEWEST <= lot.units <= family.units / 2:
+        if not MIN_UNITS_OF_LOT <= lot.units <= family.units / 2:
             continue
         for axis, called in enumerate(family.axes):
             off, sure = _off(family, name, axis, B)
-            spread = np.sqrt(_variance(B, family.Sigma[axis]))
+            spread = np.sqrt(variance_of_curve(B, family.Sigma[axis]))
             k = int(np.argmax(np.abs(off) / spread))
             if abs(off[k]) > max(sure[k], MATTERS * spread[k]):
                 T = float(family.knots.peaks[1 + k])
@@ -317,12 +313,12 @@ def _curves(family: Family, unit: BiasUnit) -> list[LotOutlier]:
                     f"°C (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
                     "one another"
                 )
-                found.append(LotOutlier(name, SHAPE, called, T, sentence))
-    return found
+                odd.append(LotOutlier(name, SHAPE, called, T, sentence))
+    return odd
 
 
 def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
-    """Return by how much the curve of a lot is off the other lots' (G,), and how much of that may be chance (G,).
+    """Return the deviation of the curve of a lot from the other lots' (G,), and the limit of chance (G,).
 
     The spread of the lots is that of the others, robustly: one that is off must not widen what it is judged by. Its
     degrees of freedom are few where there are few lots (Satterthwaite).
@@ -331,8 +327,9 @@ def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
 
     lots = family.lots
     others = np.array([B @ lot.shift[axis] for other, lot in lots.items() if other != name])
-    own = _variance(B, lots[name].mean_covariance[axis])
-    theirs = np.median([_variance(B, lot.mean_covariance[axis]) for o, lot in lots.items() if o != name], axis=0)
+    own = variance_of_curve(B, lots[name].mean_covariance[axis])
+    rest = [variance_of_curve(B, lot.mean_covariance[axis]) for other, lot in lots.items() if other != name]
+    theirs = np.median(rest, axis=0)
     middle = np.median(others, axis=0)
     wide = (1.4826 * np.median(np.abs(others - middle), axis=0)) ** 2
     between, n = max(float(np.median(wide / theirs)) - 1, 0.0) * theirs, len(others)  # in all, not where it is least
@@ -341,28 +338,21 @@ def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
     return B @ lots[name].shift[axis] - middle, t.isf(norm.sf(LOT_OFF), np.maximum(dof, 0.5)) * np.sqrt(variance)
 
 
-def _variance(B: Array, covariance: Array) -> Array:
-    return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))
-
-
-def _figures(family: Family, records: list[UnitRecord]) -> list[LotOutlier]:
-    if not records:
-        return []
-    found = []
+def _odd_figures(family: Family, records: list[UnitRecord]) -> list[LotOutlier]:
+    odd = []
     table, lots = np.array([row_of(record, len(family.axes)) for record in records]), [r.lot for r in records]
     for k, name in enumerate(FIGURES):
         law, off = figure_law(name, table[:, k], lots)
-        for axis, (called, shifts) in enumerate(zip(family.axes, off, strict=True)):
+        for axis, (called, shifts) in enumerate(zip(family.axes, off if law else (), strict=False)):
             for lot, by in shifts.items():
-                if law is None:
-                    continue
+                assert law is not None
                 usual, shifted = [unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by)]
                 sentence = (
                     f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
                     f"{lots.count(lot)} units are held against one another"
                 )
-                found.append(LotOutlier(lot, name, called, None, sentence))
-    return found
+                odd.append(LotOutlier(lot, name, called, None, sentence))
+    return odd
 
 
 PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
@@ -373,7 +363,7 @@ LITTLE = 0.15  # of the squared distance
 
 @dataclass(frozen=True)
 class Reason:
-    """What is wrong: `what` is `sign`, `swap`, `scale`, `level`, `bump`, or `curve` where none of these is all.
+    """Reason of an odd curve: `sign`, `swap`, `scale`, `level`, `bump`, or `curve` where none of these is all.
 
     The curve of `axes` is `off` most at `T` degC, where units spread by `spread` (SI), or is so many `times` the usual.
     """
@@ -393,8 +383,8 @@ class CurveReasons:
         self.statistics, self.laws = statistics, laws
 
     def of(self, J: Array, h: Array, lot: str, axes: Sequence[int]) -> list[Reason]:
-        """Return what is wrong with the curves of the axes that are odd, of a soak with J (d, q, q) and h (d, q)."""
-        found, rest = [], list(axes)
+        """Return the reasons of the axes whose curves are odd, of a soak with J (d, q, q) and h (d, q)."""
+        reasons, rest = [], list(axes)
         every = [self._hypotheses(J[axis], h[axis], lot, axis) for axis in range(len(J))]
         least = [own[0 if axis in axes else -1][0] for axis, own in enumerate(every)]
         for a, b in combinations(range(len(J)), 2):
@@ -404,30 +394,30 @@ class CurveReasons:
             cost = sum(own[0] for own in crossed) + PRICES["swap"]
             if cost < least[a] + least[b] and all(own[1] for own in crossed):
                 rest = [axis for axis in rest if axis not in (a, b)]
-                found.append(self._where("swap", (a, b), J[a], h[a], lot))
+                reasons.append(self._where("swap", (a, b), J[a], h[a], lot))
         for axis in rest:
             ordinary = [reason for _, reason, good in every[axis] if good]
-            found.append(ordinary[0] if ordinary else every[axis][-1][1])
-        return found
+            reasons.append(ordinary[0] if ordinary else every[axis][-1][1])
+        return reasons
 
     def _hypotheses(self, J: Array, h: Array, lot: str, axis: int) -> list[tuple[float, Reason, bool]]:
         """Return cost, reason, and whether it makes the curve ordinary, the likeliest first; at the end `curve`."""
         shapes = self.statistics.shapes(lot)[axis]
-        found = []
+        reasons = []
         cost, good = self._prior(J, h, lot, axis, -1.0, axis)
-        found.append((cost + PRICES["sign"], self._where("sign", (axis,), J, h, lot), good))
+        reasons.append((cost + PRICES["sign"], self._where("sign", (axis,), J, h, lot), good))
         cost, own = _cost(J, h, shapes.c, shapes.L)
         where = self._where("curve", (axis,), J, h, lot)
         gain, size, left = _less(own, shapes.level[:, None])
         spread = float(1 / np.sqrt(shapes.level @ own.K @ shapes.level))
         reason = Reason("level", (axis,), float(size[0]), spread, where.T)
-        found.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
+        reasons.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
         times = 1 + float(_less(own, np.column_stack([shapes.scale, shapes.level]))[1][0])
         if SCALES[0] < abs(times) < SCALES[1]:
             scaled, wide = _cost(J, h, times * shapes.c, times * shapes.L)
             gain, _, left = _less(wide, shapes.level[:, None] / times)
             reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)
-            found.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
+            reasons.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
         seen = np.flatnonzero(self.statistics.seen(J))
         bumps = shapes.bumps[:, seen]
         t = (bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", bumps, own.K, bumps, optimize=True)
@@ -435,8 +425,8 @@ class CurveReasons:
         g = shapes.bumps[:, k]
         gain, size, left = _less(own, g[:, None])
         bump = Reason("bump", (axis,), float(size[0]), float(1 / np.sqrt(g @ own.K @ g)), float(self.statistics.at[k]))
-        found.append((cost - gain + PRICES["bump"], bump, self._ordinary(left, axis, own)))
-        return [*sorted(found, key=lambda one: one[0]), (cost, where, True)]
+        reasons.append((cost - gain + PRICES["bump"], bump, self._ordinary(left, axis, own)))
+        return [*sorted(reasons, key=lambda one: one[0]), (cost, where, True)]
 
     def _prior(self, J: Array, h: Array, lot: str, axis: int, times: float, own: int) -> tuple[float, bool]:
         """Return the cost of a curve that is so many times one of an axis, and whether it is ordinary then."""
@@ -458,14 +448,14 @@ class CurveReasons:
         statistics, axis = self.statistics, axes[0]
         shapes, knots = statistics.shapes(lot)[axis], statistics.family.knots
         B = knots.values(knots.peaks[1:-1])
-        spread = np.sqrt(np.einsum("ti,ij,tj->t", B, statistics.family.Sigma[axis], B))
+        spread = np.sqrt(variance_of_curve(B, statistics.family.Sigma[axis]))
         off = B @ (shapes.L @ _cost(J, h, shapes.c, shapes.L)[1].z)
         k = int(np.argmax(np.abs(off) / spread))
         return Reason(what, axes, float(off[k]), float(spread[k]), float(knots.peaks[1 + k]), times)
 
 
 def _less(own: CurveDeviation, g: Array) -> tuple[float, Array, CurveDeviation]:
-    """Return what shapes g (q, G) of the likeliest sizes gain, these sizes (G,), and what they leave."""
+    """Return the gain of shapes g (q, G) of the likeliest sizes, these sizes (G,), and the deviation that is left."""
     pull, square = g.T @ own.z, g.T @ own.K @ g
     size = np.linalg.solve(square, pull)
     return float(pull @ size), np.asarray(size), CurveDeviation(own.z - own.K @ g @ size, own.K, 0.0)

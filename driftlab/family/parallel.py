@@ -1,4 +1,4 @@
-"""Who goes through units: the process that asks, or several for it."""
+"""Serial and parallel map over units."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ BATCH = 10  # items that a process is given at once
 
 
 class ParallelMap(Protocol):
-    """Yields what a function makes of each item, in their order, as `map` does.
+    """Yields the results of a function of each item, in their order, as `map` does.
 
     The function is importable by its name, or a `functools.partial` of one, so that another process may call it; at
     most a few batches of `at_once` items a process are in memory.
     """
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
-        """Yield what the function makes of each item."""
+        """Yield the result of each item."""
         ...
 
 
 def serial(function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
-    """Yield what a function makes of each item, all in this process: an `ParallelMap`."""
+    """Yield the results of a function of each item, all in this process: a `ParallelMap`."""
     return map(function, items)

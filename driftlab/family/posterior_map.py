@@ -34,12 +34,12 @@ WIDER = 1.2  # times the family's walk, from which one that does not show is tak
 SPREAD = 0.1  # least of a family's spread of noise, logarithm
 CURVE = 4  # temperatures an interval, at which the curve is taken
 DIGITS = 6  # significant ones of a mode
-LEAST = 1e-5  # of the largest deviation, or of a variance: what is less is rounding
-LOST = 0.05  # of the variance at any temperature: what the modes that are left out may have
+ROUNDING = 1e-5  # of the largest deviation, or of a variance
+LOST = 0.05  # of the variance at any temperature, with the modes that are left out
 
 
 def band_of(family: Family, soaked: UnitInformation | None) -> Band:
-    """Return how wide the bands of a unit are that saw what `soaked` did."""
+    """Return the bands of a unit with the range of `soaked`."""
     domain, d = family.knots.domain, len(family.axes)
     middle = (domain[0] + domain[1]) / 2
     seen = (middle, middle) if soaked is None else seen_by(soaked)
@@ -54,13 +54,13 @@ def seen_by(soaked: UnitInformation) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class UnitPosterior:
-    """What is known of a unit by its own soak and its family.
+    """Posterior of a unit by its own soak and its family.
 
     Attributes
     ----------
     family : Family
-    soaked : Soaked
-        With a noise that the family had a say in.
+    soaked : UnitInformation
+        With a noise that is pooled with the family's.
     lot : str
     posterior : Posterior
     band : Band
@@ -94,7 +94,7 @@ class UnitPosterior:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Which of T (N,) were soaked."""
+        """Whether each of T (N,) was soaked."""
         temperature = self.T
         return (temperature >= self.band.low) & (temperature <= self.band.high)
 
@@ -113,17 +113,17 @@ class UnitPosterior:
 
 
 def unit_posterior(family: Family, soaked: UnitInformation, lot: str = "") -> UnitPosterior:
-    """Return what is known of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
+    """Return the posterior of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
     own = with_pooled_noise(soaked, family)
     return UnitPosterior(family, own, lot, family.posterior(own, lot), band_of(family, own))
 
 
 def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | None = None) -> UnitInformation:
-    """Return what a unit's rows say with a noise that its family has a say in.
+    """Return the unit's information, its noise pooled with the family's.
 
-    A soak that is short, or goes one way, hardly tells a walk from the curve, and what is likely of one that does not
-    show is mostly what is not excluded. The logarithms of both densities are those of the unit and those of the
-    family's units, each with the weight of its variance. `own` are the unit's, where they are known.
+    A soak that is short, or goes one way, hardly separates a walk from the curve, and the likely size of one that does
+    not show is mostly the largest that is not excluded. The logarithms of both densities are those of the unit and
+    those of the family's units, each with the weight of its variance. `own` are the unit's, where they are known.
     """
     if family.bands is None:
         return soaked
@@ -135,9 +135,9 @@ def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | 
 
 
 def informed_where_unknown(soaked: UnitInformation, family: Family, record: UnitRecord) -> UnitInformation:
-    """Return what a unit's rows say with a noise that its family has a say in, where its walk does not show.
+    """Return the unit's information, its noise pooled with the family's where its walk does not show.
 
-    Where it does, or passes through the same temperatures ask for a larger one, they stay as they are.
+    Where it does, or repeated sweeps need a larger one, it stays as it is.
     """
     if family.bands is None or not {"noise", "walk"} <= set(record.figures):
         return soaked
@@ -146,8 +146,8 @@ def informed_where_unknown(soaked: UnitInformation, family: Family, record: Unit
     hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
     if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
         return soaked
-    found = with_pooled_noise(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
-    walks = np.where(hidden, found.walk, soaked.walk)
+    pooled = with_pooled_noise(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
+    walks = np.where(hidden, pooled.walk, soaked.walk)
     return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
 
 
@@ -176,10 +176,10 @@ def family_map(
     ----------
     band : Band, optional
         As `band_of` has it, which is used where it is left out.
-    soaked : Soaked, optional
-        What the unit's own soaks said: the record has what the map leaves of their rows.
+    soaked : UnitInformation, optional
+        Of the unit's own soaks: the record has the residual of the map on their rows.
     provenance : mapping of str to str, optional
-        What the record says of its making.
+        Of its making, for the record.
     """
     knots = family.knots
     band = band_of(family, soaked) if band is None else band
@@ -203,7 +203,7 @@ def _settings(step: float) -> ThermalMap:
 
 
 def _residual(family: Family, posterior: Posterior, soaked: UnitInformation) -> tuple[float, ...]:
-    """Return the rms (d,) of what the map leaves of the unit's own rows."""
+    """Return the rms (d,) of the residual of the map on the unit's own rows."""
     left = [rows.bias - family.knots.values(rows.T) @ posterior.c.T for rows in soaked.recordings]
     return tuple(np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)).tolist())
 
@@ -228,11 +228,11 @@ def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:
 
 
 def _modes(B: Array, C: Array) -> Array:
-    """Return the modes (r, G) of B C B': what goes with the surest temperature, and of the rest as few as hold it.
+    """Return the modes (r, G) of B C B': the one of the surest temperature, and of the rest as few as suffice.
 
-    The first is the level of what was soaked, as far as it is not known. Of the rest all but LOST of the variance at
-    each temperature is held, found in units of each temperature's own deviation: what was soaked is a hundred times
-    surer than what was not, and would be lost among modes that are largest over all. What is left out is made up for.
+    The first is the level of the soaked range, as far as it is not known. Of the rest all but LOST of the variance at
+    each temperature is covered, in units of each temperature's own deviation: the soaked range is a hundred times surer
+    than the rest, and would be lost among modes that are largest over all. The variance left out is made up for.
     """
     values, vectors = np.linalg.eigh(C)
     root = B @ (vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -242,10 +242,10 @@ def _modes(B: Array, C: Array) -> Array:
     first = root @ level
     rest = root - np.outer(first, level)
     size = np.linalg.norm(rest, axis=1)
-    size = np.maximum(size, max(LEAST * float(size.max()), tiny))
+    size = np.maximum(size, max(ROUNDING * float(size.max()), tiny))
     U, s, _ = np.linalg.svd(rest / size[:, None], full_matrices=False)
     modes = U * s
     held = np.cumsum(modes**2, axis=1)
-    r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:] - LEAST, axis=0)))
+    r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:] - ROUNDING, axis=0)))
     whole = np.sqrt(held[:, -1:] / np.maximum(held[:, r - 1 : r], tiny))
     return np.vstack([first, (modes[:, :r] * whole * size[:, None]).T])

@@ -1,17 +1,59 @@
-"""What is kept of a unit: `unit.json` in its folder, of which `units.parquet` is made.
+"""Records as JSON: arrays in them, and that of a unit: `unit.json` in its folder, of which `units.parquet` is made.
 
 d axes; all values in SI, temperatures in degC.
 """
 
 from __future__ import annotations
 
+from math import isqrt
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator
+
+from fusion_core.chunk import Array
+
+LOT_DIGITS = 9  # significant ones of a lot's covariance, of which there are many
+
+
+def _finite(values: Any) -> Array:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("no array of numbers") from None
+    if not np.all(np.isfinite(array)):
+        raise ValueError("a number that is not finite")
+    return array
+
+
+def _square(values: Any) -> Array:
+    """Return the symmetric matrices (..., q, q) of lists of upper triangles, row by row; arrays as they are."""
+    triangles = _finite(values)
+    n = triangles.shape[-1] if triangles.ndim else 0
+    q = (isqrt(8 * n + 1) - 1) // 2
+    if isinstance(values, np.ndarray) or q * (q + 1) // 2 != n:
+        return triangles
+    matrices = np.zeros((*triangles.shape[:-1], q, q))
+    rows, columns = np.triu_indices(q)
+    matrices[..., rows, columns] = matrices[..., columns, rows] = triangles
+    return matrices
+
+
+def _triangles(matrices: Array) -> Any:
+    return matrices[..., *np.triu_indices(matrices.shape[-1])].tolist()
+
+
+def _rounded_triangles(matrices: Array) -> Any:
+    return [[float(f"{value:.{LOT_DIGITS}g}") for value in row] for row in _triangles(matrices)]
+
+
+Numbers = Annotated[Array, PlainValidator(_finite), PlainSerializer(np.ndarray.tolist)]
+Covariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_triangles)]
+RoundedCovariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_rounded_triangles)]
 
 FIGURES = ("residual", "noise", "walk", "swing", "coast")
-"""What a line watches of each axis: rms of 30 s averages about the own map, densities of white noise and of the walk,
-largest less smallest bias of the map, rms of the error of 10 min without a measurement."""
+"""Figures of each axis on the charts of a line: rms of 30 s averages about the own map, densities of white noise and of
+the walk, largest less smallest bias of the map, rms of the error of 10 min without a measurement."""
 
 
 class Figure(BaseModel):
@@ -30,7 +72,7 @@ class Figure(BaseModel):
 
 
 class UnitRecord(BaseModel):
-    """What was found of one unit.
+    """Record of one unit.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
-"""Law of the coefficients of one axis over the units of a family, by restricted maximum likelihood.
+"""Law of the coefficients of one axis over the units of a family: robust restricted maximum likelihood.
 
-Of n units, unit i says J_i, h_i of its coefficients::
+Unit i of n has the information J_i, h_i on its coefficients::
 
     c_i = mu + b_lot + e_i,   b ~ N(0, Lambda),  e_i ~ N(0, Sigma / w_i)
 
@@ -8,42 +8,48 @@ mu has no prior, so the uncertainty of the mean is part of every expectation, wh
 *restricted* likelihood's (Patterson & Thompson 1971; Laird & Ware 1982). In the coordinates z = L^-1 c with Sigma = LL'
 no matrix that is inverted has an eigenvalue below w, whatever the condition of J: A = L'JL, M = w + A. Lambda is
 diagonal in z: lots differ by so much of each of the family's own shapes. w_i of a wild unit is small, of all others 1.
-q coefficients, G lots.
 
-The law of an axis though some units are wild: restricted maximum likelihood with weights.
+Weights: as in the deterministic MCD (Hubert, Rousseeuw & Verdonck 2012), the first law is that of the four fifths of
+the units that lie nearest under a smooth prior, so that wild units cannot hide behind a spread of their own making.
+Then each step of EM weighs the units by their squared distance from their lot's mean, in the law of all others: 1 up to
+the limit of the bulk of the units, (cut / distance)^2 beyond, so the contribution of a unit to Sigma is bounded and
+falls to nothing. The cut is set by the units themselves - median and median deviation of the cube roots, which Wilson &
+Hilferty (1931) make about normal -, since no family's law is Gaussian. Without wild units all weights are 1, and it is
+plain REML.
 
-As in the deterministic MCD (Hubert, Rousseeuw & Verdonck 2012), the first law is that of the four fifths of the units
-that lie nearest under a smooth prior, so that wild units cannot hide behind a spread of their own making. Then each
-step of EM weighs the units by their squared distance from their lot's mean, in the law of all others: 1 up to what the
-bulk of the units has, (cut / distance)^2 beyond, so what a unit adds to Sigma is bounded and falls to nothing. The cut
-is set by the units themselves - median and median deviation of the cube roots, which Wilson & Hilferty (1931) make
-about normal -, since no family's law is Gaussian. Without wild units all weights are 1, and it is plain REML.
-
-What a covariance of coefficients over temperature looks like before any unit of the family is seen.
-
-Sigma ~ inverse Wishart with `weight` degrees of freedom about a smooth covariance Psi of a level, a slope, a smooth
-curve and a rougher remainder::
+Prior: Sigma ~ inverse Wishart with `weight` degrees of freedom about a smooth covariance Psi of a level, a slope, a
+smooth curve and a rougher remainder::
 
     Psi(T, T') = a0^2 + a1^2 u u' + s^2 exp(-(T-T')^2 / 2 l^2) + r^2 (1 + k) exp(-k),   k = sqrt(3) |T-T'| / (3 step)
 
 Its five numbers are those under which the scatter of the units is likeliest: with n units of scatter S that likelihood
-is the matrix-variate t (Gupta & Nagar 2000, section 4.2), but for what does not depend on Psi::
+is the matrix-variate t (Gupta & Nagar 2000, section 4.2), up to a constant::
 
     log p = nu/2 log det(nu Psi) - (nu+n)/2 log det(nu Psi + S),    nu = q + 6
 
 whose maximum over all Psi is S/n. In Sigma it counts as WEIGHT units. The same likelihood, taken over nu too, chooses a
 prior that is all but certain for families of up to some 100 units, and maps of left-out units are then up to twice as
-far off. q coefficients at the temperatures `peaks`.
+far off. q coefficients at the temperatures `peaks`, G lots.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from fusion_core.chunk import Array
+
+TOLERANCE = 2e-3  # of Sigma's deviations in a step: far below their sampling error
+MAX_STEPS = 60
+CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
+NEAREST = 0.8  # of the units, for the first law
+MIN_WEIGHT = 1e-4
+SMOOTH = 4  # steps in which Sigma is a smooth prior's: with nothing yet to say how, no curve goes on beyond its range
+FROZEN = 24  # steps, after which weights stay
+HYPER = 4  # steps of EM between two fits of the prior
+WEIGHT = 5.0  # of the prior, units
 
 Index = npt.NDArray[np.intp]
 
@@ -62,7 +68,7 @@ class Means:
     of_lot: Array
 
     def turned(self, L: Array) -> Means:
-        """Return it in the coordinates L z."""
+        """Return the means in the coordinates L z."""
         return Means(
             L @ self.mu, L @ self.covariance @ L.T, self.shifts @ L.T, L @ self.shifts_covariance @ L.T,
             L @ self.of_lot @ L.T,
@@ -86,7 +92,7 @@ class VarianceComponents:
 
 @dataclass(frozen=True, eq=False)
 class EStep:
-    """What units say under a law.
+    """Expectations of the units under a law.
 
     Attributes
     ----------
@@ -148,7 +154,7 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
 
 
 def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) -> EStep:
-    """Return what units with J (n, q, q), h (n, q), of the lots numbered `lot` (n,), say with the weights w (n,)."""
+    """Return the expectations of units with J (n, q, q), h (n, q), of the lots `lot` (n,), with the weights w (n,)."""
     L, _, lots = law.root()
     G, q, one, weigh = int(lot.max()) + 1, len(L), np.eye(len(L)), w[:, None, None]
     A, a = inside(J, L), h @ L
@@ -173,32 +179,13 @@ def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) ->
     return EStep(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
 
 
-def m_step(found: EStep, w: Array, prior: SmoothPrior | None, *, lots: bool) -> VarianceComponents:
-    """Return the law that an EM step leads to."""
-    scatter, count = found.scatter, float(w.sum())
+def m_step(expected: EStep, w: Array, prior: SmoothPrior | None, *, lots: bool) -> VarianceComponents:
+    """Return the law that maximises the expected likelihood."""
+    scatter, count = expected.scatter, float(w.sum())
     if prior is not None:
         scatter, count = scatter + prior.scatter, count + WEIGHT
     Sigma = scatter / count
-    return VarianceComponents((Sigma + Sigma.T) / 2, found.between if lots else np.zeros_like(Sigma))
-
-
-def reml(
-    J: Array, h: Array, lot: Index, start: VarianceComponents, *, prior: SmoothPrior | None = None,
-    tolerance: float = 1e-6, most: int = 2000,
-) -> tuple[VarianceComponents, EStep]:  # fmt: skip
-    """Return the law of highest restricted likelihood, every unit's weight 1, and what the units say under it.
-
-    Until no entry of Sigma changes in a step by more than `tolerance` of its deviations, or `most` steps.
-    """
-    law, w, lots = start, np.ones(len(J)), int(lot.max()) > 0
-    law = law if lots else replace(law, Lambda=np.zeros_like(law.Sigma))
-    for _ in range(most):
-        found = e_step(law, J, h, lot, w)
-        later = m_step(found, w, prior, lots=lots)
-        law, moved = later, change(law, later)
-        if moved < tolerance:
-            break
-    return law, e_step(law, J, h, lot, w)
+    return VarianceComponents((Sigma + Sigma.T) / 2, expected.between if lots else np.zeros_like(Sigma))
 
 
 def change(before: VarianceComponents, after: VarianceComponents) -> float:
@@ -207,61 +194,51 @@ def change(before: VarianceComponents, after: VarianceComponents) -> float:
     return float(np.max(np.abs(after.Sigma - before.Sigma) / np.outer(size, size)))
 
 
-TOLERANCE = 2e-3  # of Sigma's deviations in a step: far below their sampling error
-MOST = 60  # steps
-CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
-KEPT = 0.8  # of the units, for the first law
-LEAST = 1e-4  # of a weight
-SMOOTH = 4  # steps in which Sigma is a smooth prior's: with nothing yet to say how, no curve goes on beyond its range
-FROZEN = 24  # steps, after which weights stay
-HYPER = 4  # steps of EM between two fits of the prior
-
-
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """What the fit of an axis ends with.
+class AxisFit:
+    """Result of the fit of an axis.
 
     `w` (n,) are the weights, `limit` the share of the expected distance beyond which they fall, `steps` how many EM
     took and `moved` by how much Sigma changed in the last.
     """
 
     law: VarianceComponents
-    found: EStep
+    expected: EStep
     w: Array
     limit: float
     steps: int
     moved: float
 
 
-def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> Fitted:
+def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> AxisFit:
     """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC."""
     q, lots = J.shape[1], int(lot.max()) > 0
     prior = initial_prior(peaks, initial_scale(J, h))
     law = VarianceComponents(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
     for _ in range(SMOOTH):
         w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
-        found = e_step(law, J, h, lot, w)
-        prior = fitted(peaks, found.scatter, float(w.sum()), prior)
-        law = VarianceComponents(prior.mean, found.between if lots else law.Lambda)
+        expected = e_step(law, J, h, lot, w)
+        prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
+        law = VarianceComponents(prior.mean, expected.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
-    for steps in range(1, MOST + 1):
-        found, older_w = e_step(law, J, h, lot, w), w
+    for steps in range(1, MAX_STEPS + 1):
+        expected, older_w = e_step(law, J, h, lot, w), w
         if not settled and steps % HYPER == 1:
-            older, prior = prior, fitted(peaks, found.scatter, float(w.sum()), prior)
+            older, prior = prior, likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
             settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
-        later = m_step(found, w, prior, lots=lots)
+        later = m_step(expected, w, prior, lots=lots)
         law, moved = later, change(law, later)
         if HYPER <= steps <= FROZEN:
-            w, limit = weights(found, w, float(w.sum()) + WEIGHT)
+            w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
         if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
             break
-    return Fitted(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
+    return AxisFit(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
 
 
-def weights(found: EStep, w: Array, total: float) -> tuple[Array, float]:
+def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:
     """Return weights (n,) and their limit, by distances in the law without the unit itself, of `total` weight."""
-    share, dof = found.distance
-    own = np.minimum(w * share * found.spread[:, 0] / total, 0.9)
+    share, dof = expected.distance
+    own = np.minimum(w * share * expected.spread[:, 0] / total, 0.9)
     share = share * (1 - w / total) / (1 - own)
     roots = np.cbrt(share)
     middle = np.median(roots)
@@ -272,11 +249,11 @@ def weights(found: EStep, w: Array, total: float) -> tuple[Array, float]:
 
 def outlier_weights(share: Array, limit: float) -> Array:
     """Return weights (n,) of distances `share` (n,) under a limit."""
-    return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, LEAST, 1.0))
+    return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 
 def initial_scale(J: Array, h: Array) -> float:
-    """Return about how far units are apart: median over coefficients of the units' median deviation."""
+    """Return the scale of the units' spread: median over coefficients of the units' median deviation."""
     q = J.shape[1]
     bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
     size = np.trace(J, axis1=1, axis2=2)[:, None, None] / q
@@ -289,13 +266,10 @@ def initial_scale(J: Array, h: Array) -> float:
     return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
 
 
-def _nearest(found: EStep) -> Array:
-    """Return 1 for the units nearest to their lot's mean, LEAST for the others; small families keep all."""
-    share = found.distance[0]
-    return np.where((share <= np.quantile(share, KEPT)) | (len(share) < 8), 1.0, LEAST)
-
-
-WEIGHT = 5.0  # units
+def _nearest(expected: EStep) -> Array:
+    """Return 1 for the units nearest to their lot's mean, MIN_WEIGHT for the others; small families keep all."""
+    share = expected.distance[0]
+    return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +281,7 @@ class SmoothPrior:
 
     @property
     def scatter(self) -> Array:
-        """What it adds to a scatter matrix (q, q)."""
+        """Contribution to a scatter matrix (q, q)."""
         return WEIGHT * self.mean
 
 
@@ -317,8 +291,8 @@ def smooth(peaks: Array, numbers: Array) -> Array:
     distance = np.abs(peaks[:, None] - peaks)
     u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
     k = np.sqrt(3.0) * distance / (3 * max(peaks[1] - peaks[0], 1e-9))
-    found = a0**2 + a1**2 * np.outer(u, u) + s**2 * np.exp(-0.5 * (distance / length) ** 2)
-    return np.asarray(found + r**2 * (1 + k) * np.exp(-k) + 1e-9 * (a0**2 + a1**2 + s**2) * np.eye(len(peaks)))
+    Psi = a0**2 + a1**2 * np.outer(u, u) + s**2 * np.exp(-0.5 * (distance / length) ** 2)
+    return np.asarray(Psi + r**2 * (1 + k) * np.exp(-k) + 1e-9 * (a0**2 + a1**2 + s**2) * np.eye(len(peaks)))
 
 
 def initial_prior(peaks: Array, spread: float) -> SmoothPrior:
@@ -327,7 +301,7 @@ def initial_prior(peaks: Array, spread: float) -> SmoothPrior:
     return SmoothPrior(smooth(peaks, numbers), numbers)
 
 
-def fitted(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> SmoothPrior:
+def likeliest_prior(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> SmoothPrior:
     """Return the prior under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
     from scipy.optimize import Bounds, minimize
 
@@ -337,13 +311,13 @@ def fitted(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> Sm
     begin: npt.NDArray[np.float64] = np.clip(start.numbers, low + 1e-6, high - 1e-6)
 
     def cost(numbers: npt.NDArray[np.float64]) -> float:
-        return -_likelihood(peaks, scatter, count, numbers) / count
+        return -_log_likelihood(peaks, scatter, count, numbers) / count
 
     best = minimize(cost, begin, method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25}).x
     return SmoothPrior(smooth(peaks, best), best)
 
 
-def _likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
+def _log_likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
     """Return log p of the module's text."""
     nu = len(peaks) + 6.0
     own = nu * smooth(peaks, numbers)

@@ -1,10 +1,10 @@
-"""How well a unit agrees with itself: warming with cooling, and one soak with another.
+"""Repeatability of a unit: the difference of warming and cooling, and of one soak and another.
 
 Between warming and cooling: the rows are a curve of the family's basis and, by the way the temperature last went by
-more than PLAY, half of a difference of three shapes, by least squares (a walk that is found beside a loop takes the
+more than PLAY, half of a difference of three shapes, by least squares (a walk that is estimated beside a loop takes the
 loop for its own). Between soaks: the curves of the soaks, each without its level, which is another with every turn-
-on. Both are the rms over temperature of what is found, beside what white noise and walk let expect. A linear estimate
-H y of rows with white noise of the density s and a walk of the density k has the covariance::
+on. Both are the rms over temperature, beside the rms expected of white noise and walk. A linear estimate H y of rows
+with white noise of the density s and a walk of the density k has the covariance::
 
     s^2 H diag(1 / span) H' + k^2 G diag(dt) G',    G_ij = sum of H_il over l >= j
 
@@ -22,6 +22,7 @@ from driftlab.family.record import Figure
 from driftlab.family.unit_information import SoakRows
 from driftlab.family.unit_noise import densities_of
 from fusion_core.chunk import Array
+from fusion_core.recursions import play
 
 PLAY = 2.0  # K
 SHAPES = 3  # of the difference between warming and cooling: level, slope and curvature over temperature
@@ -31,7 +32,7 @@ CUT = 1e-6  # of the largest singular value
 
 
 def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Figure:
-    """Return the difference (d,) between warming and cooling, rms, and what of it noise lets expect; None if one way.
+    """Return the difference (d,) between warming and cooling, rms, and that expected of noise; None if one way.
 
     `white` and `walk` (d,) are densities, SI/sqrt(Hz) and SI/sqrt(s); knots are `step` K apart.
     """
@@ -41,7 +42,7 @@ def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, ste
     if not EACH_WAY <= warms <= 1 - EACH_WAY:
         return Figure(value=(None,) * d, sigma=(None,) * d)
     T = np.concatenate([rows.T for rows in recordings])
-    knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
+    knots = SplineBasis.over(T, step)
     u = (2 * T - T.min() - T.max()) / max(float(np.ptp(T)), 1e-9)
     half = 0.5 * np.concatenate(ways)[:, None] * np.polynomial.legendre.legvander(u, SHAPES - 1)
     which = np.repeat(np.arange(len(recordings)), [len(rows.T) for rows in recordings])
@@ -52,51 +53,40 @@ def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, ste
 
 
 def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
-    """Return how far (d,) the curves of a unit's first and any further soak are apart at most, rms; None of one soak.
+    """Return the largest difference (d,), rms, of the curves of a unit's first and any further soak; None of one soak.
 
     The noise is that of each soak on its own: of two units under one name a joint one would be a wide walk.
     """
     d = recordings[0].bias.shape[1]
-    best = Figure(value=(None,) * d, sigma=(None,) * d)
-    if len(recordings) < 2:
-        return best
-    noise = [densities_of([rows], step) for rows in recordings]
-    found = []
-    for one in range(1, len(recordings)):
-        low = max(float(recordings[k].T.min()) for k in (0, one))
-        high = min(float(recordings[k].T.max()) for k in (0, one))
-        if high - low < COMMON * max(float(np.ptp(recordings[k].T)) for k in (0, one)):
+    noise, differences = [densities_of([rows], step) for rows in recordings], []
+    for other in range(1, len(recordings)):
+        both = (0, other)
+        low = max(float(recordings[k].T.min()) for k in both)
+        high = min(float(recordings[k].T.max()) for k in both)
+        if high - low < COMMON * max(float(np.ptp(recordings[k].T)) for k in both):
             continue
         at = np.linspace(low, high, 25)
-        parts = [_curve(recordings[k], at, step) for k in (0, one)]
-        value = np.sqrt(np.mean((parts[0] @ recordings[0].bias - parts[1] @ recordings[one].bias) ** 2, axis=0))
-        own = [
-            _covariance(H / np.sqrt(len(at)), [recordings[k]], noise[k].white, noise[k].walk)
-            for H, k in zip(parts, (0, one), strict=True)
-        ]
-        found.append((value, np.sqrt(own[0] + own[1])))
-    if not found:
-        return best
-    value, sigma = (np.array(part) for part in zip(*found, strict=True))
-    most = np.argmax(value / sigma, axis=0)
-    axes = np.arange(d)
-    return Figure(value=tuple(value[most, axes].tolist()), sigma=tuple(sigma[most, axes].tolist()))
+        H = {k: _curve(recordings[k], at, step) for k in both}
+        apart = H[0] @ recordings[0].bias - H[other] @ recordings[other].bias
+        variance = [_covariance(H[k] / np.sqrt(len(at)), [recordings[k]], noise[k].white, noise[k].walk) for k in both]
+        differences.append((np.sqrt(np.mean(apart**2, axis=0)), np.sqrt(variance[0] + variance[1])))
+    if not differences:
+        return Figure(value=(None,) * d, sigma=(None,) * d)
+    value, sigma = (np.array(part) for part in zip(*differences, strict=True))
+    largest = np.argmax(value / sigma, axis=0), np.arange(d)
+    return Figure(value=tuple(value[largest].tolist()), sigma=tuple(sigma[largest].tolist()))
 
 
 def _curve(rows: SoakRows, at: Array, step: float) -> Array:
     """Return the matrix (25, R) that makes of rows their curve at temperatures `at`, less its mean."""
-    knots = SplineBasis.covering(float(rows.T.min()), float(rows.T.max()), 2 * step)
+    knots = SplineBasis.over(rows.T, 2 * step)
     H = knots.values(at) @ np.linalg.pinv(knots.values(rows.T), rcond=CUT)
     return np.asarray(H - H.mean(axis=0))
 
 
 def _way(T: Array) -> Array:
     """Return the way (R,) that the temperature last went by more than PLAY: from -1 to 1, as a play operator has it."""
-    follows, y = np.empty(len(T)), float(T[0])
-    for k, value in enumerate(T.tolist()):
-        y = min(max(y, value - PLAY / 2), value + PLAY / 2)
-        follows[k] = y
-    return np.asarray((T - follows) / (PLAY / 2))
+    return np.asarray((T - play(np.ascontiguousarray(T), PLAY, float(T[0]))) / (PLAY / 2))
 
 
 def _figure(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Figure:
@@ -107,11 +97,11 @@ def _figure(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array)
 
 def _covariance(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Array:
     """Return the sum (d,) of the variances of the estimates H (k, R) y."""
-    found, at = np.zeros(len(white)), 0
+    total, at = np.zeros(len(white)), 0
     for rows in recordings:
         own = H[:, at : at + len(rows.t)]
         G = np.cumsum(own[:, ::-1], axis=1)[:, ::-1]
         steps = np.diff(rows.t, prepend=rows.t[0])
-        found += white**2 * np.sum(own**2 / rows.span) + walk**2 * np.sum(G**2 * steps)
+        total += white**2 * np.sum(own**2 / rows.span) + walk**2 * np.sum(G**2 * steps)
         at += len(rows.t)
-    return found
+    return total

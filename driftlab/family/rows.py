@@ -1,4 +1,4 @@
-"""From samples at rest to the rows of a soak: means of ROW seconds, with what else was recorded."""
+"""Rows of a soak: means of ROW seconds of samples at rest, with the other channels."""
 
 from __future__ import annotations
 
@@ -17,49 +17,48 @@ if TYPE_CHECKING:
     from driftlab.maps.fit import GatheredSoak
 
 ROW = 10.0  # s
-MOST = 8640  # rows of a recording: of one that lasts longer than a day, they are longer
+MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
 
 
-def rows_of(found: GatheredSoak, channel: str) -> tuple[SoakRows, ...]:
+def rows_of(soak: GatheredSoak, channel: str) -> tuple[SoakRows, ...]:
     """Return the rows of samples that were gathered with their epochs, of each recording or placement.
 
     Parameters
     ----------
-    found : Gathered
+    soak : GatheredSoak
         With its windows.
     channel : str
         Of the sensor whose bias it is.
     """
     rows, at = [], 0
-    ends = np.cumsum([len(window) for window in found.windows])
-    for start, stop in pairwise([*found.starts, len(found.T)]):
-        windows = found.windows[
+    ends = np.cumsum([len(window) for window in soak.windows])
+    for start, stop in pairwise([*soak.starts, len(soak.T)]):
+        windows = soak.windows[
             int(np.searchsorted(ends, start, "right")) : int(np.searchsorted(ends, stop, "left")) + 1
         ]
-        rows.append(_rows(windows, found.T[start:stop], found.bias[start:stop], channel))
+        rows.append(_rows(windows, soak.T[start:stop], soak.bias[start:stop], channel))
         at = stop
-    assert at == len(found.T) == ends[-1], "windows and samples are the same epochs"
+    assert at == len(soak.T) == ends[-1], "windows and samples are the same epochs"
     return tuple(rows)
 
 
 def soaked_of(
     unit: str, axes: tuple[str, ...], rows: tuple[SoakRows, ...], step: float = STEP
 ) -> tuple[UnitInformation, Densities]:
-    """Return what rows say of a unit under its own noise, and the densities of that.
+    """Return the information of rows on a unit under its own noise, and the densities of that.
 
-    The walk that information is reckoned with is the likely one, or the larger one that passes through the same
-    temperatures ask for.
+    The walk is the likely one, or the larger one that repeated sweeps need.
     """
-    found = densities_of(rows, step)
-    walk = walk_from_repeated_sweeps(rows, found.white, found.likely, step)
-    return UnitInformation.of(unit, axes, rows, found.white, walk, step), found
+    noise = densities_of(rows, step)
+    walk = walk_from_repeated_sweeps(rows, noise.white, noise.likely, step)
+    return UnitInformation.of(unit, axes, rows, noise.white, walk, step), noise
 
 
 def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> SoakRows:
     t = np.concatenate([window.t for window in windows])
     tau = np.concatenate([window["tau"] for window in windows])
-    length = max(ROW, float(t[-1] - t[0]) / MOST)
+    length = max(ROW, float(t[-1] - t[0]) / MAX_ROWS)
     number = np.floor((t - t[0]) / length + 1e-6)
     starts = np.flatnonzero(np.diff(number, prepend=-1.0))
     span = np.add.reduceat(tau, starts)

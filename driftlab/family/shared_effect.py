@@ -1,25 +1,39 @@
-"""An effect that the units of a family have in common, and what it is in each.
+"""An effect that the units of a family share: its sizes in each unit, over all of them, and by lot.
 
-d axes, q coefficients an axis.
+n units, d axes, q coefficients an axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple, Self
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from driftlab.family.contrasts import chunks_of, seen_temperatures, shown
+from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, columns_of, seen_temperatures
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.record import Numbers
+from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
-from driftlab.identification.result import parameters
-from driftlab.noise.local_level import log_determinant, whitened
+from driftlab.identification.result import described, parameters
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
+from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
+
+if TYPE_CHECKING:
+    from driftlab.units import BiasUnit
+
+DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
+HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
+MIN_UNITS = 2  # of a lot, for a law of its own
+NAMED = 6  # lots that are named one by one
+SIGNS = 2.0  # spread over mean, beyond which signs differ
+GAINS = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")  # of an effect, in the file
 
 
 class UnitDensities(NamedTuple):
@@ -29,62 +43,68 @@ class UnitDensities(NamedTuple):
     walk: Array
 
 
-@dataclass(frozen=True, eq=False)
-class EffectDistribution:
-    """How the coefficients (d, q) are spread over units: N(mean, spread^2), `sigma` of the mean; SI."""
+class EffectDistribution(BaseModel):
+    """Law of the coefficients (d, q) over units: N(mean, spread^2), `sigma` of the mean; SI."""
 
-    mean: Array
-    sigma: Array
-    spread: Array
+    model_config = ConfigDict(frozen=True, validate_by_name=True)
+
+    mean: Numbers
+    sigma: Annotated[Numbers, Field(alias="mean_sigma")]
+    spread: Numbers
 
     def shrunken(self, c: Array, v: Array) -> tuple[Array, Array]:
-        """Return a unit's coefficients and deviations, its own c with variances v (infinite: unseen) and the law."""
+        """Return a unit's coefficients and deviations, by its own c with variances v (infinite: unseen) and the law."""
         prior = np.maximum(self.spread**2, 1e-12 * (self.mean**2 + self.sigma**2) + 1e-300)
         weight = 1 / (1 / prior + 1 / v)
         return (self.mean / prior + np.where(np.isfinite(v), c / v, 0.0)) * weight, np.sqrt(weight)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it for `family.json`."""
-        return {"mean": self.mean.tolist(), "mean_sigma": self.sigma.tolist(), "spread": self.spread.tolist()}
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return what `as_json` wrote."""
-        return cls(*(np.array(content[name], dtype=float) for name in ("mean", "mean_sigma", "spread")))
+class OfLot(BaseModel):
+    """An effect in a lot: units, mean and deviation (d, q), evidence (nats), and whether that is enough."""
 
-
-@dataclass(frozen=True, eq=False)
-class OfLot:
-    """What one lot has: units, mean and deviation (d, q), the evidence of it (nats), and whether that is enough."""
+    model_config = ConfigDict(frozen=True, validate_by_name=True)
 
     lot: str
     units: int
-    mean: Array
-    sigma: Array
+    mean: Numbers
+    sigma: Annotated[Numbers, Field(alias="mean_sigma")]
     evidence: float
     has: bool
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it for `family.json`."""
-        return {
-            "lot": self.lot,
-            "units": self.units,
-            "mean": self.mean.tolist(),
-            "mean_sigma": self.sigma.tolist(),
-            "evidence": self.evidence,
-            "has": self.has,
-        }
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return what `as_json` wrote."""
-        mean, sigma = np.array(content["mean"], dtype=float), np.array(content["mean_sigma"], dtype=float)
-        return cls(content["lot"], content["units"], mean, sigma, content["evidence"], content["has"])
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LotEffects:
+    """The laws of an effect.
+
+    Attributes
+    ----------
+    law : EffectDistribution
+        Of the units that have it.
+    others : EffectDistribution or None
+        Of the units of the lots that have it not; None where every lot is one law's.
+    lots : tuple of OfLot
+        In the order of their names; none where no lots are known.
+    differs : float
+        Probability that lots of one law differ as much.
+    """
+
+    law: EffectDistribution
+    others: EffectDistribution | None = None
+    lots: tuple[OfLot, ...] = ()
+    differs: float = 1.0
+
+    def has(self, lot: str) -> bool:
+        """Whether the units of a lot have the effect."""
+        return self.others is None or any(one.lot == lot and one.has for one in self.lots)
+
+    def law_of(self, lot: str) -> EffectDistribution:
+        """Return the law of the units of a lot."""
+        return self.law if self.others is None or self.has(lot) else self.others
 
 
-@dataclass(frozen=True, eq=False)
-class SharedEffect:
-    """One effect.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SharedEffect(LotEffects):
+    """One effect with its laws.
 
     Attributes
     ----------
@@ -92,28 +112,16 @@ class SharedEffect:
         With its hyper-parameters.
     unit : str
         Of the coefficients.
-    law : Law
-        Of the units that have it.
-    others : Law or None
-        Of the units of the lots that have it not; None where every lot is one law's.
-    lots : tuple of OfLot
-        In the order of their names; none where no lots are known.
-    differs : float
-        Probability that lots of one law differ as much.
     evidence, of_mean, of_size, price : float
-        Nats: that it is there, of the mean of the units' coefficients and of their squares; and what it had to exceed.
+        Nats: that it is there, of the mean of the units' coefficients and of their squares; and the threshold.
     left_out, in_other_lots : float, float or None
         Gain on units, mean a unit in nats, that had no part in the law nor in the hyper-parameters; and in lots.
     indistinguishable_from : tuple of str
-        What predicts left-out units as well.
+        Effects that predict left-out units as well.
     """
 
     effect: Effect
     unit: str
-    law: EffectDistribution
-    others: EffectDistribution | None
-    lots: tuple[OfLot, ...]
-    differs: float
     evidence: float
     of_mean: float
     of_size: float
@@ -122,78 +130,62 @@ class SharedEffect:
     in_other_lots: float | None
     indistinguishable_from: tuple[str, ...]
 
-    def law_of(self, lot: str) -> EffectDistribution:
-        """Return the law of the units of a lot."""
-        if self.others is None or any(one.lot == lot and one.has for one in self.lots):
-            return self.law
-        return self.others
-
     def as_json(self) -> dict[str, Any]:
-        """Return it for `family.json`."""
-        effect = self.effect.model_dump(mode="json", exclude_none=True)
-        names = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")
+        """Return the effect as `family.json` has it."""
         return {
             "kind": self.effect.kind,
             "channel": self.effect.subject,
             "parameters": parameters(self.effect),
-            "effect": effect,
+            "effect": self.effect.model_dump(mode="json", exclude_none=True),
             "unit": self.unit,
-            **self.law.as_json(),
-            "other_lots": None if self.others is None else self.others.as_json(),
-            "lots": [lot.as_json() for lot in self.lots],
-            **{name: getattr(self, name) for name in names},
+            **self.law.model_dump(mode="json", by_alias=True),
+            "other_lots": self.others and self.others.model_dump(mode="json", by_alias=True),
+            "lots": [lot.model_dump(mode="json", by_alias=True) for lot in self.lots],
+            **{name: getattr(self, name) for name in GAINS},
             "indistinguishable_from": list(self.indistinguishable_from),
             "explanation": self.effect.explanation,
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return what `as_json` wrote; raises ValidationError where the effect is not installed."""
-        effect: Effect = TypeAdapter(Annotated[Effect, Installed()]).validate_python(content["effect"])
+        """Return the effect that `as_json` wrote; raises ValidationError where it is not installed."""
         others = content["other_lots"]
-        lots = tuple(OfLot.from_json(lot) for lot in content["lots"])
-        names = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")
         return cls(
-            effect, content["unit"], EffectDistribution.from_json(content),
-            None if others is None else EffectDistribution.from_json(others), lots,
-            **{name: content[name] for name in names}, indistinguishable_from=tuple(content["indistinguishable_from"]),
+            effect=TypeAdapter(Annotated[Effect, Installed()]).validate_python(content["effect"]), unit=content["unit"],
+            law=EffectDistribution.model_validate(content),
+            others=others and EffectDistribution.model_validate(others),
+            lots=tuple(OfLot.model_validate(lot) for lot in content["lots"]), **{name: content[name] for name in GAINS},
+            indistinguishable_from=tuple(content["indistinguishable_from"]),
         )  # fmt: skip
 
 
 def without_effects(
     soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect], noise: UnitDensities | None = None
 ) -> UnitInformation:
-    """Return what the soaks say of the curve where the unit has the effects, its noise beside them found if not known.
+    """Return the information of the soaks on the curve where the unit has the effects, and its `noise` beside them.
 
-    What the effects show passes for a walk where they are not in the model.
+    The noise is estimated where it is None: an effect passes for a walk where it is not in the model.
     """
     if noise is None:
-        found = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
-        noise = UnitDensities(found.white, found.likely)
+        densities = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
+        noise = UnitDensities(densities.white, densities.likely)
     return _without(replace(soaked, white=noise.white, walk=noise.walk), lot, effects)
 
 
 def _without(soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect]) -> UnitInformation:
-    """Return what the soaks say of the curve where the unit has the effects, each drawn from its law.
+    """Return the information of the soaks on the curve where the unit has the effects, each drawn from its law.
 
     With Z their columns and c ~ N(m, D), -2 log L of the curve alone is that of y - Z m under S + Z D Z'. The rows are
-    without the effects at what they are most likely to be.
+    without the effects at their most likely coefficients.
     """
     have = set(soaked.recordings[0].channels) | {"temperature"}
     effects = [effect for effect in effects if set(effect.effect.requires) <= have]
     coefficient = [effect for effect in effects if not effect.effect.acts_on_input]
-    laws = [effect.law_of(lot) for effect in coefficient]
-    chunks = chunks_of(soaked)
-    parts = [shown(effect.effect, soaked, chunks) for effect in coefficient]
-    d = len(soaked.axes)
+    laws, d, q = [one.law_of(lot) for one in coefficient], len(soaked.axes), soaked.knots.q
     mean = np.concatenate([np.zeros((d, 0)), *(law.mean for law in laws)], axis=1)
     spread = np.concatenate([np.zeros((d, 0)), *(law.spread for law in laws)], axis=1)
-    Z = [
-        np.concatenate([np.zeros((len(rows.t), d, 0)), *(part[k] for part in parts)], axis=2)
-        for k, rows in enumerate(soaked.recordings)
-    ]
+    Z = columns_of([one.effect for one in coefficient], soaked, chunks_of(soaked))
     T = seen_temperatures(soaked, [effect.effect for effect in effects])
-    q = soaked.knots.q
     J, h, squares, log_det = soaked.J.copy(), soaked.h.copy(), soaked.squares.copy(), soaked.log_det.copy()
     bias = [rows.bias.copy() for rows in soaked.recordings]
     for axis in range(d):
@@ -216,8 +208,209 @@ def _products(
     """Return the products of splines, bias less effects at their means, and effects a spread each; and log det S."""
     total, log_det = np.zeros(()), 0.0
     for k, (rows, t, z) in enumerate(zip(soaked.recordings, T, Z, strict=True)):
-        noise = rows.variances(soaked.white[axis], soaked.walk[axis], free=k > 0)
-        X = whitened(np.column_stack([soaked.knots.values(t), rows.bias[:, axis] - z @ mean, z * spread]), *noise)
-        total = total + X.T @ X
-        log_det += log_determinant(*noise)
+        columns = np.column_stack([soaked.knots.values(t), rows.bias[:, axis] - z @ mean, z * spread])
+        X, own = rows.whitened(columns, soaked.white[axis], soaked.walk[axis], free=k > 0)
+        total, log_det = total + X.T @ X, log_det + own
     return total, log_det
+
+
+@dataclass(frozen=True, eq=False)
+class OfUnit:
+    """An effect in a unit: coefficients and deviations (d, q), shrunken to the law; `own`, by its own soak alone."""
+
+    c: Array
+    sigma: Array
+    own: Array
+    own_sigma: Array
+
+
+class _UnitContrast(NamedTuple):
+    """Coefficients (d, q) and variances (d, q) of an effect beside all others, and its contrasts."""
+
+    c: Array
+    v: Array
+    contrasts: EffectContrasts
+
+
+def sizes(
+    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[tuple[Offer, Effect]], each: ParallelMap = serial
+) -> tuple[list[LotEffects], dict[str, tuple[OfUnit, ...]], dict[str, UnitDensities]]:
+    """Return the laws of effects over all units, the effects in each unit, and its noise beside them."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    with threadpool_limits(1):
+        names, lots, densities, rows = zip(*each(partial(_effects_of_unit, taken), units), strict=True)
+    laws, of_units = [], []
+    for (_, effect), column in zip(taken, zip(*rows, strict=True), strict=True):
+        contrasts = together([one.contrasts for one in column])
+        c, v = np.stack([one.c for one in column]), np.stack([one.v for one in column]) * _excess_noise(contrasts)
+        law = _laws(effect, c, v, contrasts, lots)
+        laws.append(law)
+        of_units.append([
+            OfUnit(*law.law_of(lot).shrunken(one, variance), one, np.sqrt(variance))
+            for one, variance, lot in zip(c, v, lots, strict=True)
+        ])  # fmt: skip
+    return laws, dict(zip(names, zip(*of_units, strict=True), strict=True)), dict(zip(names, densities, strict=True))
+
+
+def _effects_of_unit(
+    taken: Sequence[tuple[Offer, Effect]], unit: tuple[UnitInformation, str]
+) -> tuple[str, str, UnitDensities, list[_UnitContrast]]:
+    """Return the name of a unit, its lot, its noise beside the effects, and its contrast of each."""
+    soaked, lot = unit
+    quiet = _with_noise_beside(soaked, [effect for _, effect in taken])
+    contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]
+    return soaked.unit, lot, UnitDensities(quiet.white, quiet.walk), contrasts
+
+
+def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> UnitInformation:
+    """Return the unit with its noise beside the effects: with them it passes for one that walks more."""
+    chunks = chunks_of(soaked)
+    bias = [rows.bias.copy() for rows in soaked.recordings]
+    for k, effect in enumerate(effects):
+        if effect.acts_on_input:
+            continue
+        try:
+            c = EffectColumns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
+        except MissingChannel:
+            continue
+        for own, z in zip(bias, columns_of([effect], soaked, chunks), strict=True):
+            own -= np.einsum("rdq,dq->rd", z, c)
+    T = seen_temperatures(soaked, effects)
+    rows = [replace(one, T=t, bias=own) for one, t, own in zip(soaked.recordings, T, bias, strict=True)]
+    densities = densities_of(rows, soaked.knots.step)
+    return replace(soaked, white=densities.white, walk=densities.likely)
+
+
+def _contrast(soaked: UnitInformation, taken: Sequence[tuple[Offer, Effect]], k: int) -> _UnitContrast:
+    offer, effect = taken[k]
+    columns = EffectColumns(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
+    contrasts = columns.contrasts([effect], [offer.size])
+    try:
+        c, covariance = columns.estimates(effect)
+    except MissingChannel:
+        return _UnitContrast(np.zeros_like(contrasts.c), np.full_like(contrasts.c, np.inf), contrasts)
+    return _UnitContrast(c, np.diagonal(covariance, axis1=1, axis2=2), contrasts)
+
+
+def _excess_noise(contrasts: EffectContrasts) -> Array:
+    """Return the noise (n, d, 1) along placebos over that of the units' models, half of it that of all units."""
+    own = noise_of(contrasts.placebos)[0].mean(axis=-1, keepdims=True)
+    return np.asarray((own + own.mean(axis=0)) / 2)
+
+
+def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: Sequence[str]) -> LotEffects:
+    members = {name: np.flatnonzero([lot == name for lot in lots]) for name in dict.fromkeys(lots)}
+    known = {name: units for name, units in members.items() if name and len(units) >= MIN_UNITS}
+    whole = _law(effect, c, v, np.arange(len(lots)))
+    if len(known) < 2:
+        return LotEffects(law=whole)
+    differs, of_lots = _differ(c, v, list(known.values())), []
+    for name, units in known.items():
+        one, evidence = _law(effect, c, v, units, lag=False), _evidence(effect, c, v, contrasts, units)
+        has = evidence > HAS + float(np.log(len(known)))
+        of_lots.append(OfLot(lot=name, units=len(units), mean=one.mean, sigma=one.sigma, evidence=evidence, has=has))
+    having = [one.lot for one in of_lots if one.has]
+    if differs > DIFFERS or not having or len(having) == len(of_lots):
+        return LotEffects(law=whole, lots=tuple(of_lots), differs=differs)
+    inside = np.array([lot in having for lot in lots])
+    law, others = (_law(effect, c, v, np.flatnonzero(part)) for part in (inside, ~inside))
+    return LotEffects(law=law, others=others, lots=tuple(of_lots), differs=differs)
+
+
+def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> EffectDistribution:
+    """Return the law of some units; that of a lag is known, unless the measured one is asked for."""
+    d, q = c.shape[1:]
+    own, variance = c[units].reshape(len(units), -1), v[units].reshape(len(units), -1)
+    s2 = between(own, variance)
+    m, sigma, _ = mean_of(own, variance, s2)
+    if lag and effect.acts_on_input:
+        m, s2 = np.ones(d * q), np.zeros(d * q)
+    mean, sigma, spread = (values.reshape(d, q) for values in (m, sigma, np.sqrt(s2)))
+    return EffectDistribution(mean=mean, sigma=sigma, spread=spread)
+
+
+def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, units: Indices) -> float:
+    """Return - log of the probability that the coefficients of some units are noise, nats.
+
+    Their means under their variances, or under their scatter where that is more; or, of as many as it takes, as the
+    search weighs them.
+    """
+    from scipy.stats import chi2
+
+    n = len(units)
+    c, w = c[units].reshape(n, -1), 1 / v[units].reshape(n, -1)
+    W = w.sum(axis=0)
+    if not np.any(W > 0):
+        return 0.0
+    c, w, W = c[:, W > 0], w[:, W > 0], W[W > 0]
+    m = (w * c).sum(axis=0) / W
+    scatter = float(np.sum(w * (c - m) ** 2)) / ((n - 1) * len(W))
+    means = -float(chi2.logsf(float(np.sum(m**2 * W)) / max(scatter, 1.0), len(W)))
+    weighed = chances([Offer(effect, contrasts.c.shape[-1])], contrasts, units)[0][2]
+    return max(means, weighed) - float(np.log(2))
+
+
+def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:
+    """Return the probability that lots of one law differ as much: an F ratio an axis, weighted, all multiplied."""
+    from scipy.stats import chi2, f
+
+    n = len(c)
+    c, v = c.reshape(n, -1), v.reshape(n, -1)
+    w = np.where(np.isfinite(v), 1 / (np.where(np.isfinite(v), v, 1.0) + between(c, v)), 0.0)
+    total, freedom = np.zeros((2, c.shape[1])), np.zeros((2, c.shape[1]))
+    members = np.concatenate(groups)
+    m = (w * c)[members].sum(axis=0) / np.maximum(w[members].sum(axis=0), 1e-300)
+    for group in groups:
+        W = w[group].sum(axis=0)
+        own = (w * c)[group].sum(axis=0) / np.maximum(W, 1e-300)
+        total += np.stack([W * (own - m) ** 2, (w[group] * (c[group] - own) ** 2).sum(axis=0)])
+        freedom += np.stack([np.where(W > 0, 1.0, 0.0), np.maximum((w[group] > 0).sum(axis=0) - 1.0, 0.0)])
+    freedom[0] -= 1
+    used = (freedom > 0).all(axis=0) & (total[1] > 0)
+    if not np.any(used):
+        return 1.0
+    ratio = (total[0] / np.maximum(freedom[0], 1))[used] / (total[1] / np.maximum(freedom[1], 1))[used]
+    logs = np.maximum(f.logsf(ratio, freedom[0][used], freedom[1][used]), -700.0)
+    return float(chi2.sf(-2 * logs.sum(), 2 * len(logs)))
+
+
+def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+    """Return an effect with its sizes and its evidence, in sentences."""
+    name = described(effect.effect)
+    lines = [
+        f"{name}: {_where(effect)}, {_sizes(effect, effect.law, unit, axes)}; {effect.evidence:.0f} nats "
+        f"({effect.price:.0f} needed), and a unit that was left out is predicted {effect.left_out:.2g} nats better."
+    ]
+    if effect.others is not None:
+        lines.append(f"{name}: in the other lots {_sizes(effect, effect.others, unit, axes)}.")
+    if effect.indistinguishable_from:
+        lines.append(f"{name}: cannot be told from {', '.join(effect.indistinguishable_from)} on these soaks.")
+    return lines
+
+
+def _where(effect: SharedEffect) -> str:
+    if effect.others is None:
+        if len(effect.lots) < 2:
+            return "in the units"
+        return "in all lots alike" if effect.differs > DIFFERS else "in all lots, in some more than in others"
+    having = [lot.lot for lot in effect.lots if lot.has]
+    if len(having) <= NAMED:
+        return f"in lot{'s' if len(having) > 1 else ''} {', '.join(having)}"
+    return f"in {len(having)} of {len(effect.lots)} lots"
+
+
+def _sizes(effect: SharedEffect, law: EffectDistribution, unit: BiasUnit, axes: Sequence[str]) -> str:
+    if effect.effect.acts_on_input:
+        return "the same in each"
+    units = effect.effect.units_of(unit.shown)
+    lines = []
+    for axis, name in enumerate(axes):
+        for k in range(law.mean.shape[1]):
+            place = axis * law.mean.shape[1] + k
+            mean, sigma, spread = (float(v[axis, k]) * unit.factor for v in (law.mean, law.sigma, law.spread))
+            term = effect.effect.terms[k]
+            about = f"{name} {term}".strip()
+            lines.append(f"{about} {mean:.2g} +- {sigma:.1g} {units[place]} (units spread {spread:.1g})")
+    signs = bool(np.all(law.spread > SIGNS * np.abs(law.mean)))
+    return ("of either sign, " if signs else "") + ", ".join(lines)

@@ -1,13 +1,23 @@
-"""Which effects the units of a family have in common: evidence, what was left out, and which one is taken.
+"""Search for the effects that the units of a family share: offers, evidence, units left out, and the choice.
 
-Of every candidate the units' coefficients are weighed twice (`driftlab.family.shared_effect_tests`), all axes together,
-and both chances multiplied (R. A. Fisher, Statistical Methods for Research Workers, section 21.1). A candidate pays
-where - log of the chance exceeds log M + CHANCE, M all that was tried: candidates, and candidates times lots where the
-units of one lot are looked at alone. Then it has to predict: mean and spread from four fifths of the units make the
-coefficients of the others likelier than noise does. Of those that do, the one that predicts best is taken; a simpler
-one that is within one standard deviation of it (of the units' differences) before it; who is within two is a rival.
+Of every offer the units' coefficients c_i are tested twice for N(m, s^2) against (0, 0), all axes together, and both
+probabilities multiplied (R. A. Fisher, Statistical Methods for Research Workers, section 21.1). Neither test stands on
+the variances alone that the units' noise models give:
 
-What a family may have in common: all that the installed effects propose for some of its units.
+- of the mean m, by the scatter of the c_i between units, whatever makes it (Student's t of a weighted mean with the
+  sandwich variance). The same rows along placebos, mean over units, must be as noise is, or it counts less.
+- of the size of the c_i, whatever their signs: c_i^2 against the placebos of the same unit, an F ratio each, as
+  normal scores whose sum is normal: a unit whose noise is not that of its model is measured by its own noise.
+
+An offer pays where - log of the probability exceeds log M + CHANCE, M the number of trials: offers, and offers times
+lots where the units of one lot are looked at alone. Then it has to predict: mean and spread from four fifths of the
+units make the coefficients of the others likelier than noise does. Of those that do, the one that predicts best is
+taken; a simpler one that is within one standard deviation of it (of the units' differences) before it; one that is
+within two is a rival.
+
+n units, d axes, K coefficients (columns), J placebos. Sources: R. C. Paule and J. Mandel, J. Res. NBS 87 (1982) 377
+(s^2); P. J. Huber, Proc. 5th Berkeley Symp. 1 (1967) 221 (sandwich); S. A. Stouffer et al., The American Soldier (1949)
+45.
 """
 
 from __future__ import annotations
@@ -16,22 +26,13 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from pydantic import ValidationError
 
 from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, of_each_axis, own_curve
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.shared_effect_tests import (
-    between,
-    chance_of_means,
-    chance_of_sizes,
-    gains,
-    mean_of,
-    of_mean,
-    of_size,
-    variances,
-)
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.candidates import installed
 from driftlab.identification.state import name_of
@@ -43,26 +44,48 @@ from fusion_core.host.registry import kind_of
 CHANCE = 5.0  # nats beyond the price, as in the loop
 FOLDS = 5
 IN_LOT = 6  # units of a lot, at least, to look at it alone
-RIVAL, SIMPLER = 2.0, 1.0  # deviations of the difference of what is predicted
+RIVAL, SIMPLER = 2.0, 1.0  # deviations of the difference of the predictions
 LEFT_OUT = 3.0  # nats that left-out units have to become likelier by
+MAX_COEFFICIENTS = 3  # an axis: with more, an effect is a map, or one's guess
+HALVINGS = 36  # of the interval that holds s^2
+MIN_UNITS = 5  # for a mean and its scatter
+MIN_PLACEBOS = 3  # for the noise of a unit
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, eq=False)
+class Offer:
+    """An effect with hyper-parameters, and how many coefficients an axis it has here; a lag's one is 1."""
+
+    effect: Effect
+    size: int
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """Name and variant, common to offers that differ by hyper-parameters alone."""
+        return name_of(self.effect), self.effect.variant
+
+    @property
+    def parameters(self) -> tuple[int, int]:
+        """Number of coefficients; and of hyper-parameters, with one for a memory of the past."""
+        return self.size, len(self.effect.continuous) + int(self.effect.fades)
+
+
+@dataclass(frozen=True, eq=False)
 class Candidate:
-    """A candidate and its evidence, nats.
+    """An offer and its evidence, nats.
 
     Attributes
     ----------
     mean, size : float
         Of the mean of the coefficients, and of their squares.
     chance, price : float
-        Of both, and of all that was tried.
+        Of both, and of all trials.
     lot : str
         The lot that was looked at alone; empty: all.
     left_out : (n,) array
-        By how much the coefficients of each unit are likelier, predicted from others.
+        Gain in the log-likelihood of the coefficients of each unit, predicted from others.
     """
 
     offer: Offer
@@ -80,7 +103,7 @@ class Candidate:
 
     @property
     def total(self) -> float:
-        """Of all units."""
+        """Gain of all units."""
         return float(self.left_out.sum())
 
     @property
@@ -89,16 +112,70 @@ class Candidate:
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 
+def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
+    """Return the offers of the installed effects, and why kinds of effects have none.
+
+    Lines have none: their phase is the chamber's at the time, and no unit's.
+    """
+    channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
+    alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
+    chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
+    offers: list[Offer] = []
+    refused: dict[str, str] = {}
+    for cls in installed():
+        kind = kind_of(cls)
+        if kind in without:
+            refused[kind] = "not wanted"
+        elif cls.course == "line":
+            refused[kind] = "its phase is no property of a unit"
+        else:
+            try:
+                offers += _offers_of(cls, sample[0].axes, chunks)
+            except MissingChannel:
+                continue
+            except FusionError as error:
+                refused[kind] = f"broken: {error}"
+    return offers, refused
+
+
+def _offers_of(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk]) -> list[Offer]:
+    try:
+        blank = cls(axes=axes)  # type: ignore[call-arg]
+    except ValidationError:
+        return []
+    offers = []
+    for proposed in blank.proposals(chunks):
+        effect = proposed.beside_map(None) if set(proposed.requires) <= set(chunks[0].channels) else None
+        size = 0 if effect is None else 1 if effect.acts_on_input else _coefficients(effect, chunks[0])
+        if effect is not None and 0 < size <= MAX_COEFFICIENTS:
+            offers.append(Offer(effect, size))
+    return offers
+
+
+def _coefficients(effect: Effect, chunk: Chunk) -> int:
+    """Return the number of coefficients an axis of an effect; 0 where those of one axis show on another."""
+    signature = effect.signature(chunk.part(0, min(len(chunk), 500)), None)[0]
+    d, p = signature.shape[1:]
+    own = np.sum(of_each_axis(signature) ** 2) if p % d == 0 else np.nan
+    return p // d if np.isclose(own, np.sum(signature**2)) else 0
+
+
+def _with_residual(soaked: UnitInformation) -> list[Chunk]:
+    curve = own_curve(soaked)
+    parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
+    spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)
+    return [chunk.having(residual=part / spread) for chunk, part in zip(chunks_of(soaked), parts, strict=True)]
+
+
 def contrasts_of(
     sample: Iterable[UnitInformation], offers: Sequence[Offer], beside: Sequence[Effect], each: ParallelMap = serial
 ) -> EffectContrasts:
-    """Return what the units show of all offers beside what is named: arrays over (n, d, K)."""
+    """Return the contrasts of the units for all offers beside the effects in the model: arrays over (n, d, K)."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
     with threadpool_limits(1):
-        found = list(each(partial(_contrasts, effects, sizes, beside), sample))
-    return together(found)
+        return together(list(each(partial(_contrasts, effects, sizes, beside), sample)))
 
 
 def _contrasts(
@@ -107,43 +184,43 @@ def _contrasts(
     return EffectColumns(soaked, beside).contrasts(effects, sizes)
 
 
-def together(found: Sequence[EffectContrasts]) -> EffectContrasts:
+def together(units: Sequence[EffectContrasts]) -> EffectContrasts:
     """Return the contrasts of units as arrays over units."""
     return EffectContrasts(
-        *(np.stack([getattr(one, name) for one in found]) for name in ("c", "information", "placebos"))
+        *(np.stack([getattr(unit, name) for unit in units]) for name in ("c", "information", "placebos"))
     )
 
 
-def evaluate(offers: Sequence[Offer], shown: EffectContrasts, lots: Sequence[str]) -> list[Candidate]:
+def evaluate(offers: Sequence[Offer], contrasts: EffectContrasts, lots: Sequence[str]) -> list[Candidate]:
     """Return every offer with its evidence: of all units, or of the one lot that has it most clearly."""
-    names = [name for name, count in zip(*np.unique(lots, return_counts=True), strict=True) if count >= IN_LOT]
-    everyone = np.arange(len(lots))
+    everyone, counts = np.arange(len(lots)), Counter(lots)
     groups = {"": everyone}
-    if len(set(lots)) > 1:
-        groups |= {str(name): np.flatnonzero(np.array(lots) == name) for name in names if name}
-    of_groups = {name: chances(offers, shown, units) for name, units in groups.items()}
-    left_out = _left_out(offers, shown, everyone)
-    found = []
+    if len(counts) > 1:
+        names = sorted(name for name, count in counts.items() if name and count >= IN_LOT)
+        groups |= {name: np.flatnonzero(np.array(lots) == name) for name in names}
+    of_groups = {name: chances(offers, contrasts, units) for name, units in groups.items()}
+    price = {name: float(np.log(len(offers) * (len(groups) if name else 1))) for name in groups}
+    gained = _left_out(offers, contrasts, everyone)
+    candidates = []
     for k, offer in enumerate(offers):
-        price = {name: float(np.log(len(offers) * (len(groups) if name else 1))) for name in groups}
-        best = max(groups, key=lambda name: of_groups[name][k][2] - price[name])
-        own = left_out[:, k]
-        if best and of_groups[best][k][2] > price[best] + CHANCE:
-            own = np.zeros(len(lots))
-            own[groups[best]] = _left_out([offer], _part(offers, shown, k), groups[best])[:, 0]
-            if own.sum() < left_out[:, k].sum() and of_groups[""][k][2] > price[""] + CHANCE:
-                best, own = "", left_out[:, k]
+        lot, of_all = max(groups, key=lambda name: of_groups[name][k][2] - price[name]), gained[:, k]
+        left_out = of_all
+        if lot and of_groups[lot][k][2] > price[lot] + CHANCE:
+            left_out = np.zeros(len(lots))
+            left_out[groups[lot]] = _left_out([offer], _part(offers, contrasts, k), groups[lot])[:, 0]
+            if left_out.sum() < of_all.sum() and of_groups[""][k][2] > price[""] + CHANCE:
+                lot, left_out = "", of_all
         else:
-            best = ""
-        found.append(Candidate(offer, *of_groups[best][k], price[best], best, own))
-    return found
+            lot = ""
+        candidates.append(Candidate(offer, *of_groups[lot][k], price[lot], lot, left_out))
+    return candidates
 
 
-def chosen(found: Sequence[Candidate]) -> tuple[Candidate, list[Candidate]] | None:
-    """Return which candidate is taken and its rivals, the best of each kind; None where none pays."""
+def choose(candidates: Sequence[Candidate]) -> tuple[Candidate, list[Candidate]] | None:
+    """Return the candidate that is taken and its rivals, the best of each kind; None where none pays."""
     best: dict[tuple[str, str], Candidate] = {}
-    for one in found:
-        key = one.offer.family
+    for one in candidates:
+        key = one.offer.group
         if one.pays and (key not in best or one.total > best[key].total):
             best[key] = one
     if not best:
@@ -157,49 +234,42 @@ def chosen(found: Sequence[Candidate]) -> tuple[Candidate, list[Candidate]] | No
 
 
 def deficit(first: Candidate, other: Candidate) -> float:
-    """Return by how many deviations one candidate predicts units worse than another."""
+    """Return the deficit of one candidate's predictions of units against another's, in its deviations."""
     difference = first.left_out - other.left_out
     spread = float(np.std(difference)) * np.sqrt(len(difference))
     return float(difference.sum()) / spread if spread > 0 else 0.0
 
 
-def nested(offers: Sequence[Offer], shown: EffectContrasts, taken: Candidate, units: Indices) -> float:
+def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate, units: Indices) -> float:
     """Return the gain on units that had no part in choosing the hyper-parameters either, nats."""
-    of_kind = [k for k, offer in enumerate(offers) if offer.family == taken.offer.family]
-    parts = [_part(offers, shown, k) for k in of_kind]
-    total = 0.0
+    of_kind = [k for k, offer in enumerate(offers) if offer.group == taken.offer.group]
+    parts = [_part(offers, contrasts, k) for k in of_kind]
+    total, folds = 0.0, np.arange(len(units)) % FOLDS
     for fold in range(FOLDS):
-        test, train = units[np.arange(len(units)) % FOLDS == fold], units[np.arange(len(units)) % FOLDS != fold]
-        known = [_left_out([offers[k]], part, train)[:, 0].sum() for k, part in zip(of_kind, parts, strict=True)]
-        best = int(np.argmax(known))
-        total += float(_predicted(offers[of_kind[best]], parts[best], train, test).sum())
+        test, train = units[folds == fold], units[folds != fold]
+        gained = [_left_out([offers[k]], part, train)[:, 0].sum() for k, part in zip(of_kind, parts, strict=True)]
+        best = int(np.argmax(gained))
+        total += float(_gains([offers[of_kind[best]]], parts[best], train, test).sum())
     return total
 
 
-def between_lots(offer: Offer, shown: EffectContrasts, lots: Sequence[str]) -> float | None:
+def between_lots(offer: Offer, contrasts: EffectContrasts, lots: Sequence[str]) -> float | None:
     """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
-    names = sorted(set(lots))
+    names, of_unit = sorted(set(lots)), np.array(lots)
     if len(names) < 2:
         return None
-    gained = []
-    for name in names:
-        test = np.flatnonzero(np.array(lots) == name)
-        train = np.flatnonzero(np.array(lots) != name)
-        gained.append(_predicted(offer, shown, train, test).sum())
-    return float(np.sum(gained)) / len(lots)
+    folds = ((np.flatnonzero(of_unit != name), np.flatnonzero(of_unit == name)) for name in names)
+    return float(np.sum([_gains([offer], contrasts, *fold)[:, 0].sum() for fold in folds])) / len(lots)
 
 
-def refined(
-    sample: Sequence[UnitInformation],
-    taken: Candidate,
-    grid: Collection[Offer],
-    beside: Sequence[Effect],
+def refine(
+    sample: Sequence[UnitInformation], taken: Candidate, grid: Collection[Offer], beside: Sequence[Effect],
     each: ParallelMap = serial,
-) -> Effect:
+) -> Effect:  # fmt: skip
     """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
     effect = _of_right_size(sample, taken, beside, each)
     for name, value in effect.hyper_parameters.items():
-        known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.family == taken.offer.family})
+        known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.group == taken.offer.group})
         if len(known) < 2:
             continue
         x = np.linspace(-1, 1, 9) * float(np.min(np.diff(np.log(known))))
@@ -236,53 +306,45 @@ def _of_right_size(
     """Return the effect; a lag as long as its size says."""
     if not taken.effect.acts_on_input:
         return taken.effect
-    shown = contrasts_of(sample, [taken.offer], beside, each)
-    flat = shown.c.reshape(len(sample), -1)
-    v = variances(shown.information.reshape(flat.shape), shown.placebos.reshape(*flat.shape, -1))
-    size = float(_scale(shown.c, v.reshape(shown.c.shape))[0])
+    contrasts = contrasts_of(sample, [taken.offer], beside, each)
+    size = float(_scale(contrasts.c, variances(*contrasts.flat()[1:]).reshape(contrasts.c.shape))[0])
     longer = {name: value * size for name, value in taken.effect.hyper_parameters.items() if size > 0}
     return taken.effect.model_copy(update=longer)
 
 
-def chances(offers: Sequence[Offer], shown: EffectContrasts, units: Indices) -> list[tuple[float, float, float]]:
+def chances(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> list[tuple[float, float, float]]:
     """Return evidence of mean, of size and of both of each offer in some units, nats."""
     from scipy.stats import chi2
 
-    c, information, placebos = shown.c[units], shown.information[units], shown.placebos[units]
-    n, d, K = c.shape
-    flat = (n, d * K)
-    c, information, placebos = c.reshape(flat), information.reshape(flat), placebos.reshape(*flat, -1)
+    d, K = contrasts.c.shape[1:]
+    c, information, placebos = contrasts.flat(units)
     z, noise = (values.reshape(d, K) for values in of_mean(c, variances(information, placebos), placebos))
-    sizes = of_size(c, information, placebos).reshape(d, K)
-    found, at = [], 0
-    for offer in offers:
-        own = slice(at, at + offer.size)
-        at += offer.size
+    sizes, evidence = of_size(c, information, placebos).reshape(d, K), []
+    for offer, own in zip(offers, _columns(offers), strict=True):
         mean = chance_of_means(z[:, own].ravel(), noise[:, own].ravel())
         # of a lag the size is known; a walk has the course of any effect of time, of whatever sign
         one = offer.effect.acts_on_input or offer.effect.walks
         size = 0.0 if one else chance_of_sizes(sizes[:, own].ravel())
-        found.append((mean, size, mean if one else -float(chi2.logsf(2 * (mean + size), 4))))
-    return found
+        evidence.append((mean, size, mean if one else -float(chi2.logsf(2 * (mean + size), 4))))
+    return evidence
 
 
-def _part(offers: Sequence[Offer], shown: EffectContrasts, k: int) -> EffectContrasts:
-    at = sum(offer.size for offer in offers[:k])
-    own = slice(at, at + offers[k].size)
-    return EffectContrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
+def _columns(offers: Sequence[Offer]) -> list[slice]:
+    """Return the columns of each offer."""
+    return [slice(int(a), int(b)) for a, b in pairwise(np.cumsum([0, *(offer.size for offer in offers)]))]
 
 
-def _left_out(offers: Sequence[Offer], shown: EffectContrasts, units: Indices) -> Array:
+def _part(offers: Sequence[Offer], contrasts: EffectContrasts, k: int) -> EffectContrasts:
+    return contrasts.of(_columns(offers)[k])
+
+
+def _left_out(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> Array:
     """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
     folds = np.arange(len(units)) % FOLDS
     total = np.zeros((len(units), len(offers)))
     for fold in range(FOLDS):
-        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold])
+        total[folds == fold] = _gains(offers, contrasts, units[folds != fold], units[folds == fold])
     return total
-
-
-def _predicted(offer: Offer, shown: EffectContrasts, train: Indices, test: Indices) -> Array:
-    return _gains([offer], shown, train, test)[:, 0]
 
 
 def _scale(c: Array, v: Array) -> Array:
@@ -291,99 +353,132 @@ def _scale(c: Array, v: Array) -> Array:
     return np.asarray(np.maximum((w * c).sum(axis=(0, 1)) / np.maximum(w.sum(axis=(0, 1)), 1e-300), 0.0))
 
 
-def _gains(offers: Sequence[Offer], shown: EffectContrasts, train: Indices, test: Indices) -> Array:
+def _gains(offers: Sequence[Offer], contrasts: EffectContrasts, train: Indices, test: Indices) -> Array:
     """Return gains (units of test, offers) with mean and spread from others, all axes together.
 
     A lag that is half as long as it is taken to be shows about half as much: its size is one for all units and
     axes.
     """
-    n, d, K = shown.c.shape
-    v = variances(shown.information.reshape(n, -1), shown.placebos.reshape(n, d * K, -1))
-    c = shown.c.reshape(n, -1)
+    d, K = contrasts.c.shape[1:]
+    c, information, placebos = contrasts.flat()
+    v = variances(information, placebos)
     s2 = between(c[train], v[train])
     m = mean_of(c[train], v[train], s2)[0]
     lag = np.tile(np.repeat([o.effect.acts_on_input for o in offers], [o.size for o in offers]), d)
     size = np.tile(_scale(c[train].reshape(-1, d, K), v[train].reshape(-1, d, K)), d)
     gained = gains(c[test], v[test], np.where(lag, size, m), np.where(lag, 0.0, s2)).reshape(len(test), d, K)
-    edges = np.cumsum([0, *(offer.size for offer in offers)])[:-1]
-    return np.asarray(np.add.reduceat(gained.sum(axis=1), edges, axis=1))
+    return np.asarray(np.add.reduceat(gained.sum(axis=1), [own.start for own in _columns(offers)], axis=1))
 
 
-MOST = 3  # coefficients an axis: with more, an effect is a map, or one's guess
+def noise_of(placebos: Array) -> tuple[Array, Array]:
+    """Return the mean squares (..., K) of placebos, 1 where there are hardly any, and degrees of freedom of each."""
+    count = np.count_nonzero(placebos, axis=-1)
+    enough = count >= MIN_PLACEBOS
+    square = np.sum(placebos**2, axis=-1) / np.maximum(count, 1)
+    return np.where(enough, square, 1.0), np.where(enough, count, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Offer:
-    """An effect with hyper-parameters, and how many coefficients an axis it has here; a lag's one is 1."""
+def variances(information: Array, placebos: Array) -> Array:
+    """Return variances (n, K) of coefficients, by the noise that placebos show; infinite where nothing is seen.
 
-    effect: Effect
-    size: int
-
-    @property
-    def family(self) -> tuple[str, str]:
-        """What it has in common with those that differ by hyper-parameters alone."""
-        return name_of(self.effect), self.effect.variant
-
-    @property
-    def parameters(self) -> tuple[int, int]:
-        """How simple it is: coefficients; and hyper-parameters, with one for a memory of what came before."""
-        return self.size, len(self.effect.continuous) + int(self.effect.fades)
-
-
-def offered(sample: Sequence[UnitInformation], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
-    """Return what is offered, and why kinds of effects are not.
-
-    Lines are not: their phase is the chamber's at the time, and no unit's.
+    A unit's own mean square counts as much as that of all units.
     """
-    channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
-    alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
-    chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
-    found: list[Offer] = []
-    refused: dict[str, str] = {}
-    for cls in installed():
-        kind = kind_of(cls)
-        if kind in without:
-            refused[kind] = "not wanted"
-        elif cls.course == "line":
-            refused[kind] = "its phase is no property of a unit"
-        else:
-            try:
-                found += _of(cls, sample[0].axes, chunks)
-            except MissingChannel:
-                continue
-            except FusionError as error:
-                refused[kind] = f"broken: {error}"
-    return found, refused
+    seen = information > 0
+    own = noise_of(placebos)[0]
+    count = np.maximum(seen.sum(axis=0), 1)
+    pooled = np.where(seen, own, 0.0).sum(axis=0) / count
+    return np.where(seen, (own + pooled) / 2, np.inf) / np.where(seen, information, 1.0)
 
 
-def _of(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk]) -> list[Offer]:
-    try:
-        blank = cls(axes=axes)  # type: ignore[call-arg]
-    except ValidationError:
-        return []
-    found = []
-    for proposed in blank.proposals(chunks):
-        effect = proposed.beside_map(None) if set(proposed.requires) <= set(chunks[0].channels) else None
-        if effect is None:
-            continue
-        size = 1 if effect.acts_on_input else _coefficients(effect, chunks[0])
-        if 0 < size <= MOST:
-            found.append(Offer(effect, size))
-    return found
+def between(c: Array, v: Array) -> Array:
+    """Return the variance s^2 (K,) between units of c (n, K) with variances v, by Paule and Mandel; at least 0."""
+    seen = np.isfinite(v)
+    n = seen.sum(axis=0)
+    lowest = np.min(v, axis=0, initial=np.inf)
+    scale = np.where(np.isfinite(lowest), lowest, 1.0)
+
+    def excess(s2: Array) -> Array:
+        w = np.where(seen, 1 / (np.where(seen, v, 1.0) + s2), 0.0)
+        m = (w * c).sum(axis=0) / np.maximum(w.sum(axis=0), 1e-300)
+        return np.asarray((w * (c - m) ** 2).sum(axis=0) - (n - 1))
+
+    low = np.zeros_like(scale)
+    high = np.where(seen, c**2, 0.0).sum(axis=0) + scale
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        more = excess(middle) > 0
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return np.where(excess(np.zeros_like(scale)) > 0, (low + high) / 2, 0.0)
 
 
-def _coefficients(effect: Effect, chunk: Chunk) -> int:
-    """Return how many coefficients an axis an effect has; 0 where those of one axis show on another."""
-    shown = effect.signature(chunk.part(0, min(len(chunk), 500)), None)[0]
-    d, p = shown.shape[1:]
-    if p % d:
-        return 0
-    own = of_each_axis(shown)
-    return p // d if np.isclose(np.sum(own**2), np.sum(shown**2)) else 0
+def mean_of(c: Array, v: Array, s2: Array) -> tuple[Array, Array, Array]:
+    """Return means m (K,) of c (n, K), their deviations by the scatter between units, and degrees of freedom."""
+    seen = np.isfinite(v)
+    w = np.where(seen, 1 / (np.where(seen, v, 1.0) + s2), 0.0)
+    w = w / np.maximum(w.sum(axis=0), 1e-300)
+    m = (w * c).sum(axis=0)
+    count = 1 / np.maximum((w**2).sum(axis=0), 1e-300)
+    spread = (w**2 * (c - m) ** 2).sum(axis=0)
+    sigma = np.sqrt(spread * count / np.maximum(count - 1, 1e-3))
+    return m, sigma, np.maximum(count - 1, 1e-3)
 
 
-def _with_residual(soaked: UnitInformation) -> list[Chunk]:
-    curve = own_curve(soaked)
-    parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
-    spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)
-    return [chunk.having(residual=part / spread) for chunk, part in zip(chunks_of(soaked), parts, strict=True)]
+def scores(m: Array, sigma: Array, freedom: Array) -> Array:
+    """Return means over their deviations as normal scores (K,): what is as unlikely as Student's t."""
+    from scipy.stats import norm, t
+
+    ratio = np.where(sigma > 0, np.abs(m) / np.where(sigma > 0, sigma, 1.0), 0.0)
+    p = np.maximum(t.logsf(ratio, freedom), -700.0)
+    return np.asarray(np.sign(m) * np.maximum(norm.isf(np.exp(p)), 0.0))
+
+
+def of_mean(c: Array, v: Array, placebos: Array) -> tuple[Array, Array]:
+    """Return normal scores (K,) of the means, and mean squares (K,) of those of the placebos."""
+    n, K = c.shape
+    seen = np.isfinite(v)
+    if n < MIN_UNITS:
+        return np.zeros(K), np.ones(K)
+    z = np.where(seen.sum(axis=0) >= MIN_UNITS, scores(*mean_of(c, v, between(c, v))), 0.0)
+    own = np.sqrt(noise_of(placebos)[0])[:, :, None]
+    b = np.where(seen[:, :, None], placebos / own, 0.0)
+    total = np.sqrt(np.maximum((b**2).sum(axis=0), 1e-300))
+    return z, noise_of(np.where(total > 1e-100, b.sum(axis=0) / total, 0.0))[0]
+
+
+def of_size(c: Array, information: Array, placebos: Array) -> Array:
+    """Return normal scores (K,) of the squares of coefficients against those of the placebos of the same unit."""
+    from scipy.stats import f, norm
+
+    noise, freedom = noise_of(placebos)
+    seen = (information > 0) & (freedom > 0)
+    ratio = np.where(seen, c**2 * information / noise, 0.0)
+    p = np.clip(f.cdf(ratio, 1, np.maximum(freedom, 1.0)), 1e-9, 1 - 1e-9)
+    z = np.where(seen, norm.ppf(p), 0.0)
+    n = seen.sum(axis=0)
+    return np.where(n >= MIN_UNITS, z.sum(axis=0) / np.sqrt(np.maximum(n, 1)), 0.0)
+
+
+def chance_of_means(z: Array, noise: Array) -> float:
+    """Return - log of the probability that scores of means (K,) are no more than chance, placebos' squares known."""
+    from scipy.stats import chi2
+
+    held = z != 0
+    if not np.any(held):
+        return 0.0
+    return -float(chi2.logsf(np.sum(z[held] ** 2) / max(float(np.mean(noise[held])), 1.0), int(held.sum())))
+
+
+def chance_of_sizes(z: Array) -> float:
+    """Return - log of the probability that scores of sizes (K,) are no more than chance."""
+    from scipy.stats import norm
+
+    held = z != 0
+    return -float(norm.logsf(np.sum(z[held]) / np.sqrt(held.sum()))) if np.any(held) else 0.0
+
+
+def gains(c: Array, v: Array, m: Array, s2: Array) -> Array:
+    """Return the log-likelihood ratio of each coefficient (n, K) as a draw from N(m, s^2) to noise, nats."""
+    seen = np.isfinite(v)
+    own = np.where(seen, v, 1.0)
+    wide = own + s2
+    return np.where(seen, 0.5 * (c**2 / own - (c - m) ** 2 / wide - np.log(wide / own)), 0.0)

@@ -1,9 +1,10 @@
-"""How far out a value is among those of a family, whose law is not Gaussian and is contaminated by what is sought.
+"""Law of a test over the units of a family, which is not Gaussian and is contaminated by outliers.
 
 Of each column of values, about its median, each side has a width of its own by the median deviation of that side, which
-takes up skew and of which an odd unit has no part. Beyond it the law of a side is a t law. How heavy its tails are, the
-values of all columns on that side say together, and the other side as far as both may be alike: a law that ends on one
-side may have a heavy tail on the other. Each of the degrees of freedom DOF has a weight by the likelihood of ::
+takes up skew and of which an odd unit has no part. Beyond it the law of a side is a t law. The weight of its tails is
+estimated from the values of all columns on that side, and from the other side as far as both may be alike: a law that
+ends on one side may have a heavy tail on the other. Each of the degrees of freedom DOF has a weight by the likelihood
+of ::
 
     |u| ~ (1 - e) t_nu + e uniform over all that occurs,    e averaged over SHARES
 
@@ -44,7 +45,7 @@ class TailLaw(BaseModel):
 
     @classmethod
     def of(cls, values: Array) -> TailLaw | None:
-        """Return the law of values (n, m), NaN where there is none; None where every column has less than FEWEST."""
+        """Return the law of values (n, m), NaN where there is none; None where every column has less than MIN_UNITS."""
         known = np.sum(np.isfinite(values), axis=0)
         if not np.any(known >= MIN_UNITS):
             return None
@@ -65,17 +66,17 @@ class TailLaw(BaseModel):
         from scipy.special import stdtr
 
         off = np.where(np.array(self.below) > 0, values - np.array(self.centre), np.nan)
-        found = np.zeros(off.shape)
+        p = np.zeros(off.shape)
         for sign, width, shares in zip((-1, 1), (self.below, self.above), self.share, strict=True):
             x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
             for dof, share in zip(DOF, shares, strict=True):
                 tail += share * stdtr(1 / (1 / dof + 1 / self.most), -x * _unit(dof))
-            found += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)
-        return np.asarray(np.where(np.isfinite(off), found if upper else 2 * found, np.nan))
+            p += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)
+        return np.asarray(np.where(np.isfinite(off), p if upper else 2 * p, np.nan))
 
 
 class FigureLaw(BaseModel):
-    """What is usual of a figure, of each axis (d,).
+    """Law of a figure, of each axis (d,).
 
     `usual` is its size (SI), `sure` how well most units know theirs; `centre` and `width` are those of its values in
     the scale of `driftlab.family.outlier_tests`, and `law` that of the deviations.
@@ -91,7 +92,7 @@ class FigureLaw(BaseModel):
 
 
 class TailLaws(BaseModel):
-    """What is usual of the curves' statistics and of the figures of a family, by their names."""
+    """Laws of the curves' statistics and of the figures of a family, by their names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -146,7 +147,7 @@ def _likely(x: Array) -> Array:
 def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:
     """Return values (n,) about their median by their width and their own sigma (n,) together; median and width.
 
-    The width is what units have in common beside what each is uncertain by. NaN stays NaN.
+    The width is common to the units, beside the uncertainty of each. NaN stays NaN.
     """
     known = np.isfinite(values)
     x, s = values[known], np.nan_to_num(sigma[known])

@@ -1,12 +1,12 @@
-"""What a soak says of a unit's map: in the family's basis, with the unit's own noise.
+"""Information of a soak on a unit's map: in the family's basis, with the unit's own noise.
 
 The bias of an axis over R rows, means of some seconds at rest, is::
 
     y = B(T) c + walk + white,    c the coefficients of the family's basis (`driftlab.family.basis`)
 
-All that the rows say of c under their own noise is J = B' S^-1 B and h = B' S^-1 y: -2 log L = c'Jc - 2 c'h + y'S^-1y
+The likelihood of c under the noise of the rows has J = B' S^-1 B and h = B' S^-1 y: -2 log L = c'Jc - 2 c'h + y'S^-1y
 + log det S. Coefficients at temperatures that were never seen have no information, and that is all it takes for units
-that saw half of the range. The rows are kept too: what an effect would have shown in them can be asked later.
+that saw half of the range. The rows stay beside it: the signature of an effect in them may be asked for later.
 q coefficients, d axes.
 """
 
@@ -23,6 +23,13 @@ from driftlab.family.basis import SplineBasis
 from driftlab.noise.local_level import log_determinant, whitened
 from fusion_core.budget import opened
 from fusion_core.chunk import Array
+
+UNKNOWN = 1e8  # times the noise and the walk of a whole recording: variance of a level of which nothing is known
+
+
+def unknown_level(noise: Array, steps: Array) -> float:
+    """Return the variance of an unknown level, beside variances (R,) of white noise and of the steps of the walk."""
+    return UNKNOWN * float(np.max(noise) + np.sum(steps))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +56,13 @@ class SoakRows:
     span: Array
     channels: Mapping[str, Array]
 
-    def kept(self, own: NDArray[np.bool_]) -> SoakRows:
-        """Return the rows of which `own` (R,) is true."""
-        channels = {name: values[own] for name, values in self.channels.items()}
-        return SoakRows(self.t[own], self.T[own], self.bias[own], self.span[own], channels)
+    def part(self, where: NDArray[np.bool_]) -> SoakRows:
+        """Return the rows of which `where` (R,) is true."""
+        channels = {name: values[where] for name, values in self.channels.items()}
+        return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
 
     def within(self, low: float, high: float) -> NDArray[np.bool_]:
-        """Return which rows (R,) are at temperatures from low to high, degC."""
+        """Whether each row (R,) is at a temperature from low to high, degC."""
         temperature = self.T
         return (temperature >= low) & (temperature <= high)
 
@@ -68,18 +75,26 @@ class SoakRows:
         steps = walk**2 * np.diff(self.t, prepend=self.t[0])
         noise = np.maximum(white**2 / self.span, np.finfo(float).tiny)
         if free:
-            steps[0] = 1e8 * (np.max(noise) + np.max(np.var(self.bias, axis=0)))
+            steps[0] = unknown_level(noise, steps)
         return noise, steps
+
+    def whitened(self, columns: Array, white: float, walk: float, *, free: bool) -> tuple[Array, float]:
+        """Return columns (R, m) over the rows as normalised innovations, and log det of the covariance of the rows.
+
+        The noise is that of `variances`.
+        """
+        noise, steps = self.variances(white, walk, free=free)
+        return whitened(columns, noise, steps), log_determinant(noise, steps)
 
 
 @dataclass(frozen=True, eq=False)
 class UnitInformation:
-    """What the soaks of one unit say.
+    """Information of the soaks of one unit.
 
     Attributes
     ----------
     unit : str
-        What the unit is called.
+        Its name.
     axes : tuple of str
     knots : Knots
         Over the temperatures that the unit saw.
@@ -109,47 +124,44 @@ class UnitInformation:
 
     @classmethod
     def of(
-        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[SoakRows], white: Array, walk: Array, step: float
-    ) -> UnitInformation:
-        """Return what rows say with noise of the densities `white` and `walk` (d,), knots `step` K apart."""
-        return cls._of(unit, axes, recordings, white, walk, step, [np.ones(len(rows.t), bool) for rows in recordings])
-
-    def between(self, low: float, high: float) -> UnitInformation | None:
-        """Return what the unit would have said had only temperatures from low to high, degC, been looked at.
-
-        The level stays that of its first row, wherever that is. None where fewer than two rows are left.
-        """
-        kept = [rows.within(low, high) for rows in self.recordings]
-        if sum(int(np.sum(own)) for own in kept) < 2:
-            return None
-        return self._of(self.unit, self.axes, self.recordings, self.white, self.walk, self.knots.step, kept)
-
-    @classmethod
-    def _of(
         cls, unit: str, axes: tuple[str, ...], recordings: Sequence[SoakRows], white: Array, walk: Array, step: float,
-        kept: Sequence[NDArray[np.bool_]],
+        used: Sequence[NDArray[np.bool_]] | None = None,
     ) -> UnitInformation:  # fmt: skip
-        """Return what the rows that are `kept` say; the walk goes on in those between."""
-        T = np.concatenate([rows.T[own] for rows, own in zip(recordings, kept, strict=True)])
-        knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
+        """Return the information of rows with noise of the densities `white` and `walk` (d,), knots `step` K apart.
+
+        Where not all rows are `used` (R,), the walk goes on in those between.
+        """
+        used = [np.ones(len(rows.t), bool) for rows in recordings] if used is None else used
+        T = np.concatenate([rows.T[where] for rows, where in zip(recordings, used, strict=True)])
+        knots = SplineBasis.over(T, step)
         d, q = len(axes), knots.q
         J, h, squares, log_det = np.zeros((d, q, q)), np.zeros((d, q)), np.zeros(d), np.zeros(d)
-        left = []
-        for k, (rows, own) in enumerate(zip(recordings, kept, strict=True)):
-            if not np.any(own):
+        parts = []
+        for k, (rows, where) in enumerate(zip(recordings, used, strict=True)):
+            if not np.any(where):
                 continue
-            left.append(rows.kept(own))
-            B = knots.values(rows.T[own])
+            parts.append(rows.part(where))
+            B = knots.values(rows.T[where])
             for axis in range(d):
                 noise, steps = rows.variances(white[axis], walk[axis], free=k > 0)
-                noise, steps = noise[own], np.diff(np.cumsum(steps)[own], prepend=0.0)
-                X = whitened(np.column_stack([B, rows.bias[own, axis]]), noise, steps)
+                noise, steps = noise[where], np.diff(np.cumsum(steps)[where], prepend=0.0)
+                X = whitened(np.column_stack([B, rows.bias[where, axis]]), noise, steps)
                 N = X.T @ X
                 J[axis] += N[:q, :q]
                 h[axis] += N[:q, q]
                 squares[axis] += N[q, q]
                 log_det[axis] += log_determinant(noise, steps)
-        return cls(unit, axes, knots, J, h, squares, log_det, len(T), white, walk, tuple(left))
+        return cls(unit, axes, knots, J, h, squares, log_det, len(T), white, walk, tuple(parts))
+
+    def between(self, low: float, high: float) -> UnitInformation | None:
+        """Return the information of the rows at temperatures from low to high, degC.
+
+        The level stays that of the first row, wherever that is. None where fewer than two rows are left.
+        """
+        used = [rows.within(low, high) for rows in self.recordings]
+        if sum(int(np.sum(where)) for where in used) < 2:
+            return None
+        return self.of(self.unit, self.axes, self.recordings, self.white, self.walk, self.knots.step, used)
 
     def on(self, wider: SplineBasis) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) on the knots of a wider domain; zero where the unit saw nothing."""
@@ -160,23 +172,23 @@ class UnitInformation:
 
     def to_bytes(self) -> bytes:
         """Return it as the content of an .npz file (`unit.npz`)."""
-        found: dict[str, Array] = {
+        arrays: dict[str, Array] = {
             "unit": np.array(self.unit),
             "axes": np.array(self.axes),
             "knots": np.array([self.knots.first, self.knots.intervals, self.knots.step]),
             "count": np.array(self.count),
         }
-        found |= {name: getattr(self, name) for name in ("J", "h", "squares", "log_det", "white", "walk")}
+        arrays |= {name: getattr(self, name) for name in ("J", "h", "squares", "log_det", "white", "walk")}
         for k, rows in enumerate(self.recordings):
-            found |= {f"{k}/{name}": getattr(rows, name) for name in ("t", "T", "bias", "span")}
-            found |= {f"{k}/channel/{name}": values for name, values in rows.channels.items()}
+            arrays |= {f"{k}/{name}": getattr(rows, name) for name in ("t", "T", "bias", "span")}
+            arrays |= {f"{k}/channel/{name}": values for name, values in rows.channels.items()}
         file = io.BytesIO()
-        np.savez(file, **found)  # type: ignore[arg-type]
+        np.savez(file, **arrays)  # type: ignore[arg-type]
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, content: bytes) -> UnitInformation:
-        """Return what `to_bytes` wrote."""
+        """Return the information that `to_bytes` wrote."""
         with opened(content) as file:
             first, intervals, step = file["knots"]
             names = [name.split("/", 1) for name in file.files if "/" in name]

@@ -1,4 +1,4 @@
-"""How white a unit's noise is and how far its bias walks, whatever its curve: restricted maximum likelihood.
+"""Densities of a unit's white noise and random walk, whatever its curve: restricted maximum likelihood.
 
 The rows of a soak are a curve of the family's basis, a walk and white noise (`driftlab.family.unit_information`). With
 the densities s of the white noise and k of the walk, and r = k^2 / s^2, the noise has the covariance s^2 V(r), and
@@ -11,18 +11,16 @@ with nu rows less coefficients and levels; s^2 = Q / nu is taken out, and r is f
 made finer where it is likely. Deviations are those of the logarithms, from the curvature of l at its maximum.
 d axes, q coefficients.
 
-Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545.
-
-What a bias does beside white noise and a walk, as passes through the same temperature tell it.
-
 A real unit's slow noise is more than its fast walk lets expect: it lags, it wanders where the temperature does, and
-after a warm night it is elsewhere. So the soak is cut into passes, each sweep of each recording, and a curve of its own
-for each pass is held against one for all. By white noise and walk alone, what that gains is chi-square::
+after a warm night it is elsewhere. So `walk_from_repeated_sweeps` cuts the soak into sweeps and holds a curve for each
+sweep against one for all. By white noise and walk alone, the gain is chi-square::
 
     G = Q(one curve) - Q(a curve each),    E G = n,    n the coefficients that this adds
 
-Where G is more than chance, the walk to be reckoned with is the least at which G is n; white noise is told by
-neighbouring rows, and stays. What no pass came back to, nobody has seen. d axes.
+Where G is more than chance, the walk is the least at which G is n; white noise is that of neighbouring rows.
+Temperatures visited only once contribute nothing.
+
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545.
 """
 
 from __future__ import annotations
@@ -33,22 +31,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows
+from driftlab.family.unit_information import SoakRows, unknown_level
 from driftlab.noise.local_level import log_determinant, whitened
 from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
 
 WIDE = np.arange(-14.0, 14.1, 2.0)  # of log (walk over the whole soak / white noise of a row), its variance
 FINE = 0.4  # step of the logarithm where it is likely
-REACH = 10.0  # of - 2 log likelihood, that is looked at closely
-SHOWN = 2.71  # of - 2 log likelihood: a walk that gains less is none that shows, 95 % on one side
+REACH = 10.0  # of - 2 log likelihood, within which the grid is finer
+GAIN = 2.71  # of - 2 log likelihood: a walk that gains less does not show, 95 % on one side
 RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
-FEWEST = 8  # rows more than coefficients, with which there is anything to tell
+MIN_FREEDOM = 8  # rows more than coefficients, for a walk
+TURN = 0.25  # of the range: a smaller way back is no turn
+MAX_SWEEPS = 8  # where there are more, those that warm are one, and those that cool
+CHANCE = 0.01  # probability with which white noise and walk alone are not believed
+LARGEST = 1e3  # times the likely walk
+CLOSE = 0.01  # tolerance of the logarithm of the walk
 
 
 @dataclass(frozen=True, eq=False)
 class Densities:
-    """What was found of each axis.
+    """Densities of the noise of each axis.
 
     Attributes
     ----------
@@ -57,7 +60,7 @@ class Densities:
     walk, walk_sigma : (d,) arrays
         Of the walk, SI/sqrt(s). Where none shows it is 0, and its deviation `likely`.
     likely : (d,) array
-        Root of the mean of walk^2 over all that is likely: what is to be reckoned with where a walk hardly shows.
+        Root of the mean of walk^2 under the likelihood: the walk to use where it hardly shows.
     """
 
     white: Array
@@ -70,19 +73,17 @@ class Densities:
 def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     """Return the densities of the noise in rows about a curve with knots `step` K apart."""
     profile = _Profile(recordings, step)
-    d = recordings[0].bias.shape[1]
-    grid = WIDE
-    costs, scales = profile.of(grid)
-    near = [grid[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
-    low, high = min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0
-    more = np.arange(low, high, FINE)
-    fine = profile.of(more)
-    order = np.argsort(grid := np.concatenate([grid, more]), kind="stable")
-    keep = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
-    costs, scales, grid = np.concatenate([costs, fine[0]])[keep], np.concatenate([scales, fine[1]])[keep], grid[keep]
+    costs, scales = profile.of(WIDE)
+    near = [WIDE[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
+    fine = np.arange(min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0, FINE)
+    grid = np.concatenate([WIDE, fine])
+    order = np.argsort(grid, kind="stable")
+    order = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
+    costs, scales = (np.concatenate(pair)[order] for pair in zip((costs, scales), profile.of(fine), strict=True))
     none, scale = (values[0] for values in profile.of(np.array([-np.inf])))
-    found = [_axis(grid, costs[:, k], scales[:, k], none[k], scale[k], profile.nu) for k in range(d)]
-    white, white_sigma, walk, walk_sigma, likely = np.array(found).T
+    columns = zip(costs.T, scales.T, none, scale, strict=True)
+    of_axes = [_axis(grid[order], cost, s2, n, s2_none, profile.nu) for cost, s2, n, s2_none in columns]
+    white, white_sigma, walk, walk_sigma, likely = np.array(of_axes).T
     root = np.sqrt(profile.unit)  # from the ratio of the grid to that of the densities
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
@@ -110,12 +111,12 @@ class _Profile:
     def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
         self.recordings = recordings
         T = np.concatenate([rows.T for rows in recordings])
-        B = SplineBasis.covering(float(T.min()), float(T.max()), step).values(T)
+        B = SplineBasis.over(T, step).values(T)
         own, V = np.linalg.eigh(B.T @ B)
         seen = own > RANK * own[-1]
         U = B @ (V[:, seen] / np.sqrt(own[seen]))
         y = np.concatenate([rows.bias for rows in recordings])
-        y = y - U @ (U.T @ y)  # the curve is free: what of it is taken off first only saves digits
+        y = y - U @ (U.T @ y)  # the curve is free: to take it off first only saves digits
         edges = np.cumsum([len(rows.T) for rows in recordings])[:-1]
         self.columns = [np.ascontiguousarray(part) for part in np.split(np.hstack([U, y]), edges)]
         self.q = U.shape[1]
@@ -132,7 +133,7 @@ class _Profile:
             for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
                 noise, steps = 1.0 / rows.span, ratio * np.diff(rows.t, prepend=rows.t[0])
                 if k:  # a level of its own: nothing is known of it
-                    steps[0] = 1e8 * (np.max(noise) + np.sum(steps))
+                    steps[0] = unknown_level(noise, steps)
                 X = whitened(columns, noise, steps)
                 N += X.T @ X
                 log_det += log_determinant(noise, steps) - (np.log(steps[0]) if k else 0.0)
@@ -159,9 +160,9 @@ def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: 
     weight = np.exp(-(curve(fine) - least) / 2 + fine / 2)  # even in the walk's density
     variance = np.exp(scale(fine) + fine)
     likely = np.sqrt(float(np.sum(weight * variance) / np.sum(weight)))
-    if nu < FEWEST:
+    if nu < MIN_FREEDOM:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
-    if none - float(values.min()) < SHOWN:
+    if none - float(values.min()) < GAIN:
         return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
     bend = max(float(curve(best, 2)), 1e-3)
     slope = float(scale(best, 1))
@@ -171,31 +172,24 @@ def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: 
     return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
 
 
-TURN = 0.25  # of the range: a smaller way back is no turn
-MOST = 8  # passes; where there are more, those that warm are one, and those that cool
-CHANCE = 0.01  # probability with which white noise and walk alone are not believed
-LARGEST = 1e3  # times the walk
-CLOSE = 0.01  # of the walk: it is not looked for more closely
-
-
 def walk_from_repeated_sweeps(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Array:
-    """Return the walk (d,) with which the passes of recordings agree: at least `walk` (d,), SI/sqrt(s)."""
-    passes = _Passes(recordings, step)
-    return np.array([passes.agreeing(axis, *noise) for axis, noise in enumerate(zip(white, walk, strict=True))])
+    """Return the walk (d,) with which the sweeps of recordings agree: at least `walk` (d,), SI/sqrt(s)."""
+    sweeps = _Sweeps(recordings, step)
+    return np.array([sweeps.agreeing(axis, *noise) for axis, noise in enumerate(zip(white, walk, strict=True))])
 
 
-class _Passes:
-    """Recordings with a curve for each pass: columns (R, passes x q) of each."""
+class _Sweeps:
+    """Recordings with a curve for each sweep: columns (R, sweeps x q) of each."""
 
     def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
         self.recordings = recordings
         T = np.concatenate([rows.T for rows in recordings])
-        knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
+        knots = SplineBasis.over(T, step)
         turn = TURN * float(np.ptp(T))
         number = [sweeps_of(rows.T, turn) for rows in recordings]
         first = np.cumsum([0, *(int(own[-1]) + 1 for own in number)])
         which = [own + start for own, start in zip(number, first[:-1], strict=True)]
-        if first[-1] > MOST:
+        if first[-1] > MAX_SWEEPS:
             which = [(directions(rows.T, turn) < 0).astype(np.int64) for rows in recordings]
         self.count, self.q = int(max(own.max() for own in which)) + 1, knots.q
         self.columns = []
@@ -204,7 +198,7 @@ class _Passes:
             self.columns.append(np.einsum("Rp,Rq->Rpq", places, B).reshape(len(B), -1))
 
     def agreeing(self, axis: int, white: float, walk: float) -> float:
-        """Return the walk of an axis with which its passes agree."""
+        """Return the walk of an axis with which its sweeps agree."""
         from scipy.special import chdtri
 
         if self.count < 2 or not (white > 0 and walk > 0):
@@ -220,21 +214,20 @@ class _Passes:
         return walk * float(np.exp(high))
 
     def _gain(self, axis: int, white: float, walk: float) -> tuple[float, int]:
-        """Return G, and the number of coefficients that a curve for each pass adds."""
+        """Return G, and the number of coefficients that a curve for each sweep adds."""
         size = self.count * self.q
         N = np.zeros((size + 1, size + 1))
         for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
-            noise, steps = rows.variances(white, walk, free=k > 0)
-            X = whitened(np.column_stack([columns, rows.bias[:, axis]]), noise, steps)
+            X, _ = rows.whitened(np.column_stack([columns, rows.bias[:, axis]]), white, walk, free=k > 0)
             N += X.T @ X
         A, b = N[:size, :size], N[:size, size]
-        each, rank = _taken(A, b)
+        each, rank = _explained(A, b)
         summed = A.reshape(self.count, self.q, self.count, self.q).sum(axis=(0, 2))
-        common, least = _taken(summed, b.reshape(self.count, self.q).sum(axis=0))
-        return each - common, rank - least
+        common, rank_of_one = _explained(summed, b.reshape(self.count, self.q).sum(axis=0))
+        return each - common, rank - rank_of_one
 
 
-def _taken(A: Array, b: Array) -> tuple[float, int]:
+def _explained(A: Array, b: Array) -> tuple[float, int]:
     """Return b' A^-1 b and the rank of A."""
     scale = np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
     used = np.diag(A) > RANK * np.max(np.diag(A))

@@ -1,1 +1,1 @@
-"""Which chamber profile tells most of a unit's map, before anything is recorded."""
+"""Experiment design: the chamber profile with the smallest uncertainty of a unit's map, before any recording."""

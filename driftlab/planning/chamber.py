@@ -1,13 +1,8 @@
 """Chamber profiles that can be planned: set points over time, and the temperature of the body that follows them.
 
-Set points are joined by straight lines. A body with a lag of first order follows the chamber u(t),
-
-::
-
-    tau dT/dt = u - T,    on a piece u = u_i + s_i (t - t_i):
-    T(t) = u(t) - s_i tau + c_i exp(-(t - t_i) / tau),    c_i = T(t_i) - u_i + s_i tau
-
-so a fast ramp turns before the body is there: what a profile covers is what its body covers. M set points, N times.
+Set points are joined by straight lines. A body with a lag of first order follows the chamber
+(`fusion_core.recursions.LaggedLines`), so a fast ramp turns before the body is there: a profile covers what its body
+covers. M set points, N times.
 """
 
 from __future__ import annotations
@@ -20,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_core.chunk import Array
+from fusion_core.recursions import LaggedLines
 
-Family = Literal["staircase", "ramps", "mixed"]
+ProfileShape = Literal["staircase", "ramps", "mixed"]
 
 REACHED = 0.01  # of the range: as near as the body is to be to both ends
 SHORTEST = 300.0  # s, that a staircase holds a level
@@ -29,7 +25,7 @@ SHORTEST = 300.0  # s, that a staircase holds a level
 
 @dataclass(frozen=True)
 class Chamber:
-    """What the chamber can, and what it is asked for.
+    """Abilities of the chamber, and the range that is asked of it.
 
     Attributes
     ----------
@@ -55,7 +51,7 @@ class Chamber:
         return self.high - self.low
 
     def settling(self, rate: float) -> float:
-        """Return how long an end must be held in s, after a ramp of `rate` in K/s, until the body is there."""
+        """Return the hold of an end in s, after a ramp of `rate` in K/s, until the body is there."""
         behind = rate * self.lag / (REACHED * self.swing)
         return self.lag * float(np.log(behind)) if behind > 1 else 0.0
 
@@ -67,7 +63,7 @@ class Profile:
     Attributes
     ----------
     name : str
-        What it does, in words.
+        A description in words.
     family : str
         `staircase`, `ramps` or `mixed`.
     time, temperature : (M,) arrays
@@ -75,7 +71,7 @@ class Profile:
     """
 
     name: str
-    family: Family
+    family: ProfileShape
     time: Array
     temperature: Array
 
@@ -96,7 +92,7 @@ class Profile:
 
     @property
     def reversals(self) -> int:
-        """How many times the chamber turns from warming to cooling or back."""
+        """Number of turns from warming to cooling or back."""
         moving = np.sign(self.rates[self.rates != 0])
         return int(np.sum(np.diff(moving) != 0))
 
@@ -107,16 +103,7 @@ class Profile:
     def body(self, t: ArrayLike, lag: float) -> Array:
         """Return the temperature (N,) in degC at t (N,) in s of a body that follows after `lag` s, in balance at 0."""
         at = np.asarray(t, dtype=np.float64)
-        if lag == 0:
-            return self.chamber(at)
-        T = [float(self.temperature[0])]
-        for step, u, s in zip(np.diff(self.time), self.temperature, self.rates, strict=False):
-            T.append(u + s * (step - lag) + (T[-1] - u + s * lag) * np.exp(-step / lag))
-        s_i, T_i = np.append(self.rates, 0.0), np.array(T)
-        i = np.clip(np.searchsorted(self.time, at, side="right") - 1, 0, len(T) - 1)
-        u, since = self.temperature[i] + s_i[i] * (at - self.time[i]), at - self.time[i]
-        c = T_i[i] - self.temperature[i] + s_i[i] * lag
-        return np.asarray(u - s_i[i] * lag + c * np.exp(-since / lag))
+        return LaggedLines.behind(self.time, self.temperature, lag).lagged(at) if lag else self.chamber(at)
 
     def samples(self, lag: float, count: int) -> tuple[Array, Array]:
         """Return `count` times (N,) in s, each in the middle of an even part of the profile, and the body's T (N,)."""
@@ -195,11 +182,11 @@ def _rate(chamber: Chamber, hours: float, levels: Array) -> float | None:
 
 
 def _moves(chamber: Chamber, levels: Array) -> Array:
-    """Return how long the chamber takes to each level from the one before, at its fastest, s."""
+    """Return the time of the chamber to each level from the one before, at its fastest, s."""
     return np.asarray(np.abs(np.diff(levels, prepend=chamber.start)) / chamber.rate)
 
 
-def _joined(name: str, family: Family, chamber: Chamber, levels: Array, holds: Array, moves: Array) -> Profile:
+def _joined(name: str, family: ProfileShape, chamber: Chamber, levels: Array, holds: Array, moves: Array) -> Profile:
     """Return the profile of levels (L,), each reached in `moves` (L,) and held for `holds` (L,) s."""
     begin = np.cumsum(moves) + np.append(0.0, np.cumsum(holds)[:-1])
     time = np.concatenate([[0.0], np.column_stack([begin, begin + holds]).ravel()])

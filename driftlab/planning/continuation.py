@@ -1,9 +1,8 @@
-"""What is still missing after what was recorded, and when enough is enough.
+"""Continuation of a soak: the further profile that improves the map most, and whether any is needed.
 
-The recordings are read and fitted as `fit-map` does, one after the other as if there were no pause. What the map leaves
-of them tells white noise and walk (`measured_noise`), which stand in place of the config's. A further profile is judged
-by the sigma of the map that is fitted to both together; what the kind has been seen to misfit stays. G temperatures,
-d axes.
+The recordings are read and fitted as `fit-map` does, one after the other as if there were no pause. White noise and
+walk are those of the residuals of the map (`measured_noise`), in place of the config's. A further profile is rated by
+the sigma of the map that is fitted to both together; the misfit of the kind so far stays. G temperatures, d axes.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.maps.fit import samples
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
-from driftlab.planning.search import ENOUGH, GRID, SAMPLES, RatedProfile
+from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, RatedProfile, SearchResult, SigmaCurve
 from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
@@ -34,22 +33,22 @@ Progress = Callable[..., None] | None
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedSoak:
-    """What was recorded, N samples, and the map that it makes.
+class RecordedSoak(SigmaCurve):
+    """Recordings, N samples in all, and the map that is fitted to them.
 
     Attributes
     ----------
     subject : Subject
         The unit, its noise as measured, its curve as fitted.
     chamber : Chamber
-        What was asked of it.
+        With the range that is asked for.
     parts : tuple of ((N_r,), (N_r, d)) arrays
         Temperature and bias of each recording, degC and SI.
     dt : float
         From one sample to the next, s.
     map : FittedMap
-    grid, sigma, misfit : (G,) and (G, d) arrays
-        Over the range: what is known of the map, SI; NaN where nothing was seen; and the part of it that the kind of
+    temperature, sigma, misfit : (G,) and (G, d) arrays
+        Over the range: uncertainty of the map, SI; NaN where nothing was seen; and the part of it that the kind of
         map is to blame for.
     """
 
@@ -58,7 +57,7 @@ class RecordedSoak:
     parts: tuple[tuple[Array, Array], ...]
     dt: float
     map: FittedMap
-    grid: Array
+    temperature: Array
     sigma: Array
     misfit: Array
 
@@ -74,7 +73,7 @@ class RecordedSoak:
 
     @property
     def hours(self) -> float:
-        """How long it lasts in all."""
+        """Length in all."""
         return len(self.T) * self.dt / 3600
 
     @property
@@ -84,7 +83,7 @@ class RecordedSoak:
 
     @property
     def share(self) -> float:
-        """How much of the range was seen."""
+        """Share of the range that was seen."""
         low, high = self.seen
         return max(min(high, self.chamber.high) - max(low, self.chamber.low), 0.0) / self.chamber.swing
 
@@ -95,39 +94,17 @@ class RecordedSoak:
         near = EDGE * self.chamber.swing
         return low <= self.chamber.low + near and high >= self.chamber.high - near
 
-    @property
-    def score(self) -> float:
-        """Root mean square of sigma of the worst axis, over what was seen of the range; infinite where nothing was."""
-        known = np.isfinite(self.sigma[:, 0])
-        if not known.any():
-            return float("inf")
-        return float(np.max(np.sqrt(np.mean(self.sigma[known] ** 2, axis=0))))
 
-    @property
-    def worst(self) -> tuple[float, float, int]:
-        """Largest sigma that is known (SI), the temperature (degC) and the axis where it is."""
-        k, axis = np.unravel_index(int(np.nanargmax(self.sigma)), self.sigma.shape)
-        return float(self.sigma[k, axis]), float(self.grid[k]), int(axis)
-
-
-@dataclass(frozen=True, eq=False)
-class Continuation:
-    """What a further profile would add: the profiles that were judged, the best first, and whether it is enough.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Continuation(SearchResult):
+    """Result of a search for a further profile, and whether the recordings are enough.
 
     `enough` says why, in a word: `target`, `gain` (an hour gains too little), `floor` (the bias wanders by more); empty
-    where it is not.
+    where they are not.
     """
 
     recorded: RecordedSoak
-    hours: float
-    judged: tuple[RatedProfile, ...]
-    target: float | None
-    enough: str
-
-    @property
-    def chosen(self) -> RatedProfile:
-        """The profile to record."""
-        return self.judged[0]
+    enough: str = ""
 
     @property
     def gain(self) -> float:
@@ -160,14 +137,14 @@ def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
 
 
 def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:
-    """Return what samples tell, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
+    """Return the soak of samples, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
     fitted = subject.map.fit(T, bias, {})
     many = int(np.ceil(len(T) / SAMPLES[1]))
     means = tuple((_means(T_r, many), _means(b_r, many)) for T_r, b_r in parts)
-    own = np.concatenate([T_r for T_r, _ in means]), np.concatenate([b_r for _, b_r in means])
-    answer, step = subject.map.smoother(*own), dt * many
-    noise, walk = measured_noise(own[0], own[1] - fitted.bias(own[0]), step, answer)
+    T_m, b_m = (np.concatenate(values) for values in zip(*means, strict=True))
+    answer, step = subject.map.smoother(T_m, b_m), dt * many
+    noise, walk = measured_noise(T_m, b_m - fitted.bias(T_m), step, answer)
     straight = replace(fitted, outside="tangent")
     known = replace(
         subject, noise=noise, walk=walk, noise_of="measured on what was recorded",
@@ -177,7 +154,7 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
     near = EDGE * chamber.swing
     inside = (grid >= T.min() - near) & (grid <= T.max() + near)
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
-    alone = expected_curve_error(own[0], step, noise, walk, answer).variance(grid)
+    alone = expected_curve_error(T_m, step, noise, walk, answer).variance(grid)
     misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone, 0.0, None))
     return RecordedSoak(known, chamber, means, step, fitted, grid, sigma, misfit)
 
@@ -189,7 +166,7 @@ def _means(values: Array, many: int) -> Array:
 
 
 def jointly(profile: Profile, before: RecordedSoak, seed: int = 0) -> RatedProfile:
-    """Return what is expected of the map that is fitted to what was recorded and a further profile together."""
+    """Return the rating of the map that is fitted to the recordings and a further profile together."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     subject, chamber = before.subject, before.chamber
@@ -199,38 +176,37 @@ def jointly(profile: Profile, before: RecordedSoak, seed: int = 0) -> RatedProfi
     with threadpool_limits(1):
         answer = subject.map.smoother(T, bias)
         error = expected_curve_error(T, before.dt, subject.noise, subject.walk, answer)
-    noise = error.variance(before.grid)
-    covered = float(T.min()), float(T.max())
-    share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
-    sigma = np.sqrt(noise + before.misfit**2)
-    return RatedProfile(profile, before.grid, sigma, np.sqrt(noise), covered, max(share, 0.0))
+    grid = before.temperature
+    return RatedProfile.of(profile, chamber, T, grid, error.variance(grid), before.misfit**2)
 
 
-def after(before: RecordedSoak, hours: float, target: float | None, progress: Progress = None) -> Continuation:
-    """Return which profile of `hours` adds most to what was recorded, and whether any is needed.
+def continuation_of(
+    before: RecordedSoak, hours: float, target: float | None, progress: Progress = None
+) -> Continuation:
+    """Return the profile of `hours` that adds most to the recordings, and whether any is needed.
 
     Enough is what reaches the target. Where none is given: when the range was seen, and an hour more would gain less
     than LITTLE of sigma, or sigma is below the floor of the Allan deviation, by which the bias wanders anyway.
     """
     say = progress or (lambda *state: None)
-    judged = []
+    rated = []
     for profile in candidates(before, hours):
         say(f"{profile.name} after what was recorded")
-        judged.append(jointly(profile, before))
-    order = sorted(judged, key=lambda item: (item.share < ENOUGH, item.score))
-    found = Continuation(before, hours, tuple(order), target, "")
-    return replace(found, enough=_enough(found))
+        rated.append(jointly(profile, before))
+    order = sorted(rated, key=lambda item: (item.share < MIN_COVERAGE, item.score))
+    plan = Continuation(before.subject, before.chamber, hours, tuple(order), target=target, recorded=before)
+    return replace(plan, enough=_enough(plan))
 
 
-def _enough(found: Continuation) -> str:
-    before = found.recorded
+def _enough(plan: Continuation) -> str:
+    before = plan.recorded
     if not before.whole:
         return ""
-    if found.target is not None:
-        return "target" if before.score <= found.target else ""
+    if plan.target is not None:
+        return "target" if before.score <= plan.target else ""
     if np.all(before.sigma <= before.subject.floor):
         return "floor"
-    return "gain" if found.gain < LITTLE else ""
+    return "gain" if plan.gain < LITTLE else ""
 
 
 def candidates(before: RecordedSoak, hours: float) -> Iterator[Profile]:

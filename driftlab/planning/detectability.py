@@ -1,15 +1,14 @@
-"""Which effects a profile could tell apart, and which not, before anything is recorded.
+"""Detectability of effects on a planned recording, and their discrimination, before anything is recorded.
 
-Every effect that the loop would try on the recording is looked at with the map beside it: how many nats one of a stated
-size has, from which size on the loop would find it, and how many nats are left when another effect may take its part.
-Lines of the spectrum do not depend on a profile, and what is a function of the temperature alone is the map's.
+Every effect that the loop would try on the recording is taken beside the map: the nats of one of a stated size, the
+smallest size that the loop would find, and the nats that are left when another effect may take its part. Lines of the
+spectrum do not depend on a profile, and a function of the temperature alone is the map's.
 
-From which size on the loop would find an effect on a planned recording: its own gates, on twins of the noise.
-
-All that the gates look at is linear or square in what was measured, so what a least-squares fit makes of a few twins of
-the noise, and of the effect alone, says for any size what share of the twins passes. As in the loop, an effect's
-hyper-parameters are those with which it fits best, anew for each part that is left out. m twins, S shapes that one
-effect may have, n rows, d axes; y (n, m + S) is the twins, then the shapes.
+The smallest size is that of the loop's own acceptance, on simulated noise (`MonteCarlo`). Its criteria are linear or
+square in the measurements, so the least-squares fit of a few realisations of the noise, and of the effect alone, gives
+for any size the share of the realisations that pass. As in the loop, an effect's hyper-parameters are those with which
+it fits best, anew for each part that is left out. m realisations, S shapes that one effect may have, n rows, d axes;
+y (n, m + S) is the realisations, then the shapes.
 """
 
 from __future__ import annotations
@@ -27,40 +26,45 @@ from driftlab.identification.normal_equations import Indices
 from driftlab.identification.records import one_way
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
-from driftlab.noise.local_level import LocalLevel, effective, one_step
-from driftlab.planning.information import Information
-from driftlab.planning.simulated_search import Body, UnrecordedUnit, measured, noises, planned, shapes
+from driftlab.noise.local_level import effective, one_step
+from driftlab.planning.simulated_search import Body, Information, measured, noises, planned, shapes
+from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
-TWICE = 2.0  # of the smallest size that is found: the size at which effects are to be told apart
+TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be told apart
 ALIKE = 0.2  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
-OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters: where the smallest size is looked for
+OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters, for the smallest size
+REALISATIONS = 7  # of the noise
+POWERS = range(-2, 7)  # of 2, times the size that has ten nats: sizes that are tried
+HALVINGS = 3  # of the last factor 2
+
+Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the errors with the effect and without
 
 
 @dataclass(frozen=True)
 class Detectability:
-    """What a planned recording would say of one effect.
+    """Detectability of one effect on a planned recording.
 
     Attributes
     ----------
     name : str
-        What the loop calls it.
+        Its name in the loop.
     effect : Effect
         In the middle of its hyper-parameters.
     nats : float
         Of one of the stated size.
     threshold : float
-        Nats that the loop asks for at short times; it asks for better predictions of left-out parts too.
+        Nats that the loop requires at short times; it requires better predictions of left-out parts too.
     found_from : float
         Smallest size in SI, from lowest to highest on each axis, that the loop would find in half of all recordings;
         infinite where none.
     best, worst : float
         The same, the smallest and the largest over its hyper-parameters.
     nats_found : float
-        Of one of twice the smallest size; 0 where none is found.
+        Of one of twice the smallest size; 0 where none is search.
     left : dict of str to float
         Share of the nats that is left where another effect may take its part.
     """
@@ -88,12 +92,12 @@ class Detectability:
 
 @dataclass(frozen=True)
 class DetectabilityReport:
-    """What a planned recording would say of effects.
+    """Detectability of effects on a planned recording.
 
     Attributes
     ----------
-    effects : tuple of Foretold
-        The effects, what is found at the smallest size first.
+    effects : tuple of Detectability
+        The effects, the one found at the smallest size first.
     silent : tuple of str
         Effects that the recording cannot show at all.
     size : float
@@ -101,7 +105,7 @@ class DetectabilityReport:
     shown : BiasUnit
         Unit of the bias.
     still : tuple of str
-        Channels that are held: what follows them is not seen.
+        Channels that are held: effects that follow them are not seen.
     curve_known : bool
         Whether the map's curve is the unit's own.
     only : str
@@ -118,99 +122,99 @@ class DetectabilityReport:
 
 
 def predict_detectability(
-    unit: UnrecordedUnit, body: Body, duration: float, kinds: Collection[str] = (), still: Sequence[str] = ()
+    unit: UnitModel, body: Body, duration: float, kinds: Collection[str] = (), still: Sequence[str] = ()
 ) -> DetectabilityReport:
-    """Return what a recording of `duration` s with the temperatures `body(t)` would say of effects.
+    """Return the detectability of effects on a recording of `duration` s with the temperatures `body(t)`.
 
     Of all, or of `kinds`; `still` are channels that are held where they are.
     """
-    found = planned(unit, body, duration)
-    everything = families(found)
+    search = planned(unit, body, duration)
+    everything = families(search)
     price = float(np.log(max(len({repr(effect) for own in everything.values() for effect in own}), 1)))
     asked = {name: own for name, own in everything.items() if not kinds or own[0].kind in kinds}
     of_name = [(name, effect) for name, own in asked.items() for effect in own]
-    information = Information(found, unit, [effect for _, effect in of_name])
+    information = Information(search, unit, [effect for _, effect in of_name])
     places = {name: [k for k, (other, _) in enumerate(of_name) if other == name] for name in asked}
-    twins = bench(found, unit, price)
-    size = STATED * float(np.sqrt(np.mean(unit.white**2) / 60.0))
-    effects = [_foretold(information, places, name, size, twins) for name in asked]
+    simulated = MonteCarlo(search, unit, price)
+    size = STATED * float(np.sqrt(np.mean(unit.noise**2) / 60.0))
+    effects = [_detectability(information, places, name, size, simulated) for name in asked]
     silent = sorted(set(_by_turning(unit, duration, kinds)) - set(asked))
     order = sorted(effects, key=lambda one: (one.found_from, one.name))
     T = body(np.linspace(0.0, duration, 2000))
     return DetectabilityReport(
-        tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, one_way([T])
+        tuple(order), tuple(silent), size, unit.unit, tuple(still), unit.curve_known, one_way([T])
     )
 
 
-def families(found: Search) -> dict[str, list[Effect]]:
+def families(search: Search) -> dict[str, list[Effect]]:
     """Return the effects that the loop would try on a planned recording, by name, each with its hyper-parameters."""
     own: dict[str, list[Effect]] = {}
-    for (name, *_), terms in candidates_of(found).items():
+    for (name, *_), terms in candidates_of(search).items():
         effect = terms[0].effect
-        if not terms[0].free and effect.course != "line" and not _of_map(found, effect):
+        if not terms[0].free and effect.course != "line" and not _of_map(search, effect):
             own.setdefault(name, []).extend(term.effect for term in terms)
     return own
 
 
-def _of_map(found: Search, effect: Effect) -> bool:
-    """Return whether an effect is a function of the temperature alone: run backwards, it shows the same backwards."""
-    chunk = found.columns.evidence.chunks[0]
+def _of_map(search: Search, effect: Effect) -> bool:
+    """Whether an effect is a function of the temperature alone: run backwards, its signature is the same backwards."""
+    chunk = search.columns.evidence.chunks[0]
     back = chunk.having(temperature=chunk["temperature"][::-1].copy())
-    shown = effect.signature(chunk, None)[0]
-    return bool(np.any(shown)) and np.allclose(effect.signature(back, None)[0][::-1], shown, rtol=1e-9, atol=0.0)
+    way, reverse = (effect.signature(one, None)[0] for one in (chunk, back))
+    return bool(np.any(way)) and np.allclose(reverse[::-1], way, rtol=1e-9, atol=0.0)
 
 
-def _by_turning(unit: UnrecordedUnit, duration: float, kinds: Collection[str]) -> list[str]:
+def _by_turning(unit: UnitModel, duration: float, kinds: Collection[str]) -> list[str]:
     """Return the effects that the loop would try on a recording that goes up and down over the same time."""
-    found = planned(unit, lambda t: 30.0 * np.abs(1 - np.abs(1 - 4 * t / duration)), duration, rows=200)
-    return [name for name, own in families(found).items() if not kinds or own[0].kind in kinds]
+    search = planned(unit, lambda t: 30.0 * np.abs(1 - np.abs(1 - 4 * t / duration)), duration, rows=200)
+    return [name for name, own in families(search).items() if not kinds or own[0].kind in kinds]
 
 
-def _foretold(
-    information: Information, places: dict[str, list[int]], name: str, size: float, twins: MonteCarlo
+def _detectability(
+    information: Information, places: dict[str, list[int]], name: str, size: float, simulated: MonteCarlo
 ) -> Detectability:
     own = places[name]
-    sizes = _smallest(information, own, twins)
+    sizes = _smallest(information, own, simulated)
     k = own[round(0.5 * (len(own) - 1))]
-    theta, unit_nats = _one(information, k, twins)
+    theta, unit_nats = _one(information, k, simulated)
     smallest, whole = sizes[OF_GRID.index(0.5)], max(information.nats(k, theta), 1e-300)
     left = {other: information.left(k, theta, at) / whole for other, at in places.items() if other != name}
-    found = unit_nats * (TWICE * smallest) ** 2 if np.isfinite(smallest) else 0.0
-    best, worst = min(sizes), max(sizes)
+    nats_found = unit_nats * (TWICE * smallest) ** 2 if np.isfinite(smallest) else 0.0
     return Detectability(
-        name, information.effects[k], unit_nats * size**2, twins.price + CHANCE, smallest, best, worst, found, left
-    )
+        name, information.effects[k], unit_nats * size**2, simulated.price + CHANCE, smallest, min(sizes), max(sizes),
+        nats_found, left,
+    )  # fmt: skip
 
 
-def _one(information: Information, k: int, twins: MonteCarlo) -> tuple[Array, float]:
+def _one(information: Information, k: int, simulated: MonteCarlo) -> tuple[Array, float]:
     """Return coefficients of an effect that is one SI unit from lowest to highest, and its nats."""
     theta = information.direction(k)
-    theta = theta / max(float(np.max(np.ptp(_shape(twins, information.effects[k], theta), axis=0))), 1e-300)
+    theta = theta / max(float(np.max(np.ptp(_shape(simulated, information.effects[k], theta), axis=0))), 1e-300)
     return theta, information.nats(k, theta)
 
 
-def _smallest(information: Information, own: list[int], twins: MonteCarlo) -> list[float]:
-    """Return the smallest sizes that are found, over the grid of hyper-parameters."""
+def _smallest(information: Information, own: list[int], simulated: MonteCarlo) -> list[float]:
+    """Return the smallest sizes that are search, over the grid of hyper-parameters."""
     at = [own[round(share * (len(own) - 1))] for share in OF_GRID]
     shapes, starts, alike = [], [], np.ones((len(at), len(own)), dtype=bool)
     for j, k in enumerate(at):
-        theta, nats = _one(information, k, twins)
-        shapes.append(_shape(twins, information.effects[k], theta, whole=True))
+        theta, nats = _one(information, k, simulated)
+        shapes.append(_shape(simulated, information.effects[k], theta, whole=True))
         starts.append(float(np.sqrt(10.0 / nats)) if nats > 0 else 0.0)
         alike[j] = [information.left(k, theta, [other]) <= ALIKE * nats for other in own]
-    return twins.smallest([information.effects[k] for k in own], shapes, starts, alike)
+    return simulated.smallest([information.effects[k] for k in own], shapes, starts, alike)
 
 
-def _shape(twins: MonteCarlo, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
-    axes = range(len(twins.unit.axes))
-    return np.stack([shapes(twins.found, twins.unit, effect, a, whole=whole) @ theta for a in axes], axis=1)
+def _shape(simulated: MonteCarlo, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
+    axes = range(len(simulated.unit.axes))
+    return np.stack([shapes(simulated.search, simulated.unit, effect, a, whole=whole) @ theta for a in axes], axis=1)
 
 
 @dataclass(frozen=True)
 class EffectEstimate:
-    """How large an effect may be in what was recorded, from lowest to highest, on the axis that shows it best, SI.
+    """Size of an effect in recordings, from lowest to highest, on the axis that shows it best, SI.
 
-    `sure` is whether it has as many nats as the loop asks for; `sigma` is infinite where temperature never shows it.
+    `sure` is whether it has as many nats as the loop requires; `sigma` is infinite where temperature never shows it.
     """
 
     name: str
@@ -221,21 +225,21 @@ class EffectEstimate:
 
 
 def effects_in(
-    unit: UnrecordedUnit, recordings: Sequence[tuple[Array, Array]], dt: float, kinds: Collection[str] = ()
+    unit: UnitModel, recordings: Sequence[tuple[Array, Array]], dt: float, kinds: Collection[str] = ()
 ) -> tuple[EffectEstimate, ...]:
-    """Return how large effects are in recordings, T (N,) and bias (N, d) of each, one sample each dt in s.
+    """Return the sizes of effects in recordings, T (N,) and bias (N, d) of each, one sample each dt in s.
 
     Each by itself beside the map, with the hyper-parameters that fit best; but for those on the map's input, whose size
     is that of the map's slope.
     """
-    found = measured(unit, recordings, dt)
-    every = families(found)
+    search = measured(unit, recordings, dt)
+    every = families(search)
     price = float(np.log(max(sum(map(len, every.values())), 1)))
     seen = []
     for name, own in every.items():
         if own[0].acts_on_input or (kinds and own[0].kind not in kinds):
             continue
-        information = Information(found, unit, own)
+        information = Information(search, unit, own)
         single = [information.size(k) for k in range(len(own)) if information.columns_of(k) == 1]
         if not single:
             continue
@@ -249,51 +253,45 @@ def effects_in(
     return (*seen, *never)
 
 
-TWINS = 7
-LEAST, MOST = -2, 6  # powers of 2 about the size that has ten nats, where the answer is looked for
-HALVINGS = 3  # of the last factor 2
-
-Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the errors with the effect and without
-
-
-@dataclass(frozen=True)
 class MonteCarlo:
-    """Twins of one planned recording.
+    """Realisations of one planned recording.
 
     Attributes
     ----------
-    found : Search
-        The recording, nothing found on it yet.
-    unit : Unit
+    search : Search
+        The recording, without effects.
+    unit : UnitModel
     noise : (d, n, m) array
-        Noise of each twin, SI.
+        Noise of each realisation, SI.
     curve : (d, n) array
         The map's curve, SI.
-    noises : list of Noise
+    noises : list of LocalLevel
         Of the rows of each axis.
     price : float
         Log of how many candidates the loop tries there.
     """
 
-    found: Search
-    unit: UnrecordedUnit
-    noise: Array
-    curve: Array
-    noises: list[LocalLevel]
-    price: float
+    def __init__(self, search: Search, unit: UnitModel, price: float, seed: int = 0) -> None:
+        self.search, self.unit, self.price = search, unit, price
+        evidence, rng = search.columns.evidence, np.random.default_rng(seed)
+        interval, shape = evidence.interval, (len(unit.axes), len(evidence), REALISATIONS)
+        white = rng.normal(size=shape) * (unit.noise / np.sqrt(interval))[:, None, None]
+        walk = np.cumsum(rng.normal(size=shape), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]
+        self.noise, self.noises = white + walk, noises(unit, interval)
+        self.curve = unit.curve(evidence.rows([chunk["temperature"] for chunk in evidence.chunks])).T
 
     def smallest(
         self, effects: Sequence[Effect], shapes: Sequence[Array], starts: Sequence[float], alike: Array
     ) -> list[float]:
-        """Return the sizes in SI from which on most of the twins pass, one for each shape; infinite where none helps.
+        """Return the sizes in SI from which on most realisations pass, one for each shape; infinite where none helps.
 
         Parameters
         ----------
         effects : sequence of Effect
             One effect with the hyper-parameters that the loop tries.
         shapes : sequence of (n, d) arrays
-            What it may show, at one SI unit. Of an effect on the map's input it is the whole curve as it shows then,
-            the map's own part with it: with its slope it grows.
+            Its signatures, of one SI unit. Of an effect on the map's input it is the whole curve, the map's own part
+            with it: with its slope it grows.
         starts : sequence of float
             Sizes near which the answers may be.
         alike : (S, effects) array of bool
@@ -303,7 +301,7 @@ class MonteCarlo:
         return [self._smallest(case, j, start) for j, start in enumerate(starts)]
 
     def _smallest(self, case: _Case, j: int, start: float) -> float:
-        power = next((k for k in range(LEAST, MOST + 1) if case.passes(j, start * 2.0**k)), None)
+        power = next((k for k in POWERS if case.passes(j, start * 2.0**k)), None)
         if power is None:
             return float("inf")
         low, high = power - 1.0, float(power)
@@ -313,19 +311,9 @@ class MonteCarlo:
         return float(start * 2.0 ** ((low + high) / 2))
 
 
-def bench(found: Search, unit: UnrecordedUnit, price: float, seed: int = 0) -> MonteCarlo:
-    """Return twins of a planned recording."""
-    n, interval, d = len(found.columns.evidence), found.columns.evidence.interval, len(unit.axes)
-    rng = np.random.default_rng(seed)
-    T = found.columns.evidence.rows([chunk["temperature"] for chunk in found.columns.evidence.chunks])
-    noise = rng.normal(size=(d, n, TWINS)) * (unit.white / np.sqrt(interval))[:, None, None]
-    walk = np.cumsum(rng.normal(size=(d, n, TWINS)), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]
-    return MonteCarlo(found, unit, noise + walk, unit.curve(T).T, noises(unit, interval), price)
-
-
 @dataclass(frozen=True)
 class _Fit:
-    """What a model makes of all signals on one axis, fitted to some segments: coefficients (k, m + S), what is left."""
+    """Fit of a model to all signals on one axis, on some segments: coefficients (k, m + S) and residual squares."""
 
     cols: Indices
     beta: Array
@@ -333,22 +321,22 @@ class _Fit:
 
 
 class _Case:
-    """One effect at the bench: what the loop would look at, with and without it in the model."""
+    """One effect on the realisations: fits and left-out errors with and without it in the model."""
 
     def __init__(self, bench: MonteCarlo, effects: Sequence[Effect], shapes: Sequence[Array], alike: Array) -> None:
         self.bench, self.effects, self.alike = bench, list(effects), alike
         acting = effects[0].acts_on_input
         noise = bench.noise + (0.0 if acting else bench.curve[:, :, None])
         self.y = [np.column_stack([noise[axis], *(s[:, axis] for s in shapes)]) for axis in range(len(noise))]
-        columns = bench.found.columns
+        columns = bench.search.columns
         models: list[Model] = [(), *((Term(effect),) for effect in effects)]
         for model in models:  # columns are made first, since their number is that of the inner products
             columns.of_map([term.effect for term in model])
         W = columns.W
         self._seen = [[W[s.rows].T @ y[s.rows] for s in columns.segments] for y in self.y]
         self._squares = [[y[s.rows].T @ y[s.rows] for s in columns.segments] for y in self.y]
-        parts = bench.found.left_out
-        sets = [part.rest for part in parts] + [bench.found.everything]
+        parts = bench.search.left_out
+        sets = [part.rest for part in parts] + [bench.search.everything]
         self._fits = [[[self._fit(m, axis, own) for axis in range(len(self.y))] for own in sets] for m in models]
         self._left_out = [
             [
@@ -360,20 +348,20 @@ class _Case:
         self._white = [self._base(axis) for axis in range(len(self.y))]
 
     def passes(self, j: int, size: float) -> bool:
-        """Return whether most of the twins pass where the effect has the j-th shape and this size."""
+        """Whether most realisations pass where the effect has the j-th shape and this size."""
         passed = 0
-        for k in range(TWINS):
-            passed += self._passes(k, TWINS + j, size)
-            if passed > TWINS // 2 or passed + TWINS - 1 - k <= TWINS // 2:
+        for k in range(REALISATIONS):
+            passed += self._passes(k, REALISATIONS + j, size)
+            if passed > REALISATIONS // 2 or passed + REALISATIONS - 1 - k <= REALISATIONS // 2:
                 break
-        return passed > TWINS // 2
+        return passed > REALISATIONS // 2
 
     def _passes(self, k: int, j: int, size: float) -> bool:
         whole = self._chosen(-1, k, j, size)
-        if not self.alike[j - TWINS, whole]:
+        if not self.alike[j - REALISATIONS, whole]:
             return False
         pairs: Pairs = []
-        for p in range(len(self.bench.found.left_out)):
+        for p in range(len(self.bench.search.left_out)):
             new, old = self._left_out[1 + self._chosen(p, k, j, size)][p], self._left_out[0][p]
             pairs.append([
                 (a[:, k] + size * a[:, j], b[:, k] + size * b[:, j]) for a, b in zip(new, old, strict=True)
@@ -389,7 +377,7 @@ class _Case:
         return accept(effect, replace(evidence, left_out=gained - self.bench.price), ())[0]
 
     def _chosen(self, own: int, k: int, j: int, size: float) -> int:
-        """Return the hyper-parameters that fit twin k best, of one set of segments (-1: all of them)."""
+        """Return the hyper-parameters that fit realisation k best, of one set of segments (-1: all of them)."""
         costs = [
             sum(
                 np.log(max(float(f.left[k, k] + 2 * size * f.left[k, j] + size**2 * f.left[j, j]), 1e-300))
@@ -400,7 +388,7 @@ class _Case:
         return int(np.argmin(costs))
 
     def _evidence(self, pairs: Pairs, k: int, j: int, size: float) -> CandidateEvidence:
-        """Return the figures of twin k, as `driftlab.identification.trials` works them out, the left-out gain apart."""
+        """Return the figures of realisation k as `driftlab.identification.trials` has them, but the left-out gain."""
         price = self.bench.price
         squares = np.maximum([[[float(e @ e) for e in pair] for pair in part] for part in pairs], 1e-300)
         steps = np.mean(np.log(squares[:, :, 0] / squares[:, :, 1]), axis=1)
@@ -424,32 +412,32 @@ class _Case:
 
     def _columns(self, number: int, axis: int, k: int, j: int, size: float) -> Array:
         """Return an effect's columns (n - 1, p), the map out of them, as white."""
-        W, effect = self.bench.found.columns.W, self.effects[number]
-        Z = W[:, self.bench.found.columns.of(effect).columns[axis]]
+        W, effect = self.bench.search.columns.W, self.effects[number]
+        Z = W[:, self.bench.search.columns.of(effect).columns[axis]]
         if effect.acts_on_input:
             base, other = self._fits[0][-1][axis], self._fits[1 + number][-1][axis]
             own = [W[:, f.cols] @ (f.beta[:, k] + size * f.beta[:, j]) for f in (base, other)]
             Z = np.column_stack([Z, own[0] - own[1]])
-        fit = self.bench.found.squares.fit((), axis, self.bench.found.everything)
+        fit = self.bench.search.squares.fit((), axis, self.bench.search.everything)
         base_columns = W[:, fit.cols]
         left = Z - base_columns @ fit.equations.solve(base_columns.T @ Z)
         return one_step([left], self.bench.noises[axis].gain)[0]
 
     def _base(self, axis: int) -> Array:
-        """Return what the map alone leaves of all signals (n - 1, m + S), as white."""
+        """Return the residuals of the map alone of all signals (n - 1, m + S), as white."""
         fit = self._fits[0][-1][axis]
-        left = self.y[axis] - self.bench.found.columns.W[:, fit.cols] @ fit.beta
+        left = self.y[axis] - self.bench.search.columns.W[:, fit.cols] @ fit.beta
         return one_step([left], self.bench.noises[axis].gain)[0]
 
     def _fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> _Fit:
-        fit = self.bench.found.squares.fit(model, axis, segments)
+        fit = self.bench.search.squares.fit(model, axis, segments)
         b = sum(self._seen[axis][k][fit.cols] for k in segments)
         beta = fit.equations.solve(b)
         return _Fit(fit.cols, beta, sum(self._squares[axis][k] for k in segments) - b.T @ beta)
 
     def _error(self, fit: _Fit, part: LeftOutPart, axis: int) -> Array:
         """Return the errors (n', m + S) of predicting a part from the rest, less their means."""
-        e = self.y[axis][part.rows] - self.bench.found.columns.W[part.rows][:, fit.cols] @ fit.beta
+        e = self.y[axis][part.rows] - self.bench.search.columns.W[part.rows][:, fit.cols] @ fit.beta
         e = e[part.window.stop - part.rows.start :]
         return np.asarray(e - e.mean(axis=0))
 

@@ -1,4 +1,4 @@
-"""What is asked of a plan: the chamber and its range, from what a user writes and what the config tells."""
+"""Request for a plan: the chamber and its range, from the options of the command and the config."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from driftlab.planning.chamber import Chamber
 from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
+from fusion_core.contracts import Twin
 from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.faults import RANGES
 from fusion_core.units import LIMITS, to_si
@@ -25,7 +26,7 @@ Range = str | tuple[float, float] | None
 
 
 class PlanRequest(NamedTuple):
-    """The chamber, whose unit is planned for, the sigma to reach (SI), and from where the body's lag is known."""
+    """Chamber, unit that is planned for, sigma to reach (SI), and source of the body's lag."""
 
     chamber: Chamber
     subject: UnitModel
@@ -34,28 +35,21 @@ class PlanRequest(NamedTuple):
 
 
 def parse_request(
-    config: Config,
-    hours: float,
-    *,
-    range: Range = None,
-    rate: str | None = None,
-    lag: str | None = None,
-    start: str | None = None,
-    walk: str | None = None,
-    sigma: str | None = None,
-    kind: str | None = None,
-) -> PlanRequest:
-    """Return what is asked, with what the config tells where nothing is said.
+    config: Config, hours: float, *, range: Range = None, rate: str | None = None, lag: str | None = None,
+    start: str | None = None, walk: str | None = None, sigma: str | None = None, kind: str | None = None,
+) -> PlanRequest:  # fmt: skip
+    """Return the request of the options, with the values of the config where an option is None.
 
     Raises
     ------
     ConfigError
-        If a value cannot be meant, or neither option nor config says one that is needed.
+        If a value cannot be meant, or neither option nor config has one that is needed.
     """
     _check_hours(hours)
     unit = tracked_unit(config.filter)
     subject = UnitModel.of(config, kind, None if walk is None else _walk(walk, unit.si))
-    low, high = _range(config, range)
+    twin = twin_of(config)
+    low, high = _range(config, range, twin)
     fastest, begin = (
         quantity("rate", RATE if rate is None else rate, "delta_degC/s"),
         quantity("start", START if start is None else start, "degC"),
@@ -71,7 +65,6 @@ def parse_request(
             f"--range {low:g}..{high:g} degC: spans {high - low:g} K, a map needs {subject.map.min_swing:g} K; write "
             "the lower temperature first, and more between"
         )
-    twin = twin_of(config)
     lag_of = "--lag" if lag is not None else "the simulated unit's" if twin is not None else "the default"
     behind = twin.lag if lag is None and twin is not None else quantity("lag", LAG if lag is None else lag, "s")
     if fastest <= 0 or behind < 0:
@@ -90,7 +83,7 @@ def _check_hours(hours: Any) -> None:
 
 
 def quantity(name: str, text: str, unit: str) -> float:
-    """Return what an option says, in SI; raises ConfigError that names it."""
+    """Return the value of an option in SI; raises ConfigError that names it."""
     try:
         number = to_si(text, unit)
     except UnitError as error:
@@ -108,14 +101,11 @@ def _walk(text: str, unit: str) -> Array:
     return np.array(parts)
 
 
-def _range(config: Config, given: Range) -> tuple[float, float]:
+def _range(config: Config, given: Range, twin: Twin | None) -> tuple[float, float]:
     """Return the range in degC: as it is given, of the config's fitted map, or of the chamber that is simulated."""
-    if isinstance(given, tuple):
-        return float(given[0]), float(given[1])
     if given is not None:
-        return read_range(given)
-    fitted, twin = fitted_map(config), twin_of(config)
-    if fitted is not None:
+        return read_range(given) if isinstance(given, str) else (float(given[0]), float(given[1]))
+    if (fitted := fitted_map(config)) is not None:
         return fitted.domain
     if twin is not None and np.ptp(twin.temperature) > 0:
         return float(np.min(twin.temperature)), float(np.max(twin.temperature))

@@ -1,6 +1,6 @@
-"""The search for the chamber profile that tells most of a map: few that are tried and true, each judged alike.
+"""Search for the chamber profile with the smallest uncertainty of the map: few proven ones, each rated alike.
 
-A profile is judged by the sigma that its map will have over the range (`expected_curve_error`), of the worst axis.
+A profile is rated by the sigma that its map will have over the range (`expected_curve_error`), of the worst axis.
 White noise falls with the hours, whatever the profile. A walk looks like a curve where the sweep is slow and one way;
 where each temperature is passed again and again, going up and going down, it looks like none.
 """
@@ -8,7 +8,7 @@ where each temperature is passed again and again, going up and going down, it lo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,7 +23,7 @@ Progress = Callable[..., None] | None
 CYCLES = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 CLASSIC = 5.0  # K, step of the staircase that others are compared with
 MIX = 10.0  # K, step of the levels after ramps
-ENOUGH = 0.97  # of the range: what a profile must cover
+MIN_COVERAGE = 0.97  # of the range, by a profile
 ALIKE = 1.05  # profiles whose sigma differs by less than this factor are as good
 SHARES = (0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the hours, for the Pareto curve
 GRID = 121
@@ -32,9 +32,37 @@ EVERY, SAMPLES = 4.0, (7200, 40_000)  # s from one to the next, and fewest and m
 LONGEST = 64.0  # times the hours: up to there a target is looked for
 
 
+class SigmaCurve:
+    """Uncertainty of a map over temperature: `sigma` (G, d) in SI at `temperature` (G,) in degC; NaN: not known."""
+
+    temperature: Array
+    sigma: Array
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of sigma (d,) over the temperatures at which it is known, SI."""
+        return rms(self.sigma[np.isfinite(self.sigma[:, 0])])
+
+    @property
+    def score(self) -> float:
+        """That of the worst axis; infinite where nothing is known."""
+        return float(np.max(self.rms)) if np.isfinite(self.sigma[:, 0]).any() else float("inf")
+
+    @property
+    def worst(self) -> tuple[float, float, int]:
+        """Largest sigma that is known (SI), the temperature (degC) and the axis where it is."""
+        k, axis = np.unravel_index(int(np.nanargmax(self.sigma)), self.sigma.shape)
+        return float(self.sigma[k, axis]), float(self.temperature[k]), int(axis)
+
+
+def rms(values: Array) -> Array:
+    """Return the root mean square (d,) of values (G, d)."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+
+
 @dataclass(frozen=True, eq=False)
-class RatedProfile:
-    """A profile, and what is expected of it.
+class RatedProfile(SigmaCurve):
+    """A profile, and the expected uncertainty of its map.
 
     Attributes
     ----------
@@ -44,11 +72,15 @@ class RatedProfile:
     sigma : (G, d) array
         Of the map that will be fitted, SI.
     noise : (G, d) array
-        The part of it that the unit's noise makes; what the kind cannot follow of the curve is the rest.
+        The part of it that the unit's noise makes; the rest is the misfit of the kind. With a family: the whole of it.
     covered : (float, float)
         Lowest and highest temperature of the body, degC.
     share : float
         Of the range that is covered.
+    place : str
+        With a family, the part of the range that is soaked: `lower`, `middle`, `upper`, or `whole`.
+    without_family : (G, d) array
+        With a family, the root mean square error of the map without it that is best for its units.
     """
 
     profile: Profile
@@ -57,27 +89,25 @@ class RatedProfile:
     noise: Array
     covered: tuple[float, float]
     share: float
+    place: str = ""
+    without_family: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    @property
-    def rms(self) -> Array:
-        """Root mean square of sigma (d,) over the range, SI."""
-        return np.asarray(np.sqrt(np.mean(self.sigma**2, axis=0)))
-
-    @property
-    def score(self) -> float:
-        """That of the worst axis."""
-        return float(np.max(self.rms))
+    @classmethod
+    def of(cls, profile: Profile, chamber: Chamber, T: Array, grid: Array, noise: Array, misfit: Array) -> RatedProfile:
+        """Return the rating of a profile that brings the body to T (N,), of variances (G, d) of noise and misfit."""
+        low, high = float(T.min()), float(T.max())
+        share = (min(high, chamber.high) - max(low, chamber.low)) / chamber.swing
+        return cls(profile, grid, np.sqrt(noise + misfit), np.sqrt(noise), (low, high), max(share, 0.0))
 
     @property
     def alone(self) -> float:
-        """What noise alone makes of the score."""
-        return float(np.max(np.sqrt(np.mean(self.noise**2, axis=0))))
+        """Score by noise alone."""
+        return float(np.max(rms(self.noise)))
 
     @property
-    def worst(self) -> tuple[float, float, int]:
-        """Return the largest sigma (SI), the temperature (degC) and the axis where it is."""
-        k, axis = np.unravel_index(np.argmax(self.sigma), self.sigma.shape)
-        return float(self.sigma[k, axis]), float(self.temperature[k]), int(axis)
+    def own_score(self) -> float:
+        """Score without the family."""
+        return float(np.max(rms(self.without_family)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +121,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search found: the chosen profile first among `judged`, the others by their sigma.
+    """Result of a search: the chosen profile first among `judged`, the others by their sigma.
 
     `target` is the sigma that was asked for, and `shortest` the shortest profile that reaches it, where one does.
     """
@@ -100,8 +130,8 @@ class SearchResult:
     chamber: Chamber
     hours: float
     judged: tuple[RatedProfile, ...]
-    classic: RatedProfile | None
-    pareto: tuple[Point, ...]
+    classic: RatedProfile | None = None
+    pareto: tuple[Point, ...] = ()
     target: float | None = None
     shortest: RatedProfile | None = None
 
@@ -113,25 +143,26 @@ class SearchResult:
 
 def candidates(chamber: Chamber, hours: float) -> Iterator[Profile]:
     """Yield the profiles that fill the hours and that the chamber can: staircases, ramps, and both; classic first."""
-    tried = (
-        staircase(chamber, hours, CLASSIC),
-        staircase(chamber, hours, CLASSIC, down=True),
-        staircase(chamber, hours, 2 * CLASSIC, down=True),
-        *(ramps(chamber, hours, cycles) for cycles in CYCLES),
+    yield from _possible(
+        staircase(chamber, hours, CLASSIC), staircase(chamber, hours, CLASSIC, down=True),
+        staircase(chamber, hours, 2 * CLASSIC, down=True), *(ramps(chamber, hours, cycles) for cycles in CYCLES),
         *(mixed(chamber, hours, cycles, MIX) for cycles in CYCLES),
-    )
-    yield from (profile for profile in tried if profile is not None)
+    )  # fmt: skip
 
 
 def leading(chamber: Chamber, hours: float) -> Iterator[Profile]:
     """Yield those of the candidates that are among the best of any hours: the classic, and few ramps and many."""
-    tried = [staircase(chamber, hours, CLASSIC), staircase(chamber, hours, 2 * CLASSIC, down=True)]
-    can = [profile for profile in (ramps(chamber, hours, cycles) for cycles in CYCLES) if profile is not None]
-    yield from (profile for profile in (*tried, *can[:1], *can[1:][-2:]) if profile is not None)
+    every = _possible(*(ramps(chamber, hours, cycles) for cycles in CYCLES))
+    steps = _possible(staircase(chamber, hours, CLASSIC), staircase(chamber, hours, 2 * CLASSIC, down=True))
+    yield from (*steps, *every[:1], *every[1:][-2:])
+
+
+def _possible(*profiles: Profile | None) -> list[Profile]:
+    return [profile for profile in profiles if profile is not None]
 
 
 def judge(profile: Profile, subject: UnitModel, chamber: Chamber, draws: int = 1) -> RatedProfile:
-    """Return what is expected of a profile; `draws` is by how many made-up soaks the kind's smoothing is found."""
+    """Return the rating of a profile; the kind's smoothing is the mean of that of `draws` simulated soaks."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     count = int(np.clip(profile.duration / EVERY, *SAMPLES))
@@ -144,19 +175,17 @@ def judge(profile: Profile, subject: UnitModel, chamber: Chamber, draws: int = 1
             noise += expected_curve_error(T, dt, subject.noise, subject.walk, answer).variance(grid) / draws
             if subject.shape is not None:
                 misfit += expected_misfit(T, answer, subject.shape, subject.d).variance(grid) / draws
-    covered = float(T.min()), float(T.max())
-    share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
-    return RatedProfile(profile, grid, np.sqrt(noise + misfit), np.sqrt(noise), covered, max(share, 0.0))
+    return RatedProfile.of(profile, chamber, T, grid, noise, misfit)
 
 
-def ranked(judged: list[RatedProfile]) -> list[RatedProfile]:
+def ranked(rated: list[RatedProfile]) -> list[RatedProfile]:
     """Return the profiles by their sigma, those that cover the range first.
 
     Of profiles that are as good the first is the one with the least noise (what the kind cannot follow may hide it),
     and of those with as little the slowest, which leaves least to gradients within the unit.
     """
-    order = sorted(judged, key=lambda item: (item.share < ENOUGH, item.score))
-    whole = [item for item in order if (item.share < ENOUGH) == (order[0].share < ENOUGH)]
+    order = sorted(rated, key=lambda item: (item.share < MIN_COVERAGE, item.score))
+    whole = [item for item in order if (item.share < MIN_COVERAGE) == (order[0].share < MIN_COVERAGE)]
     alike = [item for item in whole if item.score <= ALIKE * order[0].score]
     quiet = [item for item in alike if item.alone <= ALIKE * min(other.alone for other in alike)]
     first = min(quiet, key=lambda item: float(np.max(np.abs(item.profile.rates))))
@@ -176,7 +205,7 @@ def search(
     say = progress or (lambda *state: None)
     say(f"profiles of {hours:g} h")
     tried = [judge(profile, subject, chamber) for profile in candidates(chamber, hours)]
-    if max((item.share for item in tried), default=0.0) < ENOUGH:
+    if max((item.share for item in tried), default=0.0) < MIN_COVERAGE:
         raise ConfigError(_too_short(chamber, hours, tried))
     order = ranked(tried)
     classic = next((item for item in tried if _is_classic(item)), None)
@@ -204,14 +233,14 @@ def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str
 
 
 def _is_classic(item: RatedProfile) -> bool:
-    """Return whether a profile is a staircase whose last step leads up: it never comes back."""
+    """Whether a profile is a staircase whose last step leads up: it never comes back."""
     moving = item.profile.rates[item.profile.rates != 0]
     return item.profile.family == "staircase" and bool(moving[-1] > 0)
 
 
 def _point(subject: UnitModel, chamber: Chamber, hours: float) -> Point | None:
     tried = [judge(profile, subject, chamber) for profile in leading(chamber, hours)]
-    if not tried or max(item.share for item in tried) < ENOUGH:
+    if not tried or max(item.share for item in tried) < MIN_COVERAGE:
         return None
     return Point(hours, ranked(tried)[0], next((item for item in tried if _is_classic(item)), None))
 
@@ -220,16 +249,16 @@ def _shortest(
     subject: UnitModel, chamber: Chamber, hours: float, target: float, points: tuple[Point, ...]
 ) -> RatedProfile | None:
     """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
-    found = next((point for point in points if point.best.score <= target), None)
-    low = max((p.hours for p in points if found is None or p.hours < found.hours), default=points[0].hours / 8)
+    reached = next((point for point in points if point.best.score <= target), None)
+    low = max((p.hours for p in points if reached is None or p.hours < reached.hours), default=points[0].hours / 8)
     high = points[-1].hours
-    while found is None and high < LONGEST * hours:
+    while reached is None and high < LONGEST * hours:
         low, high = high, 2 * high
         point = _point(subject, chamber, high)
-        found = point if point is not None and point.best.score <= target else None
-    if found is None:
+        reached = point if point is not None and point.best.score <= target else None
+    if reached is None:
         return None
-    best, high = found.best, found.hours
+    best, high = reached.best, reached.hours
     while high > 1.03 * low:
         middle = float(np.sqrt(low * high))
         point = _point(subject, chamber, middle)

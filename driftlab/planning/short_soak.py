@@ -1,8 +1,8 @@
-"""How short a soak may be where the unit's family is known: the posterior map's sigma, before anything is recorded.
+"""Shortest soak of a unit whose family is known: the posterior map's sigma, before anything is recorded.
 
-What a soak will say of the coefficients c, its J, depends on when it is where and on the noise, not on what it will
-read. So the covariance of the posterior map is known beforehand, C = (Cov^-1 + J)^-1, and so is what a map without the
-family will be off by in the mean over the family's units: with estimates a = K (B c + e) of the rows, e the noise of
+The information J of a soak on the coefficients c depends on the course of the temperature and on the noise, not on the
+readings. So the covariance of the posterior map is known beforehand, C = (Cov^-1 + J)^-1, and so is the error of a map
+without the family in the mean over the family's units: with estimates a = K (B c + e) of the rows, e the noise of
 covariance S, and a map E a over the range::
 
     E (E a - B_g c)^2 = diag (E K B - B_g) (Cov + mu mu') (E K B - B_g)' + E K S K' E'
@@ -14,15 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import band_of, sigma
 from driftlab.family.unit_information import SoakRows, UnitInformation
-from driftlab.noise.local_level import whitened
 from driftlab.planning.chamber import Chamber, Profile, ramps
+from driftlab.planning.search import RatedProfile
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 
@@ -36,49 +35,8 @@ NEARLY = 1.1  # of the least sigma: as good, where no sigma is asked for
 
 
 @dataclass(frozen=True, eq=False)
-class ShortSoak:
-    """A soak of a part of the range.
-
-    Attributes
-    ----------
-    share : float
-        Of the range.
-    place : str
-        `lower`, `middle`, `upper`, or `whole`.
-    profile : Profile
-        Of the chamber.
-    saw : (low, high)
-        What the unit comes to, degC.
-    temperature : (G,) array
-        Over the whole range, degC.
-    sigma : (G, d) array
-        Of the posterior map, as `fit-map --family` will say it.
-    own : (G, d) array
-        Root mean square error without the family, of the map that is best for its units.
-    """
-
-    share: float
-    place: str
-    profile: Profile
-    saw: tuple[float, float]
-    temperature: Array
-    sigma: Array
-    own: Array
-
-    @cached_property
-    def score(self) -> float:
-        """Sigma, rms over the range, of the worst axis."""
-        return _worst(self.sigma)
-
-    @cached_property
-    def own_score(self) -> float:
-        """The same of the error of the map without the family."""
-        return _worst(self.own)
-
-
-@dataclass(frozen=True, eq=False)
 class ShortSoakPlan:
-    """How short a soak may be.
+    """Result of a search for the shortest soak.
 
     Attributes
     ----------
@@ -88,16 +46,16 @@ class ShortSoakPlan:
         Densities that are planned with, SI.
     hours : tuple of float
         Lengths that are tabled, the longest first.
-    tried : tuple of Short
+    tried : tuple of RatedProfile
         Of each share and length the best place.
-    chosen : Short
+    chosen : RatedProfile
         The shortest that reaches the target; without one, the shortest that is nearly as good as any.
     target : float or None
         Sigma to reach, rms over the range of the worst axis, SI.
     reached : bool
         Whether the target is.
     own_hours : float or None
-        How long it takes without the family; None where no length of the table's does.
+        Length without the family; None where no length of the table's will do.
     """
 
     family: Family
@@ -105,24 +63,30 @@ class ShortSoakPlan:
     noise: Array
     walk: Array
     hours: tuple[float, ...]
-    tried: tuple[ShortSoak, ...]
-    chosen: ShortSoak
+    tried: tuple[RatedProfile, ...]
+    chosen: RatedProfile
     target: float | None
     reached: bool
     own_hours: float | None
 
-    def best(self, share: float, hours: float) -> ShortSoak | None:
-        """Return what was tried of a share of the range in so many hours."""
-        found = [s for s in self.tried if s.share == share and np.isclose(s.profile.hours, hours, rtol=0.02)]
-        return found[0] if found else None
+    def best(self, share: float, hours: float) -> RatedProfile | None:
+        """Return the rating of a share of the range in so many hours."""
+        same = (s for s in self.tried if s.share == share and np.isclose(s.profile.hours, hours, rtol=0.02))
+        return next(same, None)
 
 
 def shortened(
     family: Family, chamber: Chamber, hours: float, noise: Array, walk: Array, target: float | None
 ) -> ShortSoakPlan:
-    """Return how short a soak of at most `hours` may be, for a unit with these densities of noise (d,) each."""
+    """Return the shortest soak, of at most `hours`, for a unit with these densities of noise (d,) each."""
+
+    def best(share: float, hours: float) -> RatedProfile | None:
+        """Return the best place for a share of the range, None where the chamber cannot do it in these hours."""
+        rated = (expected(family, chamber, *part, noise, walk) for part in _parts(chamber, share, hours))
+        return min(rated, key=lambda s: s.score, default=None)
+
     lengths = tuple((hours * SHORTER).tolist())
-    tried = tuple(s for h in lengths for share in SHARES if (s := _best(family, chamber, share, h, noise, walk)))
+    tried = tuple(s for h in lengths for share in SHARES if (s := best(share, h)))
     if not tried:
         raise ConfigError(
             f"--hours {hours:g}: the chamber cannot take any part of the family's range in so short a time; give more "
@@ -134,20 +98,14 @@ def shortened(
         chosen = min(good, key=lambda s: (s.profile.hours, s.score))
         return ShortSoakPlan(family, chamber, noise, walk, lengths, tried, chosen, None, True, None)
     own_hours: list[float] = []
-    enough: list[ShortSoak] = []
+    enough: list[RatedProfile] = []
     for length in np.geomspace(hours * SHORTER[-1], hours, STEPS):
-        here = [s for share in SHARES if (s := _best(family, chamber, share, float(length), noise, walk))]
+        here = [s for share in SHARES if (s := best(share, float(length)))]
         enough = enough or [s for s in here if s.score <= target]
         own_hours += [s.profile.hours for s in here if s.own_score <= target]
     chosen = min(enough or tried, key=lambda s: (s.share, s.score) if enough else (s.score, s.share))
     own = min(own_hours) if own_hours else None
     return ShortSoakPlan(family, chamber, noise, walk, lengths, tried, chosen, target, bool(enough), own)
-
-
-def _best(family: Family, chamber: Chamber, share: float, hours: float, noise: Array, walk: Array) -> ShortSoak | None:
-    """Return the best place for a share of the range, None where the chamber cannot do it in these hours."""
-    found = [expected(family, chamber, *part, noise, walk) for part in _parts(chamber, share, hours)]
-    return min(found, key=lambda s: s.score) if found else None
 
 
 def _parts(chamber: Chamber, share: float, hours: float) -> Iterator[tuple[float, str, Profile]]:
@@ -162,8 +120,8 @@ def _parts(chamber: Chamber, share: float, hours: float) -> Iterator[tuple[float
 
 def expected(
     family: Family, chamber: Chamber, share: float, place: str, profile: Profile, noise: Array, walk: Array
-) -> ShortSoak:
-    """Return what is expected of the map of a unit that goes through a profile."""
+) -> RatedProfile:
+    """Return the rating of a profile for a unit of the family."""
     count = int(np.clip(profile.duration / ROW, 8, ROWS))
     t, T = profile.samples(chamber.lag, count)
     rows = SoakRows(t, T, np.zeros((count, len(noise))), np.full(count, profile.duration / count), {})
@@ -171,9 +129,9 @@ def expected(
     posterior, band = family.posterior(soaked), band_of(family, soaked)
     low, high = family.knots.domain
     grid = np.linspace(max(chamber.low, low), min(chamber.high, high), 2 * family.knots.intervals + 1)
-    own = np.stack([_without(family, soaked, grid, axis) for axis in range(len(noise))], axis=1)
-    saw = (float(T.min()), float(T.max()))
-    return ShortSoak(share, place, profile, saw, grid, sigma(family, posterior, band, grid), own)
+    without = np.stack([_without(family, soaked, grid, axis) for axis in range(len(noise))], axis=1)
+    spread, covered = sigma(family, posterior, band, grid), (float(T.min()), float(T.max()))
+    return RatedProfile(profile, grid, spread, spread, covered, share, place, without)
 
 
 def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) -> Array:
@@ -183,12 +141,11 @@ def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) ->
     low, high = float(rows.T.min()), float(rows.T.max())
     middle, half = (low + high) / 2, max((high - low) / 2, 1e-6)
     seen, at = family.knots.values(rows.T), family.knots.values(grid)
-    noise, steps = rows.variances(soaked.white[axis], soaked.walk[axis], free=False)
     best, least = np.abs(at @ mean), np.inf
     x, inside = (grid - middle) / half, (np.clip(grid, low, high) - middle) / half
     for order in ORDERS:
         V = np.polynomial.chebyshev.chebvander((rows.T - middle) / half, order)
-        X = whitened(np.column_stack([V, seen]), noise, steps)
+        X, _ = rows.whitened(np.column_stack([V, seen]), soaked.white[axis], soaked.walk[axis], free=False)
         own, rest = X[:, : order + 1], X[:, order + 1 :]
         K = np.linalg.pinv(own)
         slopes = np.polynomial.chebyshev.chebder(np.eye(order + 1), axis=0)
@@ -196,11 +153,7 @@ def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) ->
         straight = clamped + (x - inside)[:, None] * np.polynomial.chebyshev.chebval(inside, slopes).T
         for E in (np.polynomial.chebyshev.chebvander(x, order), clamped, straight):
             off, noisy = E @ (K @ rest) - at, E @ K
-            found = np.einsum("gq,qp,gp->g", off, second, off, optimize=True) + np.sum(noisy**2, axis=1)
-            if np.mean(found) < least:
-                best, least = np.sqrt(found), float(np.mean(found))
+            square = np.einsum("gq,qp,gp->g", off, second, off, optimize=True) + np.sum(noisy**2, axis=1)
+            if np.mean(square) < least:
+                best, least = np.sqrt(square), float(np.mean(square))
     return np.asarray(best)
-
-
-def _worst(values: Array) -> float:
-    return float(np.max(np.sqrt(np.mean(values**2, axis=0))))

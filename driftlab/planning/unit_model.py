@@ -1,7 +1,7 @@
-"""What is known of a unit before its soak: noise, walk, the kind of its map, perhaps the shape of its curve.
+"""Model of a unit before its soak: noise, walk, the kind of its map, perhaps the shape of its curve.
 
-A simulated source tells what its unit is. Else noise and walk are the filter's, which may be tuned wider than the unit
-is: a plan says on what it stands.
+A simulated source has a unit that is known. Else noise and walk are the filter's, which may be tuned wider than the
+unit's: a plan names the source of each.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ Curve = Callable[[Array], Array]
 BENDS = 4.0  # K, of a curve whose shape nobody knows: so close that a map is not smoothed for it
 FILTERS = "the filter's"  # whose noise it is
 LOUD = 300.0  # times the noise of a minute, so that it counts
+SWING = 100.0  # times the noise of a minute: that of a curve that nobody knows
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class UnitModel:
     Attributes
     ----------
     channel, axes, unit
-        Whose bias it is, what its axes are called, and its unit.
+        Whose bias it is, names of its axes, and its unit.
     map : ThermalMap
         The settings of the kind that will be fitted.
     noise, walk : (d,) arrays
@@ -45,6 +46,10 @@ class UnitModel:
         The curve that is to be found, as far as it is known.
     shape_of : str
         Where it is from.
+    interval, align : float
+        Duration of an epoch, and how long a unit is aligned, s.
+    curve_known : bool
+        Whether the shape is the unit's own, or one that is taken for want of it.
     """
 
     channel: str
@@ -56,16 +61,36 @@ class UnitModel:
     noise_of: str
     shape: Curve | None
     shape_of: str
+    interval: float = 1.0
+    align: float = 60.0
+    curve_known: bool = True
 
     @property
     def d(self) -> int:
-        """How many axes."""
+        """Number of axes."""
         return len(self.axes)
 
     @property
     def floor(self) -> Array:
         """Floor (d,) of the Allan deviation that noise and walk make, SI."""
         return np.asarray(np.sqrt(2 * self.noise * self.walk / np.sqrt(3)))
+
+    def curve(self, T: Array) -> Array:
+        """Return the bias (N, d) of the shape at T (N,)."""
+        assert self.shape is not None, "a unit with a curve, as `with_curve` has it"
+        return self.shape(T)
+
+    def with_curve(self, low: float, high: float) -> UnitModel:
+        """Return the unit with a curve: where the shape is not known, one that bends from `low` to `high` degC.
+
+        It swings by SWING times the noise of a minute, with a slope that grows to three times what it was.
+        """
+
+        def bent(T: Array) -> Array:
+            x = (T - (low + high) / 2) / ((high - low) / 2)
+            return np.outer(x + x**2 / 4, SWING / 2 * self.noise / np.sqrt(60.0))
+
+        return self if self.shape is not None else replace(self, shape=bent, curve_known=False)
 
     def drawn(self, T: Array, dt: float, seed: int) -> Array:
         """Return bias (N, d) as it may be measured at T (N,), a sample each dt in s: curve, walk and white noise.
@@ -84,7 +109,7 @@ class UnitModel:
 
     @classmethod
     def of(cls, config: Config, kind: str | None, walk: Array | None) -> UnitModel:
-        """Return what a config says; `walk` (d,) or (1,), where given, is in place of its own.
+        """Return the unit of a config; `walk` (d,) or (1,), where given, is in place of its own.
 
         Raises
         ------
@@ -109,11 +134,14 @@ class UnitModel:
                 raise ConfigError(f"--walk: has {len(walk)} values for {len(axes)} axes; write one, or one an axis")
             own, whose = np.broadcast_to(walk, len(axes)), "the walk as --walk says"
         shape, shape_of = _shape(config, twin)
-        return cls(channel, tuple(axes), unit, settings, noise, own, whose, shape, shape_of)
+        interval, align = (config.filter.update_interval, config.filter.align) if config.filter else (1.0, 60.0)
+        return cls(
+            channel, tuple(axes), unit, settings, noise, own, whose, shape, shape_of, float(interval), float(align)
+        )
 
 
 def twin_of(config: Config) -> Twin | None:
-    """Return the unit that the config's source simulates, if it does and tells."""
+    """Return the unit that the config's source simulates, if it does and knows it."""
     return config.source.twin if isinstance(config.source, SimulatedSource) else None
 
 
@@ -138,12 +166,12 @@ def fitted_map(config: Config) -> FittedMap | None:
 
 
 def _shape(config: Config, twin: Twin | None) -> tuple[Curve | None, str]:
-    """Return the curve to be found and where it is from; None where nobody knows."""
+    """Return the curve to be fitted and where it is from; None where nobody knows."""
     if twin is not None:
         return twin.curve, "the simulated unit's"
-    found = fitted_map(config)
-    if found is None:
+    fitted = fitted_map(config)
+    if fitted is None:
         return None, "not known"
-    straight = replace(found, outside="tangent")
+    straight = replace(fitted, outside="tangent")
     name = next((item.path.name for item in config.tracked_maps() if item.path is not None and item.path.is_file()), "")
     return straight.bias, f"that of {name}"

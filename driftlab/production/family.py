@@ -30,8 +30,7 @@ from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
 from driftlab.spc.charts import LEVEL, InControl, LineReport
-from driftlab.spc.line import line_of
-from driftlab.spc.reconcile import reconcile
+from driftlab.spc.line import line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError
@@ -106,7 +105,7 @@ def analyse(
         outliers = find_outliers(family, units, records, shown=unit, fitted=known is None)
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
-        family = replace(family, laws=outliers.laws)
+        family = family.model_copy(update={"laws": outliers.laws})
         lots, line = reconcile(find_odd_lots(family, records, shown=unit), line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
@@ -143,23 +142,23 @@ def _fitted(
     except ValueError as error:
         return None, NOTHING, None, str(error)
     progress(Stage("the family, units left out"))
-    return replace(family, bands=measure_bands(units.with_rows(), fit, each)), common, units, ""
+    bands = measure_bands(units.with_rows(), fit, each)
+    return family.model_copy(update={"bands": bands}), common, units, ""
 
 
 def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, SharedEffects]:
-    content = read_family(path)
-    units = ("channel", content.channel, status.channel), ("unit", content.bias_unit, status.bias_unit)
+    family = read_family(path)
+    units = ("channel", family.channel, status.channel), ("unit", family.bias_unit, status.bias_unit)
     for what, has, wanted in units:
         if has != wanted:
             raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
-    family = content.family()
     try:
         for soaked, _ in store:
-            family.said(soaked)
+            family.information_of(soaked)
             break
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
-    return family, NOTHING if content.common_effects is None else SharedEffects.from_json(content.common_effects)
+    return family, NOTHING if family.common_effects is None else SharedEffects.from_json(family.common_effects)
 
 
 def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:

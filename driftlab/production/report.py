@@ -12,8 +12,7 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.family.file import save_family
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.shared_effect import SharedEffect
-from driftlab.family.shared_effects import of_effect
+from driftlab.family.shared_effect import SharedEffect, of_effect
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
 from driftlab.production.store import NEW, UNITS, FleetFolder

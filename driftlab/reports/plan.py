@@ -11,7 +11,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.planning.chamber import Chamber, Profile
 from driftlab.planning.detectability import DetectabilityReport
-from driftlab.planning.search import ENOUGH, RatedProfile, SearchResult
+from driftlab.planning.search import MIN_COVERAGE, RatedProfile, SearchResult
 from driftlab.planning.unit_model import FILTERS, UnitModel
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, axis_panels, target_rule
@@ -130,7 +130,7 @@ def _profiles(plan: SearchResult) -> TextTable:
 def _row(plan: SearchResult, rated: RatedProfile) -> list[str]:
     value, at, _ = rated.worst
     sizes = [number(v * plan.subject.unit.factor, zeros=True) for v in (rated.score, value)]
-    short = "" if rated.share >= ENOUGH else " (!)"
+    short = "" if rated.share >= MIN_COVERAGE else " (!)"
     low, high = rated.covered
     name = rated.profile.name + (" (chosen)" if rated is plan.chosen else "")
     return [name, *sizes, f"{at:.1f}", f"{low:.1f} to {high:.1f}{short}"]

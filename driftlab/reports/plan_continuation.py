@@ -9,7 +9,7 @@ import numpy as np
 
 from driftlab.planning.continuation import LITTLE, Continuation
 from driftlab.planning.detectability import DetectabilityReport
-from driftlab.planning.search import ENOUGH, RatedProfile
+from driftlab.planning.search import MIN_COVERAGE, RatedProfile
 from driftlab.reports import plan as plan_page
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Shade, target_rule
@@ -111,7 +111,7 @@ def cells(plan: Continuation) -> list[list[str]]:
 
 def _profile_row(plan: Continuation, rated: RatedProfile) -> list[str]:
     value, at, _ = rated.worst
-    short = "" if rated.share >= ENOUGH else " (not all of the range)"
+    short = "" if rated.share >= MIN_COVERAGE else " (not all of the range)"
     return _row(plan, rated.profile.name + short, rated.score, value, at)
 
 
@@ -139,7 +139,7 @@ def sigma_chart(plan: Continuation) -> Chart:
     shades = tuple(Shade(a, b, "not seen yet", "hole") for a, b in ends if b > a)
     curves = [
         (best.temperature, best.sigma, "with the further profile"),
-        (before.grid, before.sigma, "so far"),
+        (before.temperature, before.sigma, "so far"),
     ]
     rules = target_rule(plan.target, unit.factor)
     panels = plan_page.sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)

@@ -9,7 +9,8 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.maps.assessment import text
-from driftlab.planning.short_soak import SHARES, ShortSoak, ShortSoakPlan
+from driftlab.planning.search import RatedProfile
+from driftlab.planning.short_soak import SHARES, ShortSoakPlan
 from driftlab.reports import plan as plan_page
 from driftlab.reports.charts import Chart, Line
 from driftlab.reports.family_map import GAUSSIAN, measured_on
@@ -25,7 +26,7 @@ def headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
     best, chamber = plan.chosen, plan.chamber
     part = "the whole range" if best.share == 1 else f"the {best.place} {100 * best.share:.0f} % of the range"
     soak = (
-        f"soak {best.saw[0]:.3g} to {best.saw[1]:.3g} °C ({part}) in {best.profile.hours:.3g} h: with the "
+        f"soak {best.covered[0]:.3g} to {best.covered[1]:.3g} °C ({part}) in {best.profile.hours:.3g} h: with the "
         f"family of {plan.family.units} units the map is then known to {_size(best.score, unit)} from "
         f"{chamber.low:.4g} to {chamber.high:.4g} °C (rms, worst axis, level included)"
     )
@@ -62,7 +63,7 @@ def _size(value: float, unit: BiasUnit) -> str:
 def _sigmas(plan: ShortSoakPlan, unit: BiasUnit) -> TextTable:
     """Return sigma with the family, and the error without, by share of the range and hours."""
 
-    def cell(best: ShortSoak | None) -> str:
+    def cell(best: RatedProfile | None) -> str:
         if best is None:
             return ""
         return f"{text(best.score * unit.factor)} ({text(best.own_score * unit.factor)})\n{best.place}"
@@ -95,7 +96,7 @@ def hours_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
 def sigma_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
     """Return sigma over temperature of what was chosen, with the family and without."""
     best = plan.chosen
-    curves = [(best.temperature, best.sigma, "with the family"), (best.temperature, best.own, "without")]
+    curves = [(best.temperature, best.sigma, "with the family"), (best.temperature, best.without_family, "without")]
     caption = "one standard deviation, level included"
     panels = plan_page.sigma_panels(plan.family.axes, curves, unit)
     return Chart(panels, "temperature [°C]", "How sure the map will be", caption)
@@ -123,13 +124,13 @@ def document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str,
     }
 
 
-def _as_json(soak: ShortSoak) -> dict[str, Any]:
+def _as_json(soak: RatedProfile) -> dict[str, Any]:
     return {
         "share": soak.share,
         "place": soak.place,
         "hours": soak.profile.hours,
         "name": soak.profile.name,
-        "covered_degC": soak.saw,
+        "covered_degC": soak.covered,
         "sigma": soak.score,
         "without_family": soak.own_score,
     }

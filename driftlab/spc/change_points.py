@@ -1,6 +1,6 @@
-"""Where a line changed: steps in the mean of values in the order in which they were made.
+"""Change points of a line: steps in the mean of values in the order in which they were made.
 
-Every stretch of the line is asked whether it has a step, and where. Stretches are those of seeded binary segmentation
+Every stretch of the line is tested for a step. Stretches are those of seeded binary segmentation
 (Kovacs, Buhlmann, Li and Munk, Biometrika 110 (2023) 249): of each length so many that any two neighbouring changes
 have one that holds one of them alone. In a stretch the values count by their normal scores (van der Waerden), so what
 is found does not hang on the law of the values, and no single unit moves it; with normal values nothing is lost. Of a
@@ -26,7 +26,7 @@ import numpy as np
 from fusion_core.chunk import Array
 
 SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
-OF_BUMPS = 0.2  # of what may be found falsely: by parts that are unlike all the rest
+OF_BUMPS = 0.2  # of the false discovery rate: for parts that are unlike all the rest
 DECAY = np.sqrt(0.5)  # of the length from one layer of stretches to the next
 TAILS = (0.1, 0.01, 0.001)
 PRICES = {
@@ -78,20 +78,20 @@ def steps(z: Array, a: Array, alpha: float, blocks: Iterable[tuple[int, int]] = 
         Values that may have a level of their own, as those of a lot.
     """
     n = len(z)
-    found: list[int] = []
+    places: list[int] = []
     rest = sorted(strongest(z, a), reverse=True)
     while rest and probability(rest[0][0], n) <= (1 - OF_BUMPS) * alpha:
         at = rest[0][1]
-        found.append(at)
+        places.append(at)
         rest = [one for one in rest if not one[2] < at < one[3]]
-    for start, stop in pairwise([0, *sorted(found), n]):
+    for start, stop in pairwise([0, *sorted(places), n]):
         inside = [(max(i, start), min(j, stop)) for i, j in blocks]
-        found += [at for at in _bump(z, a, start, stop, OF_BUMPS * alpha, inside) if start < at < stop]
-    return _kept(z, a, sorted(set(found)), alpha)
+        places += [at for at in _bump(z, a, start, stop, OF_BUMPS * alpha, inside) if start < at < stop]
+    return _settled(z, a, sorted(set(places)), alpha)
 
 
 def _bump(z: Array, a: Array, start: int, stop: int, alpha: float, blocks: list[tuple[int, int]]) -> tuple[int, ...]:
-    """Return where the part of a stretch that is least like the rest of it begins and ends; nothing if that is chance.
+    """Return begin and end of the part of a stretch that is least like the rest of it; nothing if that is chance.
 
     Two steps that take each other back show less in what lies about each of them than in all of the rest. The price is
     Bonferroni's.
@@ -113,7 +113,7 @@ def _bump(z: Array, a: Array, start: int, stop: int, alpha: float, blocks: list[
 
 
 def probability(T: float, n: int) -> float:
-    """Return how probable a largest T of at least T is in n exchangeable values.
+    """Return the probability of a largest T of at least T in n exchangeable values.
 
     Its logarithm is drawn through the quantiles of PRICES over T^2, straight between and beyond them: the true tail
     falls faster, so what is rarer than 0.1 % has a p that is too large rather than too small.
@@ -131,27 +131,24 @@ def probability(T: float, n: int) -> float:
     return float(np.exp(min(logs[piece] + slope * (T**2 - places[piece]), 0.0)))
 
 
-def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[LevelStep]:
+def _settled(z: Array, a: Array, places: list[int], alpha: float) -> list[LevelStep]:
     """Return the steps, each where it is most likely between its neighbours; one that is no longer sure is dropped.
 
     Steps that take turns at moving one another are where they were last.
     """
-    n, seen = len(z), set[tuple[int, ...]]()
+    n, before = len(z), set[tuple[int, ...]]()
     while True:
-        kept = []
-        for k, at in enumerate(found):
-            start = found[k - 1] if k else 0
-            stop = found[k + 1] if k + 1 < len(found) else n
-            kept.append(_step(z, a, start, stop, at))
-        moved = [step.at for step in kept]
-        weakest = max(kept, key=lambda step: step.p, default=None)
+        edges = [0, *places, n]
+        steps_at = [_step(z, a, start, stop, at) for start, at, stop in zip(edges, places, edges[2:], strict=False)]
+        moved = [step.at for step in steps_at]
+        weakest = max(steps_at, key=lambda step: step.p, default=None)
         if weakest is not None and weakest.p > alpha:
-            found = [at for at in moved if at != weakest.at]
-        elif moved == found or tuple(moved) in seen:
-            return sorted({step.at: step for step in kept}.values(), key=lambda step: step.at)
+            places = [at for at in moved if at != weakest.at]
+        elif moved == places or tuple(moved) in before:
+            return sorted({step.at: step for step in steps_at}.values(), key=lambda step: step.at)
         else:
-            seen.add(tuple(moved))
-            found = sorted(set(moved))
+            before.add(tuple(moved))
+            places = sorted(set(moved))
 
 
 def _step(z: Array, a: Array, start: int, stop: int, at: int) -> LevelStep:

@@ -1,9 +1,8 @@
-"""What is known of a line: its charts, its changes, its limits. m values of a chart; all values in SI.
+"""Report of a line: control charts, changes, capability; and the statistics of each. All values in SI.
 
-Control charts of single units: Shewhart's (individuals, moving ranges) and the EWMA.
-
-Values are in a scale in which they are about normal, in the order in which the units were made. Of value i with the
-deviation sigma_i = sqrt(s^2 + own_i^2), s between the units and own_i of its measurement::
+Control charts are of single units: Shewhart's (individuals, moving ranges) and the EWMA. Values are in a scale in which
+they are about normal, in the order in which the units were made. Of value i with the deviation
+sigma_i = sqrt(s^2 + own_i^2), s between the units and own_i of its measurement::
 
     z_i = (x_i - centre) / sigma_i,         alarm beyond 3
     w_i = (1 - lambda) w_{i-1} + lambda z_i,  alarm beyond 2.962 sqrt(lambda / (2 - lambda) (1 - (1 - lambda)^{2 i}))
@@ -11,12 +10,18 @@ deviation sigma_i = sqrt(s^2 + own_i^2), s between the units and own_i of its me
 s is of the moving range of the units on which the limits stand, so that neither a shift nor a drift of the line widens
 them. Sources: Montgomery, Introduction to Statistical Quality Control, 7th ed., 6.4 and 9.2 (table 9.11: lambda 0.2,
 L 2.962 alarm once in 500 units of a line in control; three sigma, once in 370); NIST/SEMATECH e-Handbook 6.3.2.
-n values.
 
-The scale in which a quantity of a line is about normal: its logarithm, its root, or as it is.
+The scale is the logarithm of a quantity, its root, or as it is. A size (a density, a rms) varies by a share of itself,
+so its logarithm is tried first and stays unless another scale is clearly more normal, by the correlation of the ordered
+values with normal scores (Filliben).
 
-What is a size (a density, a rms) varies by a share of itself, so its logarithm is tried first and kept unless another
-scale is clearly more normal, by the correlation of the ordered values with normal scores (Filliben). n values.
+Capability indices are of a limit U, in such a scale, mean m of n values::
+
+    Ppk = (U - m) / (3 s)  with s the deviation of all of them,  Cpk the same with that from one unit to the next
+
+Interval of Ppk by the noncentral t distribution, of which 3 sqrt(n) Ppk is a draw, as a normal one (Abramowitz and
+Stegun 26.7.10); of the share beyond the limit by Clopper and Pearson, which needs no law of the values. m values of a
+chart, n values in general.
 """
 
 from __future__ import annotations
@@ -27,12 +32,59 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.spc.capability import Capability
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
+MIN_UNITS = 10  # for a chart, or an index
 LEVEL = "level"
 PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
+
+
+@dataclass(frozen=True)
+class Capability:
+    """Capability of a line for one limit on one axis.
+
+    Attributes
+    ----------
+    quantity, axis : str
+    limit : float
+        At most, SI.
+    n : int
+        Units.
+    since : int
+        Place of the first of them in the line: 0, or that of the last change of the line.
+    cpk, ppk : float
+    ppk_low, ppk_high : float
+        95 % interval.
+    beyond : int
+        Units above the limit.
+    share_low, share_high : float
+        95 % interval of the share of units above the limit.
+    scale : str
+        In which the indices are: `log`, `sqrt`, `as it is`.
+    normal : float
+        Probability of values as little normal in that scale, if they were (Shapiro and Wilk).
+    """
+
+    quantity: str
+    axis: str
+    limit: float
+    n: int
+    since: int
+    cpk: float
+    ppk: float
+    ppk_low: float
+    ppk_high: float
+    beyond: int
+    share_low: float
+    share_high: float
+    scale: str
+    normal: float
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the indices hold; where not, the share of units above the limit does."""
+        return self.normal >= 0.01
 
 
 @dataclass(frozen=True)
@@ -44,7 +96,7 @@ class StepChange:
     at, low, high : int
         Place in the line of the first unit after it, and the 95 % interval of that.
     before, after : float
-        What is usual (SI) in the stretches on either side of it.
+        Usual value (SI) in the stretches on either side of it.
     error : float
         Deviation of the difference, in the chart's scale.
     p : float
@@ -65,7 +117,7 @@ class StepChange:
 
 @dataclass(frozen=True)
 class Trend:
-    """A quantity that rises or falls all along the line: what is usual (SI) of its first and of its last unit."""
+    """A quantity that rises or falls all along the line: usual value (SI) of its first and of its last unit."""
 
     before: float
     after: float
@@ -110,7 +162,7 @@ class ControlChart:
         Alarms of either chart.
     changes : tuple of Change
     trend : Trend or None
-        Where a straight line says more than steps; then there are no changes.
+        Where a straight line fits better than steps; then there are no changes.
     lots : tuple of Lot
         In the order of their first units.
     of_family : bool
@@ -148,16 +200,16 @@ class LineReport:
     ----------
     units, lots, dates : tuple of str
     order : str
-        What the order stands on, in a sentence.
+        Basis of the order, in a sentence.
     axes : tuple of str
     unit : BiasUnit
         Of the bias: in SI, and as it is shown.
     controls : tuple of Control
     capability : tuple of Capability
     too_few : tuple of str
-        What has no chart because fewer than FEWEST units have it.
+        Quantities without a chart because fewer than MIN_UNITS units have them.
     sentences : tuple of str
-        What the line did, in words: changes, where it is now, its limits.
+        Changes, the present state, and the limits, in words.
     """
 
     units: tuple[str, ...] = ()
@@ -187,7 +239,7 @@ WITHIN = 0.9754  # mean of the moving ranges that are below D4 deviations, over 
 
 @dataclass(frozen=True)
 class InControl:
-    """What the line does where nothing has happened.
+    """Law of a line in control.
 
     Attributes
     ----------
@@ -195,7 +247,7 @@ class InControl:
     spread : float
         s, the deviation between units without that of their measurement.
     share : float
-        What the own deviations are multiplied by: below 1 where they claim more than the values scatter.
+        Factor of the own deviations: below 1 where they claim more than the values scatter.
     """
 
     centre: float
@@ -233,8 +285,8 @@ def _short_term(x: Array) -> float:
     """Return the deviation from one unit to the next, by the mean of the moving ranges that are in control."""
     ranges = np.abs(np.diff(x))
     rough = float(np.median(ranges)) / MEDIAN_RANGE
-    kept = ranges[ranges <= D4 * rough] if rough > 0 else ranges
-    return float(np.mean(kept)) / (D2 * (WITHIN if rough > 0 else 1.0))
+    ranges = ranges[ranges <= D4 * rough] if rough > 0 else ranges
+    return float(np.mean(ranges)) / (D2 * (WITHIN if rough > 0 else 1.0))
 
 
 def _middle(x: Array, sigma: Array) -> float:
@@ -249,7 +301,7 @@ def _middle(x: Array, sigma: Array) -> float:
 def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
     """Return the EWMA (..., n) of z (..., n), which counts to `most`.
 
-    What is further out is for Shewhart's chart to say; else one odd unit would hold the EWMA out of its limits for ten.
+    Values further out belong to Shewhart's chart; else one odd unit would hold the EWMA out of its limits for ten.
     Clipped at three, it alarms once in 530 units.
     """
     from scipy.signal import lfilter
@@ -258,7 +310,7 @@ def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
 
 
 def ewma_limit(n: int, weight: float = LAMBDA, width: float = L) -> Array:
-    """Return how far the EWMA (n,) may be from 0, which is less for the first units."""
+    """Return the limit (n,) of the EWMA about 0, which is less for the first units."""
     return np.asarray(width * np.sqrt(weight / (2 - weight) * (1 - (1 - weight) ** (2.0 * np.arange(1, n + 1)))))
 
 
@@ -267,7 +319,7 @@ Name = Literal["log", "sqrt", "as it is"]
 
 @dataclass(frozen=True)
 class ChartScale:
-    """How values are told apart.
+    """Scale of values.
 
     Attributes
     ----------
@@ -284,7 +336,7 @@ class ChartScale:
         return np.log(values) if self.name == "log" else np.sqrt(np.maximum(values, 0.0))
 
     def back(self, x: Array) -> Array:
-        """Return what `to` was given."""
+        """Return values (SI) of this scale."""
         if self.name == "as it is":
             return np.asarray(x)
         return np.exp(x) if self.name == "log" else np.maximum(x, 0.0) ** 2
@@ -337,3 +389,23 @@ def _core(x: Array) -> Array:
     middle = np.median(ordered)
     reach = 5 * 1.4826 * np.median(np.abs(ordered - middle))
     return ordered[np.abs(ordered - middle) <= reach] if reach > 0 else ordered
+
+
+def indices(x: Array, limit: float, short_term: float) -> tuple[float, float, float, float]:
+    """Return Cpk, Ppk, and the 95 % interval of Ppk, of values x (n,) and the deviation from one to the next."""
+    n, room, sd = len(x), limit - float(np.mean(x)), float(np.std(x, ddof=1))
+    if not sd > 0 or not short_term > 0:
+        return (np.inf if room >= 0 else -np.inf,) * 4
+    ppk = room / (3 * sd)
+    middle = ppk * (1 - 1 / (4 * (n - 1)))
+    half = 1.96 * float(np.sqrt(1 / (9 * n) + ppk**2 / (2 * (n - 1))))
+    return room / (3 * short_term), ppk, middle - half, middle + half
+
+
+def share_beyond(beyond: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share of which `beyond` of n were seen."""
+    from scipy.stats import beta
+
+    low = 0.0 if beyond == 0 else float(beta.ppf(0.025, beyond, n - beyond + 1))
+    high = 1.0 if beyond == n else float(beta.ppf(0.975, beyond + 1, n - beyond))
+    return low, high

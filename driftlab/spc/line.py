@@ -1,19 +1,18 @@
-"""What a line did over time: of each quantity and axis a control chart, where it changed, how well it keeps a limit.
+"""Analysis of a line over time: of each quantity and axis a control chart, its changes, and its capability.
 
 A line changes where its units say so with at most one false change in twenty clean lines, over all charts together.
 Limits of a chart stand on the first stretch without a change that has twenty units, else on the longest; or on a family
-that is known, where it says what a quantity does in control.
-n units, d axes; all values in SI.
+that is known, where that has the law of a quantity in control. Units are in the order of their dates, several of one
+day as the manifest has them.
 
-The units of a line in the order in which they were made, and their quantities as arrays.
-
-By date, several of one day as the manifest has them. n units, d axes.
+Changes of the line that an odd lot explains, and odd lots that a change of the line explains, are taken out
+(`reconcile`). n units, d axes; all values in SI.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
@@ -21,13 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
+from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.spc.capability import FEWEST, Capability, indices, share_beyond
 from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
+    MIN_UNITS,
     PER,
     SIGMAS,
+    Capability,
     ChartScale,
     ControlChart,
     InControl,
@@ -38,11 +39,13 @@ from driftlab.spc.charts import (
     ewma,
     ewma_limit,
     in_control,
+    indices,
     normality,
     scale_of,
+    share_beyond,
 )
 from driftlab.spc.sentences import sentences
-from driftlab.units import RATE, BiasUnit
+from driftlab.units import BiasUnit, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # changes found in a line without any, over all its charts
@@ -50,14 +53,10 @@ BASIS = 20  # units on which limits should stand
 
 
 def line_of(
-    records: Iterable[UnitRecord],
-    limits: Limits | None,
-    *,
-    unit: BiasUnit | None = None,
-    levels: Mapping[str, Array] | None = None,
-    known: Mapping[str, Sequence[InControl]] | None = None,
-) -> LineReport:
-    """Return what a line did.
+    records: Iterable[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
+    levels: Mapping[str, Array] | None = None, known: Mapping[str, Sequence[InControl]] | None = None,
+) -> LineReport:  # fmt: skip
+    """Return the report of a line.
 
     Parameters
     ----------
@@ -73,39 +72,36 @@ def line_of(
         By quantity: what each axis does in control (SI), on which its limits then stand, also of few units.
     """
     known = known or {}
-    order = ordered(records, levels or {})
-    if unit is None:
-        unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
+    line, table = _ordered(records, levels or {}, unit)
     names = (*FIGURES, *((LEVEL,) if levels else ()))
-    charted = [
-        (name, axis, k) for name in names for k, axis in enumerate(order.axes)
-        if np.sum(np.isfinite(order.values[name][:, k])) >= (1 if name in known else FEWEST)
-    ]  # fmt: skip
+    enough = {
+        (name, axis): np.sum(np.isfinite(table[name][0, :, k])) >= (1 if name in known else MIN_UNITS)
+        for name in names for k, axis in enumerate(line.axes)
+    }  # fmt: skip
+    alpha = FALSE / max(sum(enough.values()), 1)
     controls = tuple(
-        _control(order, name, axis, k, unit, FALSE / len(charted), known[name][k] if name in known else None)
-        for name, axis, k in charted
-    )
-    left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
-    line = LineReport(
-        units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
-        controls=controls, capability=_capability(controls, limits), too_few=tuple(left),
+        _control(line, name, k, table[name][:, :, k], alpha, known[name][k] if name in known else None)
+        for name in names for k, axis in enumerate(line.axes) if enough[name, axis]
     )  # fmt: skip
+    too_few = tuple(f"{axis} {name}" for (name, axis), many in enough.items() if not many)
+    line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
     return replace(line, sentences=tuple(sentences(line)))
 
 
 def _control(
-    order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float, known: InControl | None
+    line: LineReport, name: str, k: int, figures: Array, alpha: float, known: InControl | None
 ) -> ControlChart:
-    values, sigmas = order.values[name][:, k], order.sigmas[name][:, k]
+    """Return the chart of values and deviations (2, n) of a quantity of axis k."""
+    values, sigmas = figures
     at = np.flatnonzero(np.isfinite(values))
     value = values[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale("as it is")
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
-    whole = in_control(x, own).sigma(own) if len(x) >= FEWEST else np.zeros(len(x))  # no change is looked for
-    found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
-    trend = _trend(x, whole, found, scale)
-    found = found if trend is None else []
-    edges = [0, *(step.at for step in found), len(x)]
+    whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
+    level_steps = _steps(x, whole, alpha, _runs([line.lots[place] for place in at]))
+    trend = _trend(x, whole, level_steps, scale)
+    level_steps = level_steps if trend is None else []
+    edges = [0, *(step.at for step in level_steps), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop]) if known is None else known
@@ -118,12 +114,12 @@ def _control(
         return scale.back(law.centre + y)
 
     return ControlChart(
-        quantity=name, axis=axis, unit=unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
+        quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
         centre=float(scale.back(np.array(law.centre))), spread=law.spread, low=back(-SIGMAS * sigma),
         high=back(SIGMAS * sigma), ewma=back(w * usual), ewma_low=back(-reach * usual), ewma_high=back(reach * usual),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
-        changes=_changes(found, stretches, x, sigma, scale, at), lots=_lots(order, at, x, sigma, law, scale),
+        changes=_changes(level_steps, stretches, x, sigma, scale, at), lots=_lots(line, at, x, sigma, law, scale),
         trend=trend, of_family=known is not None,
     )  # fmt: skip
 
@@ -146,12 +142,12 @@ def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) 
     return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha, blocks)
 
 
-def _trend(x: Array, sigma: Array, found: list[LevelStep], scale: ChartScale) -> Trend | None:
-    """Return the trend of a line in which steps were found, if a straight line says more than they do.
+def _trend(x: Array, sigma: Array, level_steps: list[LevelStep], scale: ChartScale) -> Trend | None:
+    """Return the trend of a line in which steps were found, if a straight line fits better.
 
     By the Bayesian information criterion, a step having a size and a place; a value counts to SIGMAS.
     """
-    if not found:
+    if not level_steps:
         return None
     n, u = len(x), np.linspace(-1.0, 1.0, len(x))
     X, w = np.column_stack([np.ones(n), u]), 1 / sigma
@@ -160,10 +156,10 @@ def _trend(x: Array, sigma: Array, found: list[LevelStep], scale: ChartScale) ->
         off = np.abs(x - X @ line) / sigma
         w = np.sqrt(np.minimum(1.345 / np.maximum(off, 1e-12), 1.0)) / sigma
         line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
-    edges = [0, *(step.at for step in found), n]
+    edges = [0, *(step.at for step in level_steps), n]
     steps_of = np.concatenate([np.full(j - i, np.median(x[i:j])) for i, j in pairwise(edges)])
     cost = [float(np.sum(np.minimum(((x - model) / sigma) ** 2, SIGMAS**2))) for model in (X @ line, steps_of)]
-    if cost[0] + 2 * np.log(n) >= cost[1] + (2 * len(found) + 1) * np.log(n):
+    if cost[0] + 2 * np.log(n) >= cost[1] + (2 * len(level_steps) + 1) * np.log(n):
         return None
     before, after = scale.back(line @ np.array([[1.0, 1.0], [-1.0, 1.0]])).tolist()
     return Trend(before, after)
@@ -176,16 +172,12 @@ def _runs(lots: list[str]) -> list[tuple[int, int]]:
 
 
 def _changes(
-    found: list[LevelStep],
-    stretches: list[tuple[int, int]],
-    x: Array,
-    sigma: Array,
-    scale: ChartScale,
+    level_steps: list[LevelStep], stretches: list[tuple[int, int]], x: Array, sigma: Array, scale: ChartScale,
     at: NDArray[np.intp],
-) -> tuple[StepChange, ...]:
+) -> tuple[StepChange, ...]:  # fmt: skip
     laws = [(float(np.median(x[i:j])), 1.2533 * float(np.median(sigma[i:j])) / np.sqrt(j - i)) for i, j in stretches]
     changes = []
-    for step, (before, s), (after, r) in zip(found, laws[:-1], laws[1:], strict=True):
+    for step, (before, s), (after, r) in zip(level_steps, laws[:-1], laws[1:], strict=True):
         places = (int(at[step.at]), int(at[step.low]), int(at[step.high]))
         was, now = scale.back(np.array([before, after])).tolist()
         changes.append(StepChange(*places, was, now, float(np.hypot(s, r)), step.p))
@@ -193,10 +185,10 @@ def _changes(
 
 
 def _lots(
-    order: Order, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: ChartScale
+    line: LineReport, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: ChartScale
 ) -> tuple[LotPoint, ...]:
-    names = np.array(order.lots)[at]
-    found = []
+    names = np.array(line.lots)[at]
+    points = []
     for name in dict.fromkeys(names.tolist()):
         own = names == name
         weight = 1 / sigma[own] ** 2
@@ -204,109 +196,75 @@ def _lots(
         mean = float(np.median(x[own]) + np.sum(weight * z * sigma[own]) / np.sum(weight))
         reach = SIGMAS / float(np.sqrt(np.sum(weight)))
         value, low, high = scale.back(np.array([mean, law.centre - reach, law.centre + reach])).tolist()
-        found.append(LotPoint(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
-    return tuple(found)
+        points.append(LotPoint(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
+    return tuple(points)
 
 
 def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tuple[Capability, ...]:
     """Return the indices of each limited quantity: over the whole line, and since its last change."""
     declared = {} if limits is None else limits.declared
-    found = []
+    rows: list[Capability] = []
     for chart in controls:
         if chart.quantity not in declared:
             continue
         limit = declared[chart.quantity]
         for since in dict.fromkeys([0, *(change.at for change in chart.changes[-1:])]):
             part = chart.at >= since
-            if np.sum(part) < FEWEST:
+            if np.sum(part) < MIN_UNITS:
                 continue
             x = chart.scale.to(chart.value[part])
             n, beyond = len(x), int(np.sum(chart.value[part] > limit))
             spread = in_control(x, np.zeros(n)).spread
-            said = indices(x, float(chart.scale.to(np.array(limit))), spread)
-            found.append(
+            cpk_ppk = indices(x, float(chart.scale.to(np.array(limit))), spread)
+            rows.append(
                 Capability(
-                    chart.quantity, chart.axis, limit, n, since, *said, beyond, *share_beyond(beyond, n),
+                    chart.quantity, chart.axis, limit, n, since, *cpk_ppk, beyond, *share_beyond(beyond, n),
                     chart.scale.name, normality(x),
                 )
             )  # fmt: skip
-    return tuple(found)
+    return tuple(rows)
 
 
-@dataclass(frozen=True, eq=False)
-class Order:
-    """Units in order.
+def _ordered(
+    records: Iterable[UnitRecord], levels: Mapping[str, Array], unit: BiasUnit | None
+) -> tuple[LineReport, dict[str, Array]]:
+    """Return the units that are done, in order, and by quantity values and deviations (2, n, d), NaN if not known.
 
-    Attributes
-    ----------
-    units, lots, dates : tuple of str
-    said : str
-        What the order stands on.
-    axes : tuple of str
-    bias_unit : str
-        SI.
-    values, sigmas : dict of str to (n, d) array
-        By quantity; not a number where it is not known.
+    `levels` (d,) by unit become the quantity `level`.
     """
-
-    units: tuple[str, ...]
-    lots: tuple[str, ...]
-    dates: tuple[str, ...]
-    said: str
-    axes: tuple[str, ...]
-    bias_unit: str
-    values: dict[str, Array]
-    sigmas: dict[str, Array]
-
-
-def ordered(records: Iterable[UnitRecord], levels: Mapping[str, Array]) -> Order:
-    """Return the units that are done, in order; `levels` (d,) by unit become the quantity `level`."""
-    units: list[str] = []
-    lots: list[str] = []
-    dates: list[str] = []
-    kept: list[tuple[list[float], list[float]]] = []
     axes: tuple[str, ...] = ()
-    unit = ""
+    si = ""
+    names, rows = [], []
     for record in records:
-        if record.state != "done":
-            continue
-        axes, unit = axes or record.axes, unit or record.bias_unit
-        units.append(record.unit)
-        lots.append(record.lot)
-        dates.append(record.date)
-        kept.append(_figures(record, len(axes)))
-    place, said = _places(dates)
-    n, d = len(units), len(axes)
-    shape = (n, len(FIGURES), d)
-    values = np.array([own for own, _ in kept], dtype=np.float64).reshape(shape)[place]
-    sigmas = np.array([own for _, own in kept], dtype=np.float64).reshape(shape)[place]
-    names = [units[k] for k in place]
-    level = np.array([levels.get(name, np.full(d, np.nan)) for name in names], dtype=np.float64).reshape(n, d)
-    return Order(
-        units=tuple(names),
-        lots=tuple(lots[k] for k in place),
-        dates=tuple(dates[k] for k in place),
-        said=said,
-        axes=axes,
-        bias_unit=unit,
-        values={**{name: values[:, k] for k, name in enumerate(FIGURES)}, "level": level},
-        sigmas={**{name: sigmas[:, k] for k, name in enumerate(FIGURES)}, "level": np.full((n, d), np.nan)},
-    )
+        if record.state == "done":
+            axes, si = axes or record.axes, si or record.bias_unit
+            names.append((record.unit, record.lot, record.date))
+            rows.append(_figures(record, len(axes)))
+    place, order = _places([date for _, _, date in names])
+    n, d = len(rows), len(axes)
+    units, lots, dates = (tuple(names[j][k] for j in place) for k in range(3))
+    figures = np.array([rows[j] for j in place], dtype=np.float64).reshape(n, 2, len(FIGURES), d)
+    level = np.full((2, n, d), np.nan)
+    for k, name in enumerate(units):
+        level[0, k] = levels.get(name, np.nan)
+    table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
+    unit = default_unit(si) if unit is None else unit
+    return LineReport(units=units, lots=lots, dates=dates, order=order, axes=axes, unit=unit), table
 
 
-def _figures(record: UnitRecord, d: int) -> tuple[list[float], list[float]]:
-    values: list[float] = []
-    sigmas: list[float] = []
-    for name in FIGURES:
-        figure = record.figures.get(name)
-        for kept, own in ((values, figure and figure.value), (sigmas, figure and figure.sigma)):
-            numbers = [np.nan if v is None or not np.isfinite(v) else float(v) for v in own or ()]
-            kept += (numbers + [np.nan] * d)[:d]
-    return values, sigmas
+def _figures(record: UnitRecord, d: int) -> Array:
+    """Return values and deviations (2, figures, d) of a record."""
+    table = np.full((2, len(FIGURES), d), np.nan)
+    for k, name in enumerate(FIGURES):
+        if (figure := record.figures.get(name)) is not None:
+            for part, numbers in zip(table, (figure.value, figure.sigma), strict=True):
+                own = np.array(numbers[:d], dtype=np.float64)
+                part[k, : len(own)] = np.where(np.isfinite(own), own, np.nan)
+    return table
 
 
 def _places(dates: list[str]) -> tuple[list[int], str]:
-    """Return the places of units in their order, and what it stands on."""
+    """Return the places of units in their order, and its basis."""
     when = [_time(date) for date in dates]
     known = sum(time is not None for time in when)
     if known == 0:
@@ -315,15 +273,68 @@ def _places(dates: list[str]) -> tuple[list[int], str]:
     for k, time in enumerate(when):
         last = last if time is None else time
         sorting.append((last, k))
-    said = "in the order of their dates"
+    basis = "in the order of their dates"
     if known < len(dates):
-        said += f"; {len(dates) - known} without a date follow the unit that is before them in the manifest"
-    return [k for _, k in sorted(sorting)], said
+        basis += f"; {len(dates) - known} without a date follow the unit that is before them in the manifest"
+    return [k for _, k in sorted(sorting)], basis
 
 
 def _time(date: str) -> float | None:
     try:
-        found = datetime.fromisoformat(date)
+        time = datetime.fromisoformat(date)
     except ValueError:
         return None
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+
+
+def reconcile(lots: Sequence[LotOutlier], line: LineReport) -> tuple[tuple[LotOutlier, ...], LineReport]:
+    """Return the lots that are off by themselves, and the line beside them.
+
+    A lot that is off the others shows as two changes of the line, one where it begins and one back where it ends: these
+    are the lot's. A lot that is like the units before or after it, as far as the line has not changed, is not off by
+    itself: the change is the line's. The curve of a unit is watched by its level.
+    """
+    by_themselves, controls = [], {(chart.quantity, chart.axis): chart for chart in line.controls}
+    for lot in lots:
+        key = (LEVEL if lot.what == SHAPE else lot.what, lot.axis)
+        if key not in controls:
+            by_themselves.append(lot)
+            continue
+        controls[key], own = _apart(lot, controls[key], line)
+        by_themselves += [lot] if own else []
+    line = replace(line, controls=tuple(controls.values()))
+    return tuple(by_themselves), replace(line, sentences=tuple(sentences(line)))
+
+
+def _apart(lot: LotOutlier, chart: ControlChart, line: LineReport) -> tuple[ControlChart, bool]:
+    """Return the chart with the changes that are the lot's, and whether the lot is off by itself."""
+    lots = np.array(line.lots)
+    places = np.flatnonzero(lots == lot.lot)
+    start, stop = int(places[0]), int(places[-1]) + 1
+    if stop - start > len(places):  # mixed with others: no stretch of the line
+        return chart, True
+    begins = [change for change in chart.changes if change.low <= start <= change.high]
+    ends = [change for change in chart.changes if change.low <= stop <= change.high]
+    if begins and ends and (begins[0].after > begins[0].before) != (ends[0].after > ends[0].before):
+        own = (begins[0], ends[0])
+        marked = (replace(change, of_lot=lot.lot) if change in own else change for change in chart.changes)
+        return replace(chart, changes=tuple(marked)), True
+    return chart, not _as_neighbours(chart, lots == lot.lot, start, stop)
+
+
+def _as_neighbours(chart: ControlChart, own: NDArray[np.bool_], start: int, stop: int) -> bool:
+    """Whether a change of the line explains an odd lot: it came where the lot began, or before, and stayed."""
+    if not chart.changes:
+        return False
+    edges = np.array([0, *(change.at for change in chart.changes), len(own)])
+    middle = (start + stop) // 2
+    k = int(np.searchsorted(edges, middle, "right")) - 1
+    inside = (chart.at >= edges[k]) & (chart.at < edges[k + 1])
+    x, of_lot = chart.scale.to(chart.value), own[chart.at]
+    rest, outside = inside & ~of_lot, ~inside & ~of_lot
+    if not np.any(of_lot) or not np.any(outside):
+        return False
+    if not np.any(rest):
+        return True
+    off = abs(np.median(x[of_lot]) - np.median(x[rest]))
+    return bool(off < abs(np.median(x[of_lot]) - np.median(x[outside])) / 2)

@@ -1,4 +1,4 @@
-"""What a line did, in words."""
+"""Sentences on a line: changes, present state, limits."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.spc.capability import FEWEST
-from driftlab.spc.charts import SIGMAS
+from driftlab.spc.charts import MIN_UNITS, SIGMAS
 
 if TYPE_CHECKING:
     from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
@@ -21,22 +20,21 @@ def sentences(line: LineReport) -> list[str]:
     """Return the changes in their order, each that others share once; then the charts, and the limits."""
     if not line.controls:
         return ["Too few units for charts of the line."]
-    found = [_change(line, group) for group in _together(line.controls)]
-    found += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
-    if all(len(chart.at) < FEWEST for chart in line.controls):
-        found = ["Too few units to look for changes of the line."]
-    elif not found:
+    lines = [_change(line, group) for group in _together(line.controls)]
+    lines += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
+    if all(len(chart.at) < MIN_UNITS for chart in line.controls):
+        lines = ["Too few units to look for changes of the line."]
+    elif not lines:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
-        found = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
-    return [*found, *_now(line), *_limits(line)]
+        lines = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
+    return [*lines, *_now(line), *_limits(line)]
 
 
 def place(line: LineReport, k: int) -> str:
     """Return a unit of the line with its date and lot: `0121 (2026-05-06, lot L06)`."""
-    about = [line.dates[k], f"lot {line.lots[k]}" if line.lots[k] else ""]
-    said = ", ".join(filter(None, about))
-    return f"{line.units[k]} ({said})" if said else line.units[k]
+    about = ", ".join(filter(None, [line.dates[k], f"lot {line.lots[k]}" if line.lots[k] else ""]))
+    return f"{line.units[k]} ({about})" if about else line.units[k]
 
 
 def _trend(line: LineReport, chart: ControlChart) -> str:
@@ -47,7 +45,7 @@ def _trend(line: LineReport, chart: ControlChart) -> str:
 
 
 def by_how_much(line: LineReport, chart: ControlChart, change: StepChange | Trend) -> str:
-    """Return what a change is: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
+    """Return the size of a change: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
     way = "rose" if change.after > change.before else "fell"
     unit = line.shown(chart.quantity)
     if chart.quantity == "level" or change.before <= 0:
@@ -58,8 +56,8 @@ def by_how_much(line: LineReport, chart: ControlChart, change: StepChange | Tren
 
 def _together(controls: Iterable[ControlChart]) -> list[list[tuple[ControlChart, StepChange]]]:
     """Return the changes that are no lot's by the place that they may share, the surest of each first."""
-    told = ((c, change) for c in controls for change in c.changes if not change.of_lot)
-    rest = sorted(told, key=lambda one: one[1].p)
+    of_line = ((c, change) for c in controls for change in c.changes if not change.of_lot)
+    rest = sorted(of_line, key=lambda one: one[1].p)
     groups: list[list[tuple[ControlChart, StepChange]]] = []
     while rest:
         first = rest[0][1]
@@ -82,17 +80,17 @@ def _now(line: LineReport) -> list[str]:
     out = [f"{c.axis} {c.quantity}" for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
-    found = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
-    found.append(
+    lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
+    lines.append(
         f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
     )
     if line.too_few:
-        found.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
-    return found
+        lines.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
+    return lines
 
 
 def _usual(line: LineReport) -> float:
-    """Return how many values of a line in control lie beyond three sigma, by limits that stand on so many units."""
+    """Return the expected number of values of a line in control beyond three sigma, by limits of so many units."""
     from scipy.stats import norm, t
 
     return sum(
@@ -102,7 +100,7 @@ def _usual(line: LineReport) -> float:
 
 
 def _limits(line: LineReport) -> list[str]:
-    found = []
+    lines = []
     for name in dict.fromkeys(row.quantity for row in line.capability):
         rows = [row for row in line.capability if row.quantity == name]
         latest = {row.axis: row for row in sorted(rows, key=lambda row: row.since)}
@@ -114,5 +112,5 @@ def _limits(line: LineReport) -> list[str]:
             f"Ppk {worst.ppk:.2f} (95 %: {worst.ppk_low:.2f} to {worst.ppk_high:.2f}), {worst.beyond:,} of {worst.n:,} "
             "units above"
         )
-        found.append(text + ("." if worst.trusted else "; not normal, so the units above say more than the index."))
-    return found
+        lines.append(text + ("." if worst.trusted else "; not normal, so the units above say more than the index."))
+    return lines

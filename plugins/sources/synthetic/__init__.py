@@ -35,10 +35,11 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import SimulatedSource, Site, Source, Twin
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_core.recursions import LaggedLines
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.earth import earth_rate, gravity
-from fusion_plugins.sources.synthetic.chamber import Body, Profile, Reading
+from fusion_plugins.sources.synthetic.chamber import Profile, Reading, body_behind
 from fusion_plugins.sources.synthetic.settings import (
     DIFFERENCE,
     NOT_NEGATIVE,
@@ -104,11 +105,11 @@ class TrueBias:
 
     curves: tuple[BiasCurve, ...]
     hysteresis: SimulatedHysteresis | None
-    body: Body
+    body: LaggedLines
 
     def at(self, t: Array) -> Array:
         """Return the bias (N, d) in rad/s at t (N,) in s."""
-        T = self.body.temperature(t)
+        T = self.body.lagged(t)
         bias = np.stack([curve.bias(T) for curve in self.curves], axis=1)
         if self.hysteresis is None:
             return bias
@@ -120,7 +121,7 @@ class TrueBias:
     def _play(self) -> Array:
         """The play operator (S,) in degC at the beginning of each monotone piece, from the middle of its play."""
         assert self.hysteresis is not None
-        T, half = self.body.temperature(self.body.t), self.hysteresis.width / 2
+        T, half = self.body.lagged(self.body.t), self.hysteresis.width / 2
         play = T.copy()
         for i in range(1, len(T)):
             play[i] = np.clip(play[i - 1], T[i] - half, T[i] + half)
@@ -282,7 +283,7 @@ class Synthetic(SimulatedSource):
 
     def _blocks(self) -> Iterator[Chunk]:
         """Yield the recording in the blocks in which its random numbers are drawn."""
-        body = Body.behind(self.profile, self.lag)
+        body = body_behind(self.profile, self.lag)
         thermal = TrueBias(self.gyro.curve, self.gyro.hysteresis, body)
         omega_ie, g = self._surroundings()
         b_g = self._draw("turn_on", 0, 1, along_axes(self.gyro.turn_on, d))[0]  # (d,), at the end of the block before
@@ -296,7 +297,7 @@ class Synthetic(SimulatedSource):
             truth = thermal.at(t) + walk_g
             gyro = omega_ie + truth + self._white("gyro", block, len(t), self.gyro.noise)
             accel = g + walk_a + self._white("accel", block, len(t), self.accel.noise)
-            T = body.temperature(t) if self.temperature.at == "body" else body.chamber(t)
+            T = body.lagged(t) if self.temperature.at == "body" else body.line(t)
             T = T + self._draw("temperature", block, len(t), np.array([self.temperature.noise]))[:, 0]
             channels = {
                 "gyro": round_to(gyro, along_axes(self.gyro.resolution, d)),

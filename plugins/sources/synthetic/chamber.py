@@ -1,26 +1,20 @@
 """Temperature of a climatic chamber over time, and of a body that follows it.
 
-The chamber's temperature is a chain of straight lines, u(t) = u_i + s_i (t - t_i) on piece i. A body with a lag of
-first order, tau dT/dt = u - T, then has the closed form
-
-::
-
-    T(t) = u(t) - s_i tau + c_i exp(-(t - t_i) / tau),    c_i = T(t_i) - u_i + s_i tau
-
-so it needs neither a step nor a memory. Pieces are cut where T turns: on each one T is monotone, which gives the play
-operator (`thermal_curve`) a closed form too.
+The chamber's temperature is a chain of straight lines, the body's a lag of first order behind it, in closed form
+(`fusion_core.recursions.LaggedLines`). Pieces are cut where T turns: on each one T is monotone, which gives the play
+operator (`fusion_plugins.sources.synthetic.bias`) a closed form too.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array
+from fusion_core.recursions import LaggedLines
 from fusion_core.settings import Settings
 from fusion_core.units import Unit
 from fusion_plugins.sources.synthetic.settings import DIFFERENCE, NOT_NEGATIVE, default, problem
@@ -143,54 +137,15 @@ def _held(levels: Array, hold: float, rate: float) -> tuple[Array, Array]:
     return t[keep], T[keep]
 
 
-@dataclass(frozen=True)
-class Body:
-    """The temperature of a body behind the chamber, in S monotone pieces; the last one lasts for ever.
-
-    Attributes
-    ----------
-    t, u, s, c : (S,) arrays
-        Beginning of each piece in s; the chamber's temperature in degC and its rate in K/s there; what is left of the
-        body's past, in K.
-    tau : float
-        The lag in s.
-    """
-
-    t: Array
-    u: Array
-    s: Array
-    c: Array
-    tau: float
-
-    @classmethod
-    def behind(cls, profile: Profile, tau: float) -> Body:
-        """Return the body that follows the profile with lag tau, in balance at the start."""
-        t, u = profile.knots()
-        slopes = np.append(np.diff(u) / np.diff(t), 0.0)
-        T, pieces = u[0], []
-        for t_i, u_i, s, length in zip(t, u, slopes, np.append(np.diff(t), np.inf), strict=True):
-            c = T - u_i + s * tau
-            pieces.append((t_i, u_i, s, c))
-            turn = tau * np.log(c / (s * tau)) if s * tau * c > 0 else 0.0  # where dT/dt = s - (c/tau) exp(-x/tau) = 0
-            if 0 < turn < length:
-                pieces.append((t_i + turn, u_i + s * turn, s, s * tau))
-            if np.isfinite(length):
-                T = u_i + s * (length - tau) + (c * np.exp(-length / tau) if tau else 0.0)
-        t, u, s_i, c_i = np.array(pieces, dtype=np.float64).T
-        return cls(t, u, s_i, c_i, tau)
-
-    def piece(self, t: Array) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Return the index (N,) of the piece that holds each time t (N,) in s, not before 0."""
-        return np.searchsorted(self.t, t, side="right") - 1
-
-    def chamber(self, t: Array) -> Array:
-        """Return the chamber's temperature (N,) in degC at t (N,) in s."""
-        i = self.piece(t)
-        return np.asarray(self.u[i] + self.s[i] * (t - self.t[i]))
-
-    def temperature(self, t: Array) -> Array:
-        """Return the body's temperature (N,) in degC at t (N,) in s."""
-        i, chamber = self.piece(t), self.chamber(t)
-        if self.tau == 0:
-            return chamber
-        return np.asarray(chamber - self.s[i] * self.tau + self.c[i] * np.exp(-(t - self.t[i]) / self.tau))
+def body_behind(profile: Profile, tau: float) -> LaggedLines:
+    """Return the body that follows the profile with lag tau, in balance at the start; on each piece T is monotone."""
+    lines = LaggedLines.behind(*profile.knots(), tau)
+    pieces = []
+    lengths = np.append(np.diff(lines.t), np.inf)
+    for t_i, u_i, s, c, length in zip(lines.t, lines.u, lines.s, lines.c, lengths, strict=True):
+        pieces.append((t_i, u_i, s, c))
+        turn = tau * np.log(c / (s * tau)) if s * tau * c > 0 else 0.0  # where dT/dt = s - (c/tau) exp(-x/tau) = 0
+        if 0 < turn < length:
+            pieces.append((t_i + turn, u_i + s * turn, s, s * tau))
+    begins, starts, slopes, transients = np.array(pieces, dtype=np.float64).T
+    return LaggedLines(begins, starts, slopes, transients, tau)

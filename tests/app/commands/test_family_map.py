@@ -1,7 +1,6 @@
 """`fit-map --family` and `plan --family`: a map that other commands read, and what is said of it."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import family as example
@@ -37,7 +36,7 @@ def line(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line")
     units = [(soaked(unit), unit.lot) for unit in example.deal(60, seed=11, lots=3)]
     family = fit_family(units)
-    save_family(folder / "family.json", replace(family, bands=measure_bands(units, fit_family)))
+    save_family(folder / "family.json", family.model_copy(update={"bands": measure_bands(units, fit_family)}))
     unit = example.deal(1, seed=12)[0]
     example.write(folder / "short.h5", example.soak(unit, 0.5, part=0.4))
     example.write(folder / "whole.h5", example.soak(unit, 0.5, seed=1))

@@ -16,7 +16,7 @@ from driftlab.commands.inputs import config_of
 from driftlab.errors import ConfigError
 from driftlab.planning.chamber import Chamber, Profile
 from driftlab.planning.request import parse_request
-from driftlab.planning.search import ENOUGH, candidates, judge, ranked
+from driftlab.planning.search import MIN_COVERAGE, candidates, judge, ranked
 from driftlab.planning.unit_model import UnitModel, twin_of
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
@@ -87,7 +87,7 @@ def test_a_target_is_reached_and_not_much_sooner():
     plan = driftlab.plan("unit.yaml", 8, range=(-20.0, 50.0), lag="5 min", sigma="1 deg/h")
     found = plan.found
     assert found.shortest.score <= found.target
-    assert found.shortest.share >= ENOUGH
+    assert found.shortest.share >= MIN_COVERAGE
     less = driftlab.plan("unit.yaml", 0.9 * found.shortest.profile.hours, range=(-20.0, 50.0), lag="5 min").found
     assert less.chosen.score > found.target
 

@@ -10,9 +10,9 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
-from driftlab.family.curve_statistics import CurveStatistics
-from driftlab.family.file import as_json, read_family
+from driftlab.family.file import read_family, save_family
 from driftlab.family.mixed_model import fit_family
+from driftlab.family.outlier_tests import CurveStatistics
 from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_odd_lots, find_outliers, simes
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
@@ -160,8 +160,8 @@ def test_new_units_are_held_against_a_family_that_has_not_seen_them(tmp_path) ->
     family = fit_family(pairs)
     laws = find_outliers(family, pairs, [unit.record(25, ("x",)) for unit in old]).laws
     file = tmp_path / "family.json"
-    file.write_text(as_json(replace(family, laws=laws)))
-    family = read_family(file).family()
+    save_family(file, family.model_copy(update={"laws": laws}))
+    family = read_family(file)
     new = [(unit.soaked(25, ("x",)), "unheard of") for unit in units[100:]]
     records = [unit.record(25, ("x",)) for unit in units[100:]]
     odd = find_outliers(family, new, records, fitted=False).odd
@@ -179,7 +179,9 @@ def test_a_new_unit_is_judged_by_the_part_of_the_range_that_was_soaked() -> None
     old = [unit for unit in units[:100] if not unit.odd]
     pairs = [(unit.soaked(27, ("x",)), unit.lot) for unit in old]
     family = fit_family(pairs)
-    family = replace(family, laws=find_outliers(family, pairs, [unit.record(27, ("x",)) for unit in old]).laws)
+    family = family.model_copy(
+        update={"laws": find_outliers(family, pairs, [unit.record(27, ("x",)) for unit in old]).laws}
+    )
     new = [unit for unit in units[100:] if not unit.odd]
     new[4].curve[:, 0] += 0.5 * SIZE * np.exp(-(((made.GRID - 0) / 4) ** 2))
     short = [(unit.soaked(27, ("x",)).between(-20.0, 14.0), unit.lot) for unit in new]
@@ -280,5 +282,5 @@ def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
     judged = find_outliers(family, [(unit.soaked(24, ("x",)), unit.lot) for unit in units], [])
     assert judged.laws is not None
     reasons = CurveReasons(CurveStatistics(family, fitted=True), judged.laws)
-    (bend,) = reasons.of(*family.said(gap), units[7].lot, (0,))
+    (bend,) = reasons.of(*family.information_of(gap), units[7].lot, (0,))
     assert abs(bend.off) > 2 * bend.spread

@@ -51,7 +51,7 @@ def _unit(seed: int, begin: float = 0.0, share: float = 1.0, hours: float = 1.5,
 @lru_cache(maxsize=1)
 def _family() -> Family:
     units = [(_unit(seed), "") for seed in range(90)]
-    return replace(fit_family(units, bias_unit="rad/s"), bands=measure_bands(units, fit_family))
+    return fit_family(units, bias_unit="rad/s").model_copy(update={"bands": measure_bands(units, fit_family)})
 
 
 @lru_cache(maxsize=2)
@@ -171,7 +171,7 @@ def _hole(soaked: UnitInformation) -> UnitInformation:
 
 
 def _scaled(family: Family, by: float) -> Family:
-    return replace(family, Sigma=family.Sigma * by)
+    return family.model_copy(update={"Sigma": family.Sigma * by})
 
 
 def test_too_few_units_measure_nothing() -> None:

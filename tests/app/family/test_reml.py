@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from driftlab.family.reml import VarianceComponents, reml
+from driftlab.family.reml import EStep, VarianceComponents, change, e_step, m_step
+
+
+def reml(
+    J: np.ndarray, h: np.ndarray, lot: np.ndarray, start: VarianceComponents, *, tolerance: float, most: int = 2000
+) -> tuple[VarianceComponents, EStep]:
+    """Return the law of highest restricted likelihood, every unit's weight 1, and the expectations under it."""
+    w, lots = np.ones(len(J)), int(lot.max()) > 0
+    law = start if lots else replace(start, Lambda=np.zeros_like(start.Sigma))
+    for _ in range(most):
+        later = m_step(e_step(law, J, h, lot, w), w, None, lots=lots)
+        law, moved = later, change(law, later)
+        if moved < tolerance:
+            break
+    return law, e_step(law, J, h, lot, w)
 
 
 def dense(y: np.ndarray, X: list[np.ndarray], noise: float, Sigma: np.ndarray) -> float:

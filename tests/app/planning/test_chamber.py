@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from driftlab.planning.chamber import Chamber, Profile, mixed, ramps, staircase
-from driftlab.planning.search import ENOUGH, candidates
+from driftlab.planning.search import MIN_COVERAGE, candidates
 
 CHAMBER = Chamber(-20.0, 50.0, 25.0, 2 / 60, 600.0)
 
@@ -50,7 +50,7 @@ def test_every_candidate_is_what_the_chamber_can(hours, low, swing, start, rate,
 def test_the_ends_of_ramps_are_held_until_the_body_is_there(cycles):
     profile = ramps(CHAMBER, 8.0, cycles)
     low, high = profile.covered(CHAMBER.lag)
-    assert (high - low) / CHAMBER.swing > ENOUGH
+    assert (high - low) / CHAMBER.swing > MIN_COVERAGE
     assert profile.reversals == 2 * cycles
 
 
@@ -61,7 +61,7 @@ def test_ramps_are_found_where_only_slower_ones_fit():
     assert 2 * chamber.swing / chamber.rate + 3 * chamber.settling(chamber.rate) > 3.0 * 3600
     assert profile.hours == pytest.approx(3.0)
     low, high = profile.covered(chamber.lag)
-    assert (high - low) / chamber.swing > ENOUGH
+    assert (high - low) / chamber.swing > MIN_COVERAGE
 
 
 def test_a_profile_that_does_not_fit_the_hours_is_none():

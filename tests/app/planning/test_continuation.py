@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from driftlab.planning.chamber import Chamber, ramps
-from driftlab.planning.continuation import after, jointly, of_samples
+from driftlab.planning.continuation import continuation_of, jointly, of_samples
 from driftlab.planning.unit_model import UnitModel
 from driftlab.reports import plan_continuation
 from driftlab.units import BiasUnit
@@ -51,10 +51,10 @@ def test_measured_noise_stands_in_place_of_a_guess():
 def test_what_was_not_seen_is_not_known_and_is_recorded_first():
     narrow = replace(CHAMBER, high=20.0, start=10.0)
     before = of_samples(soak([ramps(narrow, 3.0, 2)], 0), DT, SUBJECT, CHAMBER)
-    unseen = before.grid > before.seen[1] + 2
+    unseen = before.temperature > before.seen[1] + 2
     assert np.isnan(before.sigma[unseen]).all()
-    assert np.isfinite(before.sigma[before.grid < before.seen[1]]).all()
-    found = after(before, 3.0, 1.0)  # any sigma would do, were it known
+    assert np.isfinite(before.sigma[before.temperature < before.seen[1]]).all()
+    found = continuation_of(before, 3.0, 1.0)  # any sigma would do, were it known
     assert found.enough == ""
     assert found.chosen.covered[1] > 38
     assert "the rest of the range is not known" in plan_continuation.headline(found)
@@ -62,18 +62,18 @@ def test_what_was_not_seen_is_not_known_and_is_recorded_first():
 
 def test_enough_is_what_reaches_the_target_or_gains_too_little():
     before = of_samples(soak([ramps(CHAMBER, 6.0, 3)], 1), DT, SUBJECT, CHAMBER)
-    assert after(before, 1.0, 1.01 * before.score).enough == "target"
-    assert after(before, 1.0, 0.99 * before.score).enough == ""
+    assert continuation_of(before, 1.0, 1.01 * before.score).enough == "target"
+    assert continuation_of(before, 1.0, 0.99 * before.score).enough == ""
     loud = replace(before, subject=replace(before.subject, noise=before.subject.noise * 1e3))
-    assert after(loud, 1.0, None).enough == "floor"
-    text = plan_continuation.headline(after(before, 1.0, 1.01 * before.score))
+    assert continuation_of(loud, 1.0, None).enough == "floor"
+    text = plan_continuation.headline(continuation_of(before, 1.0, 1.01 * before.score))
     assert text.startswith("enough: ")
     assert "was asked for" in text
 
 
 def test_a_part_of_the_range_is_offered_and_named():
     before = of_samples(soak([ramps(CHAMBER, 3.0, 1)], 2), DT, SUBJECT, CHAMBER)
-    found = after(before, 2.0, None)
+    found = continuation_of(before, 2.0, None)
     names = [item.profile.name for item in found.judged]
     assert any(name.startswith("-10 to 40 °C: ") for name in names)
     assert any(name.startswith("-10 to 6.667 °C: ") for name in names)
@@ -85,7 +85,7 @@ def test_a_part_of_the_range_is_offered_and_named():
 def test_what_the_kind_cannot_follow_is_not_recorded_away():
     ((T, bias),) = soak([ramps(CHAMBER, 6.0, 3)], 3)
     bent = bias + 3e-4 * np.tanh((T - 15) / 2)[:, None]
-    found = after(of_samples([(T, bent)], DT, SUBJECT, CHAMBER), 2.0, 1e-7)
+    found = continuation_of(of_samples([(T, bent)], DT, SUBJECT, CHAMBER), 2.0, 1e-7)
     assert found.enough == ""
     assert "is not reached by recording more" in plan_continuation.headline(found)
     assert any("kind: polynomial cannot follow" in line for line in plan_continuation.lines(found))

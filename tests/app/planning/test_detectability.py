@@ -7,8 +7,8 @@ from driftlab.identification.records import Evidence, Record
 from driftlab.identification.result import search
 from driftlab.identification.state import name_of
 from driftlab.planning.detectability import effects_in, predict_detectability
-from driftlab.planning.information import Information
-from driftlab.planning.simulated_search import UnrecordedUnit, noises, planned, shapes
+from driftlab.planning.simulated_search import Information, noises, planned, shapes
+from driftlab.planning.unit_model import UnitModel
 from driftlab.reports.plan_effects import cells, lines, matrix
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
@@ -27,8 +27,8 @@ def curve(T):
     return np.outer(x + x**2 / 4, np.full(len(AXES), np.deg2rad(60 / 3600)))
 
 
-UNIT = UnrecordedUnit(
-    Polynomial(order=3), "gyro", AXES, BiasUnit("rad/s", "deg/h"), np.full(2, WHITE), np.full(2, WALK), curve, 1.0, 60.0
+UNIT = UnitModel(
+    "gyro", AXES, BiasUnit("rad/s", "deg/h"), Polynomial(order=3), np.full(2, WHITE), np.full(2, WALK), "", curve, ""
 )
 
 
@@ -75,7 +75,7 @@ def made_up(effect, size, seed):
     means = [x.reshape(-1, 4, *x.shape[1:]).mean(axis=1) for x in (t, T, bias)]
     chunk = Chunk(means[0], {"temperature": means[1], "gyro": means[2]}, sensors=frozenset({"gyro"}))
     record = Record("made up", True, True, chunk, np.arange(0, len(chunk), 3))
-    return Evidence((record,), "gyro", AXES, UNIT.shown, 12.0, 60.0), (T, bias)
+    return Evidence((record,), "gyro", AXES, UNIT.unit, 12.0, 60.0), (T, bias)
 
 
 def named(evidence):
@@ -107,7 +107,7 @@ def test_what_only_warms_up_cannot_show_a_loop():
 
 
 def test_less_noise_finds_smaller_effects():
-    quiet = UnrecordedUnit(**{**UNIT.__dict__, "white": UNIT.white / 4, "walk": UNIT.walk / 4})
+    quiet = UnitModel(**{**UNIT.__dict__, "noise": UNIT.noise / 4, "walk": UNIT.walk / 4})
     loud, still = (
         predict_detectability(unit, up_and_down, DURATION, ["hysteresis"]).effects[0] for unit in (UNIT, quiet)
     )

@@ -3,9 +3,8 @@
 import numpy as np
 
 from driftlab.planning.chamber import Chamber, ramps, staircase
-from driftlab.planning.discrimination import SHARE, DiscriminationCriterion, preferred
+from driftlab.planning.discrimination import SIGMA_EXCESS, DiscriminationCriterion, preferred
 from driftlab.planning.search import RatedProfile, SearchResult
-from driftlab.planning.simulated_search import UnrecordedUnit
 from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -27,13 +26,11 @@ def found(*items):
 
 
 def test_ramps_tell_more_of_a_loop_than_one_way_up_and_are_chosen_while_sigma_allows():
-    telling = DiscriminationCriterion(
-        UnrecordedUnit.of(SUBJECT, -10.0, 40.0, None), CHAMBER, 4.0, ["hysteresis", "thermal_lag"]
-    )
+    telling = DiscriminationCriterion(SUBJECT.with_curve(-10.0, 40.0), CHAMBER, 4.0, ["hysteresis", "thermal_lag"])
     assert set(telling.names) == {"hysteresis", "thermal_lag"}
     up, again = staircase(CHAMBER, 4.0, 5.0), ramps(CHAMBER, 4.0, 3)
     assert telling.nats(again) > 2 * telling.nats(up)
-    near = found(judged(up, 1e-6), judged(again, (1 + SHARE) * 0.99e-6))
+    near = found(judged(up, 1e-6), judged(again, (1 + SIGMA_EXCESS) * 0.99e-6))
     assert preferred(near, telling).chosen.profile is again
-    far = found(judged(up, 1e-6), judged(again, (1 + SHARE) * 1.01e-6))
+    far = found(judged(up, 1e-6), judged(again, (1 + SIGMA_EXCESS) * 1.01e-6))
     assert preferred(far, telling).chosen.profile is up

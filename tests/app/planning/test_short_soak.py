@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +11,8 @@ from driftlab.family.basis import SplineBasis
 from driftlab.family.mixed_model import Family
 from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.planning.chamber import Chamber
-from driftlab.planning.short_soak import ShortSoak, expected, shortened
+from driftlab.planning.search import RatedProfile
+from driftlab.planning.short_soak import expected, shortened
 
 LOW, HIGH = -10.0, 40.0
 CHAMBER = Chamber(LOW, HIGH, 15.0, 5 / 60, 120.0)
@@ -27,15 +27,18 @@ def _family() -> Family:
     shapes = np.stack([40 * np.ones_like(u), 30 * u, 20 * np.sin(3 * u)])
     Sigma = (shapes.T @ shapes + 1e-4 * np.eye(knots.q))[None]
     zero = np.zeros_like(Sigma)
-    return Family(knots, ("x",), "gyro", "rad/s", 50 * u[None] ** 2, zero, Sigma, zero, {}, 200, 200)
+    return Family(
+        channel="gyro", bias_unit="rad/s", axes=("x",), first=knots.first, intervals=knots.intervals, step=knots.step,
+        units=200, sampled=200, mu=50 * u[None] ** 2, mu_covariance=zero, Sigma=Sigma, Lambda=zero, lots={},
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def plan() -> ShortSoak:
+def plan() -> RatedProfile:
     return shortened(_family(), CHAMBER, 2.0, NOISE, WALK, 8.0).chosen
 
 
-def test_units_that_are_soaked_so_get_the_sigma_that_is_foretold(plan: ShortSoak) -> None:
+def test_units_that_are_soaked_so_get_the_sigma_that_is_foretold(plan: RatedProfile) -> None:
     family, profile = _family(), plan.profile
     t, T = profile.samples(CHAMBER.lag, int(profile.duration / 10))
     B, G = family.knots.values(T), family.knots.values(plan.temperature)
@@ -84,7 +87,7 @@ def test_a_part_says_no_more_than_the_whole_where_the_bias_does_not_walk() -> No
 
 
 def test_a_family_whose_units_are_alike_needs_no_soak() -> None:
-    family = replace(_family(), Sigma=1e-6 * _family().Sigma)
+    family = _family().model_copy(update={"Sigma": 1e-6 * _family().Sigma})
     short = shortened(family, CHAMBER, 1.0, NOISE, WALK, None).chosen
     again = expected(family, CHAMBER, short.share, short.place, short.profile, NOISE, WALK)
     assert again.score == short.score < 0.1

@@ -71,16 +71,13 @@ def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
 
 
 def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
-    law = EffectDistribution(np.full((3, 1), 2.0), np.full((3, 1), 0.01), np.full((3, 1), 0.1))
+    law = EffectDistribution(mean=np.full((3, 1), 2.0), sigma=np.full((3, 1), 0.01), spread=np.full((3, 1), 0.1))
     effect = effect_of("hysteresis", width=1.0)
-    common = SharedEffects(
-        "explained",
-        (SharedEffect(effect, "rad/s/K", law, None, (), 1.0, 9, 9, 9, 5, 1.0, None, ()),),
-        (),
-        1,
-        COUNT,
-        COUNT,
-    )
+    shared = SharedEffect(
+        law=law, effect=effect, unit="rad/s/K", evidence=9, of_mean=9, of_size=9, price=5, left_out=1.0,
+        in_other_lots=None, indistinguishable_from=(),
+    )  # fmt: skip
+    common = SharedEffects("explained", (shared,), (), 1, COUNT, COUNT)
     expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept]
     with UnitSpool(kept, common, serial, whole=(2, 5)) as units:
         assert len(units) == COUNT

@@ -5,9 +5,19 @@ import pytest
 from lines import AXES, DEG_H, SPREAD, TYPICAL, line, record
 
 from driftlab.config import Limits
-from driftlab.spc.capability import indices, share_beyond
 from driftlab.spc.change_points import SHORTEST, probability, scores, shares, steps, strongest
-from driftlab.spc.charts import LAMBDA, SIGMAS, InControl, L, ewma, ewma_limit, in_control, scale_of
+from driftlab.spc.charts import (
+    LAMBDA,
+    SIGMAS,
+    InControl,
+    L,
+    ewma,
+    ewma_limit,
+    in_control,
+    indices,
+    scale_of,
+    share_beyond,
+)
 from driftlab.spc.line import line_of
 
 LIMITS = Limits.model_validate({"noise": "2.5 deg/h/sqrt(Hz)", "residual": "1 deg/h", "bias_instability": "1 deg/h"})

@@ -5,8 +5,7 @@ import pytest
 from lines import line
 
 from driftlab.family.outliers import LotOutlier
-from driftlab.spc.line import line_of
-from driftlab.spc.reconcile import reconcile
+from driftlab.spc.line import line_of, reconcile
 
 
 def said(records, *lots):
