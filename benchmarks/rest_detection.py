@@ -23,7 +23,7 @@ from driftlab.config import Config
 from driftlab.soak.rest import at_rest
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
-from fusion_core.rate_estimators import with_rate
+from fusion_core.thermal.rate_estimators import with_rate
 
 DEG_H = np.deg2rad(1 / 3600)
 G = 9.80206

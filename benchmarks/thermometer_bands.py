@@ -26,7 +26,7 @@ def temperatures(case: Coarse, rng: np.random.Generator, profile: str):
     """Return epochs of readings as the filter gets them, the error of what maps see of them, and the truth (N,)."""
     from driftlab.filtering.thermometer import ThermometerError
     from fusion_core.chunk import Chunk
-    from fusion_core.rate_estimators import Regression, with_rate
+    from fusion_core.thermal.rate_estimators import Regression, with_rate
     from fusion_core.thermal.thermometer import NO_STEPS, Steps, readings, sawtooth, started
 
     rate, hours = (100.0, 0.5) if case.interval < 0.1 else (10.0, 2.0)

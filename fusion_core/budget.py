@@ -1,4 +1,4 @@
-"""The budget of a reader: what a file that a stranger made may cost, over what its rows cost.
+"""The budget of a reader: the limits of size and time for a file of unknown origin, beside the cost of its rows.
 
 A header, a chunk or an archive can declare any size, and a few bytes can inflate to any number. So every reader asks
 here before it makes room for a piece that has to be held whole, inflates no further than the budget, and gives up on
@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Protocol, Self
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -27,13 +27,16 @@ from numpy.typing import NDArray
 
 from fusion_core.errors import UnreadableFile, Unwritable
 
+if TYPE_CHECKING:
+    from _typeshed import SupportsRead
+
 PIECE = 512_000_000  # bytes of a piece (row group, variable, index) that is held whole
 LISTED = 128_000_000  # bytes of a piece whose messages are listed one by one
 TEXTS = 64_000_000  # bytes of all definitions (schemas, formats, parameters)
 COUNT = 1_000_000  # pieces of one sort (chunks, parameters, subscriptions) that are listed
 TOTAL = 1_500_000_000  # bytes of memory in all, over what the rows cost
-KEPT = 16_000_000_000  # bytes of a temporary file,
-RATIO, LEAST = 100, 1_000_000_000  # and of an archive so many times its own, or at least so many
+MAX_TEMPORARY = 16_000_000_000  # bytes of a temporary file,
+RATIO, MIN_UNPACKED = 100, 1_000_000_000  # and of an archive so many times its own, or at least so many
 SECONDS = 30.0  # of the processor, for what yields no rows: with all else it stays below a minute
 PACE = 1e8  # bytes a second: what a file takes on the disk may be passed over at that
 COPIED = 1 << 20  # bytes at a time
@@ -47,29 +50,8 @@ NAME = 64  # characters of a channel, a kind, a unit
 TEXT = 100_000  # characters of another text in the record of a map
 
 
-class Readable(Protocol):
-    """A stream of bytes."""
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Return at most `size` bytes, none at the end."""
-
-
-class Writable(Protocol):
-    """A file that is written."""
-
-    def write(self, data: bytes, /) -> object:
-        """Write."""
-
-    def flush(self) -> object:
-        """Hand over what was written."""
-
-
 class Decompressor(Protocol):
-    """What inflates, as those of bz2, lz4 and zstd do."""
-
-    @property
-    def eof(self) -> bool:
-        """Whether the stream is at its end."""
+    """An engine that inflates, as those of bz2, lz4 and zstd do."""
 
     def decompress(self, data: bytes, max_length: int = -1) -> bytes:
         """Return at most `max_length` bytes."""
@@ -144,7 +126,7 @@ def _check_array(file: IO[bytes], what: str, size: int) -> None:
 
 
 def rows_at_once(path: Path, what: str, size: int, row: float) -> int:
-    """Return how many rows of `row` bytes each are read at once: `size`, or what the budget allows.
+    """Return the number of rows of `row` bytes each that are read at once: `size`, or as many as the budget allows.
 
     Raises UnreadableFile where it does not allow a single one.
     """
@@ -172,14 +154,14 @@ def check_size(path: Path, what: str, size: float, most: float = PIECE) -> None:
 
 
 def inflated(path: Path, what: str, engine: Decompressor, data: bytes, most: int = PIECE) -> bytes:
-    """Return what compressed bytes hold, as far as they are whole; raises UnreadableFile beyond the budget."""
-    found = engine.decompress(data, max_length=most + 1)
-    if len(found) > most:
+    """Return the content of compressed bytes, as far as they are whole; raises UnreadableFile beyond the budget."""
+    content = engine.decompress(data, max_length=most + 1)
+    if len(content) > most:
         raise UnreadableFile(
             f"{path}: {what} of {size_of(len(data))} inflates to more than {size_of(most)}, which is the limit; write "
             "it in smaller pieces"
         )
-    return found
+    return content
 
 
 def check_count(path: Path, what: str, count: int, most: int = COUNT) -> None:
@@ -199,10 +181,10 @@ def on_disk(path: Path) -> int:
 
 def unpacked_at_most(path: Path) -> int:
     """Return the bytes that a temporary file with what an archive holds may have."""
-    return min(KEPT, max(LEAST, RATIO * on_disk(path)))
+    return min(MAX_TEMPORARY, max(MIN_UNPACKED, RATIO * on_disk(path)))
 
 
-def keep(path: Path, stream: Readable, to: Writable, most: int = KEPT) -> None:
+def keep(path: Path, stream: SupportsRead[bytes], to: IO[bytes], most: int = MAX_TEMPORARY) -> None:
     """Copy what a stream gives into a temporary file.
 
     Raises

@@ -1,9 +1,9 @@
-"""What comes from outside, looked at once for a stretch of samples: shapes, kinds of numbers, covariances.
+"""Checks of the arrays of a stretch of samples, made once: shapes, kinds of numbers, covariances.
 
 Behind this file arrays are float64, contiguous, and of the shapes that the core's conventions name: N samples, n
 states, m components.
 
-Shapes of arrays whose leading axis, time, may be left out.
+`check_shape` and `common_lead` are for arrays whose leading axis, time, may be left out.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def checked_measurement(measurement: Measurement, n: int) -> Measurement:
 
 
 def checked_reset(reset: Flags | None, n: int) -> Flags:
-    """Return which states start again, (n,)."""
+    """Return the flags (n,) of states that start again."""
     return np.zeros(n, dtype=np.bool_) if reset is None else flags("reset", reset, (n,), f"for n = {n} states")
 
 
@@ -169,17 +169,17 @@ def common_lead(who: str, arrays: Mapping[str, Array], ndim: int) -> tuple[int, 
     """Return the leading (N,) of the arrays, or () where none has one; raises ValueError where they differ."""
     leads = {name: array.shape[0] for name, array in arrays.items() if array.ndim > ndim}
     if len(set(leads.values())) > 1:
-        found = ", ".join(f"{name} {N}" for name, N in leads.items())
-        raise ValueError(f"{who}: steps differ in number ({found}); give each N of them, or one without leading N")
+        counts = ", ".join(f"{name} {N}" for name, N in leads.items())
+        raise ValueError(f"{who}: steps differ in number ({counts}); give each N of them, or one without leading N")
     return tuple(leads.values())[:1]
 
 
 def check_shape(who: str, what: str, array: Array, shape: tuple[int, ...], *, lead: bool = False) -> None:
     """Raise ValueError where an array is not of that shape; with `lead`, (N, *shape) will do too."""
-    found = np.shape(array)
-    if found == shape or (lead and found[1:] == shape and len(found) == len(shape) + 1):
+    have = np.shape(array)
+    if have == shape or (lead and have[1:] == shape and len(have) == len(shape) + 1):
         return
     last = ", ".join(map(str, shape))
     alone = f"({last},)" if len(shape) == 1 else f"({last})"
     expected = f"{alone} or (N, {last})".replace("(N, )", "(N,)") if lead else alone
-    raise ValueError(f"{who}: {what} has the shape {found}, {expected} was expected; time comes first, then states")
+    raise ValueError(f"{who}: {what} has the shape {have}, {expected} was expected; time comes first, then states")

@@ -6,29 +6,17 @@ recording was cut.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.errors import MissingChannel
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
 Array = NDArray[np.float64]
-
-READINGS = ("temperature_step", "temperature_variance")
-"""Channels of what a thermometer's samples showed up to an epoch: its steps in K, and their variance in K^2."""
-
-CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
-"""Channels that a temperature gets with its smoothing: its rate, what was measured, the window in s."""
-
-DERIVED = frozenset({"dt", "tau", "residual", *CONDITIONED, *READINGS})
-"""Channels that the program makes from others: a recording has none of these names."""
 
 
 @dataclass(frozen=True)
@@ -97,15 +85,16 @@ class Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
         if start <= 0 and stop >= len(self):
             return self
-        return self._slice(start, stop, self._slice(start - 1, start) if start else self.previous)
+        before = self._rows(slice(start - 1, start), None) if start else self.previous
+        return self._rows(slice(start, stop), before)
 
     def last(self) -> Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
-        return self._slice(len(self) - 1, len(self))
+        return self._rows(slice(len(self) - 1, len(self)), None)
 
-    def _slice(self, start: int, stop: int, previous: Chunk | None = None) -> Chunk:
-        channels = {name: values[start:stop] for name, values in self.channels.items()}
-        return Chunk(self.t[start:stop], channels, previous, self.sensors)
+    def _rows(self, rows: slice | NDArray[np.bool_], previous: Chunk | None) -> Chunk:
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        return Chunk(self.t[rows], channels, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
@@ -113,8 +102,7 @@ class Chunk:
 
     def where(self, keep: NDArray[np.bool_]) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
-        channels = {name: values[keep] for name, values in self.channels.items()}
-        return Chunk(self.t[keep], channels, self.previous, self.sensors)
+        return self._rows(keep, self.previous)
 
 
 def read_only(values: Array) -> Array:
@@ -160,13 +148,3 @@ def concatenate(chunks: Iterable[Chunk]) -> Chunk:
         parts[0].previous,
         parts[0].sensors,
     )
-
-
-def auxiliary(chunks: Iterable[Chunk]) -> list[str]:
-    """Return the channels that all chunks have and that are neither a sensor's nor made by the program."""
-    parts = list(chunks)
-    return [
-        name
-        for name in (parts[0].channels if parts else ())
-        if name not in DERIVED and all(name in part.channels and name not in part.sensors for part in parts)
-    ]

@@ -1,4 +1,4 @@
-"""Is the filter as good as it says: tests on its innovations.
+"""Tests of the filter on its innovations: size (NIS) and whiteness.
 
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), sec. 5.4.
 """
@@ -86,9 +86,9 @@ class Whiteness:
         self._total += np.sum(white, axis=0)
         self._first = np.concatenate([self._first, white[: self.lags - len(self._first)]])
         rows = np.concatenate([self._last, white])
-        kept = max(0, len(rows) - self.lags)
-        _lagged(rows, kept, self._products)
-        self._last = rows[kept:]
+        count = max(0, len(rows) - self.lags)
+        _lagged(rows, count, self._products)
+        self._last = rows[count:]
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""

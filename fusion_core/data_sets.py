@@ -31,6 +31,7 @@ STEP = 1 << 17  # bytes of a stream inflated at once, and
 PIECE_OF_IT = 1 << 22  # bytes that they may give at once
 DEFLATE, SHUFFLE, FLETCHER, SZIP, NBIT, SCALE, LZF = 1, 2, 3, 4, 5, 6, 32000
 RATIO = {DEFLATE: 1032, SHUFFLE: 1, FLETCHER: 1, SZIP: 1, NBIT: 1, SCALE: 1, LZF: 128}  # that a byte grows to, at most
+TOO_MANY = f"has more than {NAMES:,} groups and data sets, which is the limit; write it anew"
 COUNT = {NBIT: 2, SCALE: 2}  # where a filter's parameters say how many values it writes
 
 
@@ -38,16 +39,16 @@ def names_of(path: Path, file: h5py.Group) -> list[bytes]:
     """Return the path of every data set, each once; raises UnreadableFile where there is no end of them."""
     import h5py
 
-    clock, seen, found = TimeBudget(path, "listing its data sets", LISTING), set(), []
+    clock, visited, data_sets = TimeBudget(path, "listing its data sets", LISTING), set(), []
     waiting = [(b"", 0)]
     while waiting:
         here, depth = waiting.pop()
         info = h5py.h5o.get_info(file.id, here or b".")
-        if (info.fileno, info.addr) in seen:
+        if (info.fileno, info.addr) in visited:
             continue
-        seen.add((info.fileno, info.addr))
+        visited.add((info.fileno, info.addr))
         if info.type == h5py.h5o.TYPE_DATASET:
-            found.append(here)
+            data_sets.append(here)
         elif info.type == h5py.h5o.TYPE_GROUP:
             if depth > DEEPEST:
                 raise UnreadableFile(
@@ -55,10 +56,10 @@ def names_of(path: Path, file: h5py.Group) -> list[bytes]:
                 )
             inside = links_of(path, file[here] if here else file)
             waiting += [(here + b"/" + name if here else name, depth + 1) for name in reversed(inside)]
-        if len(seen) + len(waiting) > NAMES:
-            raise UnreadableFile(f"{path}: {_too_many(NAMES)}")
+        if len(visited) + len(waiting) > NAMES:
+            raise UnreadableFile(f"{path}: {TOO_MANY}")
         clock.check()
-    return found
+    return data_sets
 
 
 def links_of(path: Path, group: h5py.Group) -> list[bytes]:
@@ -73,7 +74,7 @@ def links_of(path: Path, group: h5py.Group) -> list[bytes]:
 
     group.id.links.iterate(add)
     if len(names) > NAMES:
-        raise UnreadableFile(f"{path}: {_too_many(NAMES)}")
+        raise UnreadableFile(f"{path}: {TOO_MANY}")
     return [name for name in names if group.id.links.get_info(name).type == h5py.h5l.TYPE_HARD]
 
 
@@ -136,20 +137,20 @@ class DataSetRows:
         start, stop = rows.start, min(rows.stop, self.node.shape[self.axis])
         if not self.held or start >= stop:
             return np.asarray(self.node[self._at(start, stop)])
-        begin, kept = self._kept or (0, None)
-        if kept is None or not begin <= start <= begin + kept.shape[self.axis]:
-            begin, kept = start // self.step * self.step, None
-        end = begin if kept is None else begin + kept.shape[self.axis]
+        begin, decoded = self._kept or (0, None)
+        if decoded is None or not begin <= start <= begin + decoded.shape[self.axis]:
+            begin, decoded = start // self.step * self.step, None
+        end = begin if decoded is None else begin + decoded.shape[self.axis]
         if end < stop:
             last = min(-(-stop // self.step) * self.step, self.node.shape[self.axis])
-            parts = [] if kept is None or end == start else [self._cut(kept, start - begin, end - begin)]
+            parts = [] if decoded is None or end == start else [self._cut(decoded, start - begin, end - begin)]
             begin = start if parts else end
-            self._kept = kept = None  # whose memory is needed
+            self._kept = decoded = None  # whose memory is needed
             parts += self._decoded(end, last)
-            kept = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=self.axis)
-            self._kept = begin, kept
-        assert kept is not None, "it was kept, or decoded"
-        return self._cut(kept, start - begin, stop - begin)
+            decoded = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=self.axis)
+            self._kept = begin, decoded
+        assert decoded is not None, "it was kept, or decoded"
+        return self._cut(decoded, start - begin, stop - begin)
 
     def _at(self, start: int, stop: int) -> tuple[slice, ...]:
         return (slice(None),) * self.axis + (slice(start, stop),)
@@ -223,13 +224,13 @@ class DataSetRows:
         first = tuple(start if k == self.axis else 0 for k in range(len(shape)))
         if tuple(shape) == self.node.chunks and (whole := self._chunk(first)) is not None:
             return [whole]
-        found = np.full(shape, self.node.fillvalue, self.node.dtype)
+        values = np.full(shape, self.node.fillvalue, self.node.dtype)
         for into, place in self._places(start, stop):
             chunk = self._chunk(place)
             if chunk is not None:
-                part = found[into]
+                part = values[into]
                 part[...] = chunk[tuple(slice(0, n) for n in part.shape)]
-        return [found]
+        return [values]
 
     def _places(self, start: int, stop: int) -> Iterator[tuple[tuple[slice, ...], tuple[int, ...]]]:
         """Yield where each chunk of some rows goes in them, and where it is in the data set."""
@@ -291,17 +292,13 @@ def check_rows(path: Path, columns: list[DataSetRows]) -> None:
             f"{path}: data set '{first.name}' declares {declared:.4g} rows, {written} of them were ever written, at "
             f"most {UNWRITTEN:,} more than twice as many are read; record it again, or cut it to what was measured"
         )
-    kept = [column.held for column in columns]
-    check_size(path, "a chunk of each data set that is named", sum(kept) + 2 * max(kept), TOTAL)
-
-
-def _too_many(most: int) -> str:
-    return f"has more than {most:,} groups and data sets, which is the limit; write it anew"
+    held = [column.held for column in columns]
+    check_size(path, "a chunk of each data set that is named", sum(held) + 2 * max(held), TOTAL)
 
 
 def _inflated(data: bytes, most: int) -> memoryview:
-    """Return what a zlib stream holds; raises OSError where that is more than `most` bytes, or it is damaged."""
-    engine, found, at = zlib.decompressobj(), np.empty(most, np.uint8), 0
+    """Return the content of a zlib stream; raises OSError where that is more than `most` bytes, or it is damaged."""
+    engine, content, at = zlib.decompressobj(), np.empty(most, np.uint8), 0
     try:
         for begin in range(0, len(data), STEP):
             rest: bytes = data[begin : begin + STEP]
@@ -309,13 +306,13 @@ def _inflated(data: bytes, most: int) -> memoryview:
                 piece = engine.decompress(rest, PIECE_OF_IT)
                 if at + len(piece) > most:
                     raise OSError(f"a chunk inflates to more than the {most} bytes that it declares")
-                found[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+                content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
                 at, rest = at + len(piece), engine.unconsumed_tail
     except zlib.error as error:
         raise OSError(str(error)) from None
     if not engine.eof:
         raise OSError("a compressed chunk is cut short")
-    return memoryview(found[:at])  # type: ignore[arg-type]
+    return memoryview(content[:at])  # type: ignore[arg-type]
 
 
 def _checked(data: bytes | memoryview) -> memoryview:
@@ -327,7 +324,7 @@ def _checked(data: bytes | memoryview) -> memoryview:
         part = words[begin : begin + (1 << 16)].astype(np.uint64)
         b = int(b + len(part) * a + np.dot(np.arange(len(part), 0, -1, dtype=np.uint64), part)) % 65535
         a = int(a + part.sum()) % 65535
-    found = (b % 65535, a % 65535)
-    if found != tuple(int.from_bytes(written[k : k + 2], "little") % 65535 for k in (2, 0)):
+    sums = (b % 65535, a % 65535)
+    if sums != tuple(int.from_bytes(written[k : k + 2], "little") % 65535 for k in (2, 0)):
         raise OSError("a chunk's checksum does not fit it")
     return content

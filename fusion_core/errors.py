@@ -1,11 +1,10 @@
-"""When something was, as messages say it: seconds from the recording's first row, as in `PATH::START:STOP`.
-
-The file's own time stands beside it where it counts from elsewhere: `812.0 s (t = 1760000812.0 s in the file)`.
-
-The errors that a user can cause, each named for what is wrong.
+"""The errors that a user can cause, each named for what is wrong, and moments as their messages say them.
 
 A message says who has a problem, what it has and what was expected; after a semicolon, what to do.
 Anything else that is raised is a defect of the program, and keeps its traceback.
+
+A moment is in seconds from the recording's first row, as in `PATH::START:STOP`. The file's own time stands beside it
+where it counts from elsewhere: `812.0 s (t = 1760000812.0 s in the file)`.
 """
 
 from __future__ import annotations

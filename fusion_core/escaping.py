@@ -96,7 +96,7 @@ def json_text(content: Any, indent: int | None = None, *, allow_nan: bool = True
 
 def json_of(text: str) -> str:
     """Return JSON text in ASCII, with the codes of all else."""
-    return re.sub(r"[^\n -~]", lambda found: json.dumps(found[0])[1:-1].replace("\x7f", "\\u007f"), text)
+    return re.sub(r"[^\n -~]", lambda match: json.dumps(match[0])[1:-1].replace("\x7f", "\\u007f"), text)
 
 
 def script_json(content: Any) -> str:

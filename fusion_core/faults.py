@@ -6,18 +6,14 @@ since then no order of the rows is known to be right.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import EmptyRecording, TimeBackwards, moment
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from fusion_core.chunk import Array, Chunk
 
 LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
 RANGES = {"temperature": (-273.15, 5000.0, "degC")}  # of what can be; a logger writes -999 where it has nothing
@@ -27,7 +23,7 @@ NO_FRAME = "bytes that came for a second or more without a frame, check baudrate
 
 @dataclass
 class Fault:
-    """How often one thing was wrong, and where it was seen first; 0 times what is only a note."""
+    """A count of one fault, and the place of its first case; 0 for a note."""
 
     count: int
     first: str
@@ -39,7 +35,7 @@ class Fault:
 
 @dataclass
 class Faults:
-    """What was wrong with a recording that was used all the same.
+    """The faults of a recording that was used all the same.
 
     Attributes
     ----------
@@ -70,7 +66,7 @@ class Faults:
         self.found.setdefault(text, Fault(0, ""))
 
     def when(self, t: float) -> str:
-        """Return when t, in the recording's own seconds, was: `812.0 s (t = 1760000812.0 s in the file)`."""
+        """Return the moment t, in the recording's own seconds, as text: `812.0 s (t = 1760000812.0 s in the file)`."""
         return moment(t, self.first_row)
 
     def since(self, t: float) -> float:
@@ -79,8 +75,8 @@ class Faults:
 
     def lines(self, *, notes: bool = True) -> list[str]:
         """Return one sentence for each kind of fault, and each note, where those are wanted too."""
-        found = list(self.found.items())  # at once: of a live run, another thread may ask
-        return [fault.line(what) for what, fault in found if fault.count or notes]
+        faults = list(self.found.items())  # at once: of a live run, another thread may ask
+        return [fault.line(what) for what, fault in faults if fault.count or notes]
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:
@@ -105,11 +101,11 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         finite = chunk.t[np.abs(chunk.t) <= LARGEST]  # neither NaN
         if faults.first_row is None and len(finite):
             faults.first_row = float(finite[0]) - start
-        kept = _forward(_finite(chunk, faults), previous, faults, name)
-        if len(kept) == 0:
+        rows = _forward(_finite(chunk, faults), previous, faults, name)
+        if len(rows) == 0:
             continue
-        yield type(kept)(kept.t, kept.channels, previous)
-        previous = kept.last()
+        yield type(rows)(rows.t, rows.channels, previous)
+        previous = rows.last()
     if previous is None:
         wrong = faults.lines(notes=False)
         why = f" ({'; '.join(wrong)})" if wrong else ""
@@ -136,9 +132,9 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         if np.any(bad):
             faults.add(f"{what}, left out", int(np.sum(bad)), f"at {faults.when(chunk.t[np.argmax(bad)])}")
             keep = keep & good
-    kept = chunk if np.all(keep) else chunk.where(keep)
-    channels = {name: values for name, values in kept.channels.items() if name != "valid"}
-    return type(chunk)(kept.t, channels, chunk.previous)
+    rows = chunk if np.all(keep) else chunk.where(keep)
+    channels = {name: values for name, values in rows.channels.items() if name != "valid"}
+    return type(chunk)(rows.t, channels, chunk.previous)
 
 
 def _all_usable(values: Array, low: float, high: float) -> bool:

@@ -1,17 +1,14 @@
-"""What the filter works on: state, measurement and estimates, as arrays."""
+"""State, transition, measurement and estimates of the filter, as arrays."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 Flags = NDArray[np.bool_]
 
@@ -93,7 +90,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Estimates:
-    """What the filter gives back for N samples.
+    """The results of the filter for N samples.
 
     Attributes
     ----------
@@ -141,10 +138,7 @@ def join(parts: Iterable[Estimates]) -> Estimates:
     if len(parts) == 1:
         return parts[0]
 
-    def stack(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    names = ("x", "sigma", "y", "white", "nis", "log_det")
-    used, dof = (np.concatenate([getattr(part, name) for part in parts]) for name in ("used", "dof"))
-    P = None if parts[0].P is None else stack("P")
-    return Estimates(**{name: stack(name) for name in names}, used=used, dof=dof, state=parts[-1].state, P=P)
+    names = [field.name for field in fields(Estimates) if field.name not in ("state", "P")]
+    names += [] if parts[0].P is None else ["P"]
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Estimates(**arrays, state=parts[-1].state)

@@ -79,7 +79,7 @@ def lag_fading(dt: Array, N: int, tau: float, begun: bool) -> Array:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
     """Return values (N,), their rates (N,) and the memory of a straight line whose weights fade by tau s."""
-    # weighted sums with time counted from the current sample and temperature from the first one
+    # weighted sums with time counted from the current sample and T from the first one
     T_0, w, wt, wtt, wT, wtT, pull = memory
     smooth, rate = np.empty(len(T)), np.empty(len(T))
     usual, keep = -1.0, 0.0  # what was worked out last

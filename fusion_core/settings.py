@@ -1,4 +1,4 @@
-"""What every part of a configuration is: a frozen pydantic model that refuses what it does not know."""
+"""The base of every part of a configuration: a frozen pydantic model that refuses keys it does not know."""
 
 from __future__ import annotations
 
@@ -46,10 +46,23 @@ def can_be_path(text: str) -> bool:
     return "\0" not in text and len(text) < 4096 and all(len(part.encode()) < 256 for part in text.split("/"))
 
 
-class Settings(BaseModel):
-    """Base of every part of a config: frozen; a key that it does not know is an error, and so are NaN and infinity."""
+class Frozen(BaseModel):
+    """Base of what is never changed, and holds nothing that it does not declare."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other fields; what was worked out from the old ones (cached properties) is left behind."""
+        copy = super().model_copy(update=update, deep=deep)
+        for name in copy.__dict__.keys() - type(copy).model_fields.keys():
+            del copy.__dict__[name]
+        return copy
+
+
+class Settings(Frozen):
+    """Base of every part of a config: a key that it does not know is an error, and so are NaN and infinity."""
+
+    model_config = ConfigDict(defer_build=True, allow_inf_nan=False)
     written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
 
     @classmethod
@@ -65,13 +78,6 @@ class Settings(BaseModel):
                 properties[name]["description"] = text
         return written
 
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with other fields; what was worked out from the old ones (cached properties) is left behind."""
-        copy = super().model_copy(update=update, deep=deep)
-        for name in copy.__dict__.keys() - type(copy).model_fields.keys():
-            del copy.__dict__[name]
-        return copy
-
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, data: Any) -> Any:
@@ -86,12 +92,12 @@ class Settings(BaseModel):
 
 def _descriptions(cls: type[BaseModel]) -> dict[str, str]:
     """Return the string below each field of a class, its own before those of its bases, where the source is there."""
-    found = {}
+    texts = {}
     for base in reversed(cls.__mro__):
         if base is BaseModel or not issubclass(base, BaseModel):
             continue
         if "kind" in inspect.get_annotations(base):
-            found["kind"] = (base.__doc__ or base.__name__).partition("\n")[0]
+            texts["kind"] = (base.__doc__ or base.__name__).partition("\n")[0]
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
         except (OSError, TypeError, SyntaxError):
@@ -99,11 +105,11 @@ def _descriptions(cls: type[BaseModel]) -> dict[str, str]:
         for field, below in pairwise(getattr(body, "body", ())):
             text = below.value.value if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) else None
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, str):
-                found[field.target.id] = inspect.cleandoc(text)
-    return found
+                texts[field.target.id] = inspect.cleandoc(text)
+    return texts
 
 
 def nearest(word: str, known: Any) -> str | None:
     """Return the known word most like `word`, or None."""
-    found = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.5)
-    return found[0] if found else None
+    matches = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.5)
+    return matches[0] if matches else None

@@ -107,12 +107,12 @@ class Smoother:
         data = Data(z, measurement.used, np.full(z.shape[1] + 1, np.inf), self.reset)
         job = Job(begin, model, groups, data, keep_P=True, keep_K=True)
         job.recursive(0, len(z))
-        places, found, states = job.places, job.found, groups.states
+        places, run, states = job.places, job.results, groups.states
         lam, Lam = np.append(self.lam, 0.0)[states], groups.blocks(self.Lam, states, states)
         backward(
             places.s, Passed(
-                places.states, places.rows, self.reset, found.used, model.F, model.H, found.x, found.white, found.P,
-                found.K, found.root,
+                places.states, places.rows, self.reset, run.used, model.F, model.H, run.x, run.white, run.P,
+                run.K, run.root,
             ), lam, Lam, out,
         )  # fmt: skip
         wide = np.empty(groups.n + 1)
@@ -121,7 +121,7 @@ class Smoother:
 
 
 class Passed(NamedTuple):
-    """What the filter left behind of N samples, G groups of s states and c components; K is N, or 1 for F and H."""
+    """The filter's results of N samples, G groups of s states and c components; K is N, or 1 for F and H."""
 
     states: Index  # (G, s) places of the states, n where filled up
     rows: Index  # (G, c)
@@ -137,7 +137,7 @@ class Passed(NamedTuple):
 
 
 class SmoothedArrays(NamedTuple):
-    """What is written down for each sample."""
+    """The results of each sample."""
 
     x: Array  # (N, n)
     sigma: Array  # (N, n)

@@ -1,4 +1,4 @@
-"""How large a mean square may be that a bias makes by wandering, by what one recording of it says.
+"""Bounds of the mean square that the wandering of a bias makes, from one recording of it.
 
 Rows r (K,) are what is left of a bias after a linear answer H to it was taken off, P = I - H: a map, or a level. With W
 the covariance of what the bias wanders by and white noise of variance w an average, of which a row has n::
@@ -49,14 +49,16 @@ class BiasWalk:
         """Return the covariance (N, N) of means over `lasted` s at t (N,), which do not overlap."""
         apart = np.abs(t[:, None] - t[None, :])
         if not self.taus:
-            found = (np.minimum(t[:, None], t[None, :]) - self.start) * (2 / self.span)
-            return np.asarray(found - np.eye(len(t)) * (lasted / (3 * self.span)))  # a mean varies less
-        found = np.zeros((len(t), len(t)))
+            covariance = (np.minimum(t[:, None], t[None, :]) - self.start) * (2 / self.span)
+            return np.asarray(covariance - np.eye(len(t)) * (lasted / (3 * self.span)))  # a mean varies less
+        covariance = np.zeros((len(t), len(t)))
         for tau in self.taus:
             x = lasted / tau
-            own = 2 * (x - 1 + np.exp(-x)) / x**2
-            found += np.where(apart > 0, (2 * np.sinh(x / 2) / x) ** 2 * np.exp(-apart / tau), own) / len(self.taus)
-        return found
+            variance = 2 * (x - 1 + np.exp(-x)) / x**2
+            covariance += np.where(apart > 0, (2 * np.sinh(x / 2) / x) ** 2 * np.exp(-apart / tau), variance) / len(
+                self.taus
+            )
+        return covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +104,8 @@ class BiasMeans:
         n, step = self.size, self.lasted / self.size
         if n < 2:
             return [0.0] * len(self.laws)
-        found = self._of_means(self.t[0] + step * (np.arange(n) - (n - 1) / 2), step)
-        return [float(np.trace(C) - np.mean(C) * n) / (n - 1) for C in found]
+        covariances = self._of_means(self.t[0] + step * (np.arange(n) - (n - 1) / 2), step)
+        return [float(np.trace(C) - np.mean(C) * n) / (n - 1) for C in covariances]
 
     def _of_means(self, t: Array, lasted: float) -> list[Array]:
         return [law.covariance(t, lasted) for law in self.laws]
@@ -123,7 +125,7 @@ def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:
 
 @dataclass(frozen=True, eq=False)
 class WalkContrasts:
-    """What is left of rows in contrasts V' (m, K), with the variance of each of white noise and of wandering (m,).
+    """Contrasts V' (m, K) of the residual rows, with the variance of each of white noise and of wandering (m,).
 
     `white` and `wandering` are the mean squares that P leaves of all averages, of white noise and of what wanders;
     `inside` is the variance of what wanders within a row.
@@ -139,17 +141,21 @@ class WalkContrasts:
 
 def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     """Return the contrasts of what P (K, K) leaves of rows, by each law."""
-    found = []
+    each = []
     free = rows.count - len(P)
     for W, inside in zip(rows.covariances(), rows.inside(), strict=True):
         left = P @ W @ P.T
         value, V = np.linalg.eigh(left)
         of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
-        kept = of_white > TAKEN / rows.size
+        free_of_map = of_white > TAKEN / rows.size
         white = (free + float(np.sum(P**2))) / rows.count
         wandering = float(np.trace(left)) / len(P) + free * inside / rows.count
-        found.append(WalkContrasts(V.T[kept], of_white[kept], np.maximum(value[kept], 0.0), white, wandering, inside))
-    return found
+        each.append(
+            WalkContrasts(
+                V.T[free_of_map], of_white[free_of_map], np.maximum(value[free_of_map], 0.0), white, wandering, inside
+            )
+        )
+    return each
 
 
 def bounds(
@@ -160,7 +166,7 @@ def bounds(
     `within` is theirs of `rows.within`; `wanted` are a and b by each of the laws, of which `each` are the contrasts.
     """
     free = rows.count - len(r) if rows.size > 1 else 0
-    best, found = np.inf, []
+    best, each_law = np.inf, []
     for one, (a, b) in zip(each, wanted, strict=True):
         v = one.of_white + RATIOS[:, None] * one.of_wandering  # (R, m), of w = 1
         v_inside = 1 + RATIOS * one.inside
@@ -168,7 +174,7 @@ def bounds(
         n = len(one.V) + free
         w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
         cost = n * np.log(w) + squares / w + np.sum(np.log(v), axis=1) + free * np.log(v_inside)
-        found.append((cost, w * (a + RATIOS * b)))
+        each_law.append((cost, w * (a + RATIOS * b)))
         best = min(best, float(np.min(cost)))
-    near = [E[cost <= np.min(cost) + REACH] for cost, E in found if np.min(cost) <= best + UNLIKELY]
+    near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]
     return min(float(np.min(E)) for E in near), max(float(np.max(E)) for E in near)

@@ -191,7 +191,7 @@ def family_map(
         samples=0 if soaked is None else soaked.count,
         error=_error(family, posterior, band), provenance=recorded(provenance or {}),
     )  # fmt: skip
-    return _settings(knots.step).following(T, bias, record)
+    return _settings(knots.step).from_curve(T, bias, record)
 
 
 @lru_cache(maxsize=4)

@@ -36,7 +36,7 @@ from fusion_core.contracts import Alignment
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT
-from fusion_core.rate_estimators import RateMemory, with_rate
+from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
 
 

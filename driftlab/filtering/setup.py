@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fusion_core.chunk import DERIVED, Chunk
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import (
     Alignment,
     BiasModel,
@@ -26,6 +26,7 @@ from fusion_core.contracts import (
     ThermalMap,
     Transition,
 )
+from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, MapError, MissingChannel
 from fusion_core.settings import nearest
 

@@ -32,8 +32,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.chunk import READINGS, Array, Chunk
-from fusion_core.thermal.thermometer import Steps, noise_before, readings, sawtooth, started
+from fusion_core.chunk import Array, Chunk
+from fusion_core.thermal.thermometer import READINGS, Steps, noise_before, readings, sawtooth, started
 
 Index = NDArray[np.int64]
 

@@ -19,8 +19,9 @@ from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
 from driftlab.identification.normal_equations import Indices
 from driftlab.identification.state import Search, name_of
-from fusion_core.chunk import Array, Chunk, auxiliary
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, shown
 from fusion_core.host.registry import kind_of, registry
 from fusion_core.settings import nearest

@@ -46,7 +46,7 @@ def host_of(declared: BiasModel) -> ThermalBias:
         raise ConfigError(
             f"explain: bias model {declared.kind} takes no effects; declare {known or 'one that does'} or random_walk"
         )
-    return hosts[0].hosting(declared)
+    return hosts[0].from_random_walk(declared)
 
 
 def built_in(cls: type[Any]) -> bool:

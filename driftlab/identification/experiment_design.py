@@ -19,7 +19,8 @@ from driftlab.identification.records import Evidence, Record
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
 from driftlab.noise.local_level import LocalLevel, one_step
-from fusion_core.chunk import Array, Chunk, auxiliary
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import FusionError
 
 HOURS = 3.0  # of a designed recording

@@ -25,7 +25,8 @@ from driftlab.recordings.epochs import epochs
 from driftlab.soak.sweeps import rise_and_fall
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
-from fusion_core.chunk import DERIVED, Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
 
 FINE = 10.0  # s: longest mean that effects are computed on

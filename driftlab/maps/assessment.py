@@ -123,7 +123,7 @@ class MapVerdict:
         between = f"between {low:.3g} and {high:.3g} °C"
         if self.good is None or self.sigma is None:
             left = self.fitted.record.residual
-            words = f"{self.settings.called} does not say how sure its curve is"
+            words = f"{self.settings.description} does not say how sure its curve is"
             if left is None:
                 return [words]
             axis = int(np.argmax(left))
@@ -145,12 +145,12 @@ class MapVerdict:
         return [good, f"its level is not in that: {level}"]
 
     def _misfits(self, unit: BiasUnit) -> list[str]:
-        error, advice = self.fitted.record.error, self.settings.looser
+        error, advice = self.fitted.record.error, self.settings.advice
         found = sorted(() if error is None else error.misfits, key=lambda misfit: -misfit.left)
         if not found:
             return []
         each = [
-            f"{self.axes[m.axis]} bends at {m.T:.3g} °C more than {self.settings.called} can "
+            f"{self.axes[m.axis]} bends at {m.T:.3g} °C more than {self.settings.description} can "
             f"({text(m.left * unit.factor)} {unit.shown} left, {text(m.noise * unit.factor)} is noise)"
             for m in found[:1]
         ] + [

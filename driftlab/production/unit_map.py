@@ -131,7 +131,7 @@ def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config
     """
     if config.filter is None:
         return config
-    loaded, tracked = settings.holding(fitted), config.filter.tracked
+    loaded, tracked = settings.with_fitted(fitted), config.filter.tracked
     if tracked.calibration is not None:
         return with_tracked(config, calibration=loaded)
     with bias_unit(tracked.unit):

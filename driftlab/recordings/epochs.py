@@ -17,8 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.chunk import READINGS, Array, Chunk, concatenate
-from fusion_core.thermal.thermometer import readings, started
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.thermal.thermometer import READINGS, readings, started
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from fusion_core.chunk import DERIVED, Array, Chunk
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource
-from fusion_core.contracts.table import USUAL
+from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags

@@ -151,7 +151,7 @@ def page_of(
     density = verdict.coverage.density[verdict.coverage.density > 0]
     return page(
         "map",
-        title=f"Thermal map of the {record.channel}: {verdict.settings.called}",
+        title=f"Thermal map of the {record.channel}: {verdict.settings.description}",
         lead=f"{record.samples:,} samples of {record.provenance.get('recordings', '') or 'samples in memory'}, "
         f"{low:.2f} to {high:.2f} °C",
         sheet=sheet,

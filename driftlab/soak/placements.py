@@ -30,11 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.thermal_map import smooth_lines
-from fusion_core.thermal.curve_uncertainty import Smoother, with_errors
+from fusion_core.thermal.curve_uncertainty import with_errors
 from fusion_core.thermal.fitted_map import FittedMap
-from fusion_core.thermal.penalised import penalised
-from fusion_core.thermal.soak_noise import Blocks, Contrasts, blocks_of
+from fusion_core.thermal.penalised import penalised, smooth_lines
+from fusion_core.thermal.soak_noise import Blocks, Contrasts, Smoother, blocks_of
 
 Index = NDArray[np.int64]
 

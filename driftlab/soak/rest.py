@@ -24,7 +24,7 @@ from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
 from fusion_core.faults import Faults
-from fusion_core.rate_estimators import with_rate
+from fusion_core.thermal.rate_estimators import with_rate
 
 NOTED = 0.05  # of a soak, not used: more is said first
 SHORTEST = 10.0  # s of rest about a motion, at least

@@ -1,4 +1,4 @@
-"""The contract of bias models: how a sensor's bias moves from sample to sample."""
+"""The contract of bias models: the steps of a sensor's bias from sample to sample."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fusion_core.units import Axes, Quantity, Unit, check_axes, usual_axes
 
 
 class BiasModel(Plugin):
-    """How a bias of d axes moves: states, prior, and the transition of each step."""
+    """Model of a bias of d axes: states, prior, and the transition of each step."""
 
     axes: Axes = Field(default_factory=usual_axes)
     """Names of the axes whose bias it is."""
@@ -39,7 +39,7 @@ class BiasModel(Plugin):
         """Return the settings `axes`, `sigma_0` and `walk` where the bias is a random walk and nothing else.
 
         None, the default, says that it is more than that. A model that gives them can be replaced by one that follows
-        a map and carries effects besides (`ThermalBias.hosting`).
+        a map and carries effects besides (`ThermalBias.from_random_walk`).
         """
         return None
 
@@ -59,7 +59,7 @@ class BiasModel(Plugin):
 
     @property
     def channel_columns(self) -> Mapping[str, int]:
-        """How many columns channels have that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
+        """Columns d of each channel that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
         return {}
 
     @abstractmethod

@@ -1,6 +1,6 @@
-"""What is known of the sensors of one unit: what an exporter is given.
+"""The calibration of one unit, which exporters are given: maps, effects and noise of its sensors.
 
-What the noise of a sensor must be multiplied with, as innovations of a run say: what an exporter of noise is given.
+With it go the factors on the noise of a sensor that the innovations of a run ask for.
 
 d axes, K lags.
 """
@@ -23,7 +23,7 @@ TEMPERATURES = 2001  # over a domain, at which a map is looked at
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What is known of the bias of one sensor of d axes.
+    """The calibration of one sensor of d axes.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Calibrated:
 
     @cached_property
     def factor(self) -> float:
-        """What a bias in `unit` is multiplied by to be shown."""
+        """Factor from `unit` to the unit in which people read a bias."""
         return 1.0 / float(convert(1.0, self.shown, self.unit))
 
     @property
@@ -85,13 +85,13 @@ class Calibrated:
         MissingChannel
             If the recording lacks what an effect reads.
         """
-        seen = chunk
+        at_map = chunk
         for effect in self.effects:
             if effect.acts_on_input:
-                seen = seen.having(temperature=effect.input(seen, None)[0])
+                at_map = at_map.having(temperature=effect.input(at_map, None)[0])
         total = np.zeros((len(chunk), len(self.axes)))
         if self.map is not None:
-            total = total + self.map.bias(seen["temperature"], chunk.t)
+            total = total + self.map.bias(at_map["temperature"], chunk.t)
         for effect in self.effects:
             if effect.coefficients is not None:
                 signature, _ = effect.held(chunk, None)
@@ -117,19 +117,19 @@ class Export:
     serial: str = ""
 
     def sensor(self, channel: str) -> Calibrated | None:
-        """Return what is known of the sensor of a channel, None where there is none."""
+        """Return the calibration of the sensor of a channel, None where there is none."""
         return next((sensor for sensor in self.sensors if sensor.channel == channel), None)
 
     @property
     def mapped(self) -> tuple[Calibrated, ...]:
         """The sensors that have a map; raises ConfigError where none has, or one gives no number in its domain."""
-        found = tuple(sensor for sensor in self.sensors if sensor.map is not None)
-        if not found:
+        sensors = tuple(sensor for sensor in self.sensors if sensor.map is not None)
+        if not sensors:
             have = " and ".join(sorted(sensor.channel for sensor in self.sensors))
             raise ConfigError(
                 f"{have}: without a thermal map; name one with its path in the config, or give a map's file"
             )
-        for sensor in found:
+        for sensor in sensors:
             T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
             known = np.all(np.isfinite(sensor.fitted.bias(T)), axis=1)
             if not np.all(known):
@@ -137,7 +137,7 @@ class Export:
                     f"{sensor.fitted.record.kind}: the map of the {sensor.channel} gives no number at "
                     f"{T[np.argmin(known)]:.6g} °C, and no target could hold it; refit it"
                 )
-        return found
+        return sensors
 
 
 def _said(value: float) -> str:
@@ -158,7 +158,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Lag:
-    """What a bias does over a time, by the differences of adjacent means over it.
+    """The differences of a bias between adjacent means over a time.
 
     Attributes
     ----------

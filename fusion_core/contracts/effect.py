@@ -1,8 +1,7 @@
-"""The contract of effects: what a residual can be traced to.
+"""The contract of effects: causes to which a residual can be traced.
 
-What an effect is made of: signals of channels and of time that a firmware can run too.
-
-A signal has one value a sample; Reading, Elapsed and Fading begin one, the others are of signals:
+An effect is made of signals, of channels and of time, that a firmware can run too. A signal has one value a sample;
+Reading, Elapsed and Fading begin one, the others are of signals:
 
 ::
 
@@ -83,15 +82,12 @@ class Effect(Plugin):
             raise ValueError(f"initial is given and {self.kind} has no memory of what came before; remove initial")
         return self
 
+    # must: what every effect writes
+
     @property
     @abstractmethod
     def requires(self) -> tuple[str, ...]:
         """Names of the channels that the effect reads, what it is mostly about first; none if it is about time."""
-
-    @property
-    def channel_columns(self) -> Mapping[str, int]:
-        """How many columns channels have that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
-        return {}
 
     @property
     @abstractmethod
@@ -105,6 +101,96 @@ class Effect(Plugin):
     @abstractmethod
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
+
+    # may: the search for it
+
+    @property
+    def channel_columns(self) -> Mapping[str, int]:
+        """Columns d of each channel that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
+        return {}
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield what to try on these recordings, where the grid depends on them; it does not by default.
+
+        Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
+        """
+        yield from self.candidates()
+
+    def beside_map(self, degree: int | None) -> Self | None:
+        """Return the part of the effect that is left beside a map that follows powers of temperature up to `degree`.
+
+        0: there is no map; None: it follows all that matter. The effect itself by default; None where nothing is left.
+        """
+        return self
+
+    # may: a memory of what came before
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
+        """Factor (N,) by which what is unknown of the effect's state decays over the step to each sample.
+
+        What the effect adds to the bias is its signature from equilibrium times its coefficients, and a times the
+        product of the factors so far, where a is what the state at the recording's first sample was off by; so the
+        first factor of a recording is 1. A lag has exp(-dt / tau); a play has 1 until it must have been dragged,
+        whatever it began at, and 0 from then on. None, the default: no memory of what came before. The memory is the
+        method's own.
+        """
+        return None, memory
+
+    @property
+    def memory_span(self) -> float | None:
+        """Time (s) over which the effect forgets its subject, or takes its rate; None, by default, where it is not one.
+
+        A memory of the temperature that is shorter than what recordings resolve is its rate, whatever it is called.
+        """
+        return None
+
+    # may: acting on the temperature that the map sees
+
+    def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
+        return chunk["temperature"], memory
+
+    # may: firmware
+
+    def realisation(self) -> tuple[Signal, ...] | None:
+        """Return the signals that are the regressors of one axis, in the order of `terms`; each axis has the same.
+
+        For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
+        """
+        return None
+
+    def realised_input(self, temperature: Signal) -> Signal | None:
+        """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
+        return None if self.acts_on_input else temperature
+
+    # text: names and units in configs and reports
+
+    @property
+    def subject(self) -> str:
+        """The subject of the effect in reports: the first channel that it reads, or time."""
+        return self.requires[0] if self.requires else "time"
+
+    @property
+    def variant(self) -> str:
+        """Mark of candidates of one kind and subject that are judged each for itself; none by default."""
+        return ""
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the coefficients of one axis; one without a name by default."""
+        return ("",)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the p coefficients, as `on_each_axis` orders them."""
+        return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
+        return (self.unit,) * len(self.labels)
+
+    # given: the same for every effect
 
     def ends(self, channel: str) -> Array:
         """Return the ends (columns, 2) of the domain of a channel that is in it, SI."""
@@ -121,6 +207,11 @@ class Effect(Plugin):
         signature, memory = self.signature(chunk, memory)
         return self.within_regressors(signature), memory
 
+    def within_domain(self, chunk: Chunk) -> Chunk:
+        """Return the chunk with each channel held at the nearer end of the domain."""
+        inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
+        return chunk.having(**inside) if any(values is not chunk[name] for name, values in inside.items()) else chunk
+
     def within_regressors(self, signature: Array) -> Array:
         """Return a signature (N, d, p) with each regressor held at its ends; one that is zero is of another axis."""
         if not self.regressors:
@@ -130,26 +221,29 @@ class Effect(Plugin):
             return signature
         return np.where(signature == 0, 0.0, np.clip(signature, low, high))
 
-    def within_domain(self, chunk: Chunk) -> Chunk:
-        """Return the chunk with each channel held at the nearer end of the domain."""
-        inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
-        return chunk.having(**inside) if any(own is not chunk[name] for name, own in inside.items()) else chunk
-
-    def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
-        return chunk["temperature"], memory
-
     @property
     def acts_on_input(self) -> bool:
         """Whether the effect changes the temperature that the map sees."""
         return type(self).input is not Effect.input
 
-    def realisation(self) -> tuple[Signal, ...] | None:
-        """Return what the regressors of one axis are made of, in the order of `terms`; each axis has the same.
+    @property
+    def fades(self) -> bool:
+        """Whether the effect has a memory of what came before the recording."""
+        return type(self).fading is not Effect.fading
 
-        For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
-        """
-        return None
+    @property
+    def walks(self) -> bool:
+        """Whether the effect runs with time alone, as a walk of the bias may."""
+        return not self.requires and self.course != "line"
+
+    @property
+    def hyper_parameters(self) -> dict[str, float]:
+        """Values of the `continuous` hyper-parameters by name, in SI."""
+        return {name: float(value) for name, value in self if name in self.continuous}
+
+    def units_of(self, bias: str) -> tuple[str, ...]:
+        """Return `units` where the bias is in the unit `bias`."""
+        return tuple(unit.replace("bias", bias) for unit in self.units)
 
     @property
     def realised(self) -> tuple[Signal, ...] | None:
@@ -161,87 +255,6 @@ class Effect(Plugin):
             return signals
         ends = {name: self.ends(name).tolist() for name in self.domain}
         return tuple(limited(signal, ends) for signal in signals)
-
-    def realised_input(self, temperature: Signal) -> Signal | None:
-        """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
-        return None if self.acts_on_input else temperature
-
-    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
-        """Factor (N,) by which what is unknown of the effect's state decays over the step to each sample.
-
-        What the effect adds to the bias is its signature from equilibrium times its coefficients, and a times the
-        product of the factors so far, where a is what the state at the recording's first sample was off by; so the
-        first factor of a recording is 1. A lag has exp(-dt / tau); a play has 1 until it must have been dragged,
-        whatever it began at, and 0 from then on. None, the default: no memory of what came before. The memory is the
-        method's own.
-        """
-        return None, memory
-
-    @property
-    def fades(self) -> bool:
-        """Whether the effect has a memory of what came before the recording."""
-        return type(self).fading is not Effect.fading
-
-    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
-        """Yield what to try on these recordings, where the grid depends on them; it does not by default.
-
-        Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
-        """
-        yield from self.candidates()
-
-    @property
-    def hyper_parameters(self) -> dict[str, float]:
-        """Values of the `continuous` hyper-parameters by name, in SI."""
-        return {name: float(value) for name, value in self if name in self.continuous}
-
-    @property
-    def variant(self) -> str:
-        """What tells apart candidates of one kind and subject that are judged each for itself; nothing by default."""
-        return ""
-
-    @property
-    def memory_span(self) -> float | None:
-        """Time (s) over which the effect forgets its subject, or takes its rate; None, by default, where it is not one.
-
-        A memory of the temperature that is shorter than what recordings resolve is its rate, whatever it is called.
-        """
-        return None
-
-    def beside_map(self, degree: int | None) -> Self | None:
-        """Return what of the effect is left beside a map that follows powers of temperature up to `degree`.
-
-        0: there is no map; None: it follows all that matter. The effect itself by default; None where nothing is left.
-        """
-        return self
-
-    @property
-    def walks(self) -> bool:
-        """Whether the effect runs with time alone, as a walk of the bias may."""
-        return not self.requires and self.course != "line"
-
-    @property
-    def subject(self) -> str:
-        """What the effect is about, in reports: the first channel that it reads, or time."""
-        return self.requires[0] if self.requires else "time"
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """What the coefficients of one axis are called; one without a name by default."""
-        return ("",)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
-        return (self.unit,) * len(self.labels)
-
-    def units_of(self, bias: str) -> tuple[str, ...]:
-        """Return `units` where the bias is in the unit `bias`."""
-        return tuple(unit.replace("bias", bias) for unit in self.units)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the p coefficients, as `on_each_axis` orders them."""
-        return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
 
 
 def _clipped(values: Array, ends: Array) -> Array:
@@ -284,7 +297,7 @@ class Fading:
 
 @dataclass(frozen=True)
 class Behind:
-    """What of a signal a first-order lag has not followed yet; the signal is straight between its samples."""
+    """The part of a signal that a first-order lag has not followed yet; the signal is straight between its samples."""
 
     of: Signal
     tau: float  # s
@@ -292,7 +305,7 @@ class Behind:
 
 @dataclass(frozen=True)
 class PlayState:
-    """Where in its loop a play operator stands: its output less its input, from -width / 2 to width / 2."""
+    """The state of a play operator in its loop: its output less its input, from -width / 2 to width / 2."""
 
     of: Signal
     width: float

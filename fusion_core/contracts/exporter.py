@@ -1,6 +1,6 @@
-"""The contract of exporters: how a calibration leaves for another program or device, and how one is read back.
+"""The contract of exporters: a calibration is written for another program or device, and read back.
 
-What a calibration loses on its way into another program, measured as that program evaluates it.
+The loss of a calibration is measured as the target evaluates it:
 
 ::
 
@@ -90,20 +90,20 @@ def warm_up(domain: tuple[float, float]) -> Chunk:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far what the target gives is from what it should, (d,) each, in the sensor's unit."""
+    """Rms and largest error (d,) of the values that the target gives, in the sensor's unit."""
 
     rms: Array
     largest: Array
 
     @classmethod
     def of(cls, error: Array) -> Self:
-        """Return that of errors (N, d)."""
+        """Return the deviation of errors (N, d)."""
         return cls(np.sqrt(np.mean(error**2, axis=0)), np.max(np.abs(error), axis=0))
 
 
 @dataclass(frozen=True)
 class SensorLoss:
-    """What is lost of one sensor.
+    """The loss of one sensor.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class SensorLoss:
         causes: Mapping[str, Deviation] | None = None,
         flown: tuple[float, float] | None = None,
     ) -> Self:
-        """Measure what is lost.
+        """Measure the loss.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class SensorLoss:
         )
 
     def lines(self) -> list[str]:
-        """Return what is lost in words."""
+        """Return the loss in words."""
         sensor = self.sensor
         low, high = sensor.fitted.domain
         warm_up = f"an hour's warm-up from {low:.4g} to {high:.4g} degC, time constant {RISE / 60:g} min"
@@ -172,7 +172,7 @@ class SensorLoss:
             self._over(sensor.fitted.domain, self.domain),
             *flight,
             f"{self._whose}: loses {self._said(self.warm_up)} over {warm_up}",
-            *(f"{self._whose}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
+            *(f"{self._whose}: of that, {what}: {self._said(deviation)}" for what, deviation in self.causes.items()),
         ]
         residual = self.residual
         if residual is not None:
@@ -181,10 +181,10 @@ class SensorLoss:
 
     @property
     def residual(self) -> Array | None:
-        """What the map itself leaves, rms (d,) of averages where they are known; None: not known."""
+        """Rms (d,) that the map itself leaves, of averages where they are known; None: not known."""
         record = self.sensor.fitted.record
-        found = record.averaged_residual or record.residual
-        return None if found is None else np.asarray(found)
+        rms = record.averaged_residual or record.residual
+        return None if rms is None else np.asarray(rms)
 
     @property
     def _whose(self) -> str:
@@ -192,45 +192,45 @@ class SensorLoss:
         sensor = self.sensor
         return sensor.channel if len(sensor.axes) == 1 else f"{sensor.channel} {'/'.join(sensor.axes)}"
 
-    def _over(self, ends: tuple[float, float], found: Deviation) -> str:
-        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
+    def _over(self, ends: tuple[float, float], deviation: Deviation) -> str:
+        return f"{self._whose}: loses {self._said(deviation)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
-    def _said(self, found: Deviation) -> str:
+    def _said(self, deviation: Deviation) -> str:
         sensor = self.sensor
-        return f"{sensor.said(found.rms)} {sensor.shown} rms, {sensor.said(found.largest)} at most"
+        return f"{sensor.said(deviation.rms)} {sensor.shown} rms, {sensor.said(deviation.largest)} at most"
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers in the sensor's SI unit, and in the unit in which they are shown."""
         sensor = self.sensor
 
-        def shown(found: Deviation) -> dict[str, Any]:
-            return {name: (values * sensor.factor).tolist() for name, values in vars(found).items()}
+        def in_shown_unit(deviation: Deviation) -> dict[str, Any]:
+            return {name: (values * sensor.factor).tolist() for name, values in vars(deviation).items()}
 
         return {
             "channel": sensor.channel,
             "unit": sensor.shown,
             "axes": list(sensor.axes),
             "range": list(sensor.fitted.domain),
-            "domain": shown(self.domain),
-            "warm_up": {"duration_s": HOUR, "time_constant_s": RISE, **shown(self.warm_up)},
-            "flight": None if self.flight is None else {"range": list(self.flight[0]), **shown(self.flight[1])},
-            "causes": {what: shown(found) for what, found in self.causes.items()},
+            "domain": in_shown_unit(self.domain),
+            "warm_up": {"duration_s": HOUR, "time_constant_s": RISE, **in_shown_unit(self.warm_up)},
+            "flight": None if self.flight is None else {"range": list(self.flight[0]), **in_shown_unit(self.flight[1])},
+            "causes": {what: in_shown_unit(deviation) for what, deviation in self.causes.items()},
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
         }
 
 
 def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
-    """Return what each step of a chain of calculations costs.
+    """Return the deviation that each step of a chain of calculations adds.
 
     `steps` are values (N, d): the first what should be given, under any name; each further one under what makes it
     differ from the one before. A step that changes nothing is left out.
     """
-    found = {}
+    costs = {}
     for (_, before), (what, after) in pairwise(steps.items()):
         change = np.asarray(after, dtype=np.float64) - before
         if np.any(change):
-            found[what] = Deviation.of(change)
-    return found
+            costs[what] = Deviation.of(change)
+    return costs
 
 
 def seen_in_a_warm_up(sensor: Calibrated) -> Calibrated:
@@ -244,23 +244,23 @@ def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
 
     The latter in words, each with its size over the warm-up.
     """
-    recording, seen = warm_up(sensor.fitted.domain), seen_in_a_warm_up(sensor)
-    said = []
+    recording, visible = warm_up(sensor.fitted.domain), seen_in_a_warm_up(sensor)
+    left_out = []
     for effect in sensor.effects:
         size = "of a size that a warm-up does not show"
-        if effect in seen.effects:
-            lost = Deviation.of(seen.bias(recording) - seen.without(effect).bias(recording))
+        if effect in visible.effects:
+            lost = Deviation.of(visible.bias(recording) - visible.without(effect).bias(recording))
             size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
-        said.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
+        left_out.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
     if sensor.walk is not None and np.any(sensor.walk):
         after = sensor.said(sensor.walk * np.sqrt(HOUR))
-        said.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
-    return seen, tuple(said)
+        left_out.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
+    return visible, tuple(left_out)
 
 
 @dataclass(frozen=True)
 class Loss:
-    """What a target loses.
+    """The loss of an export.
 
     Attributes
     ----------
@@ -279,8 +279,8 @@ class Loss:
     def lines(self) -> list[str]:
         """Return all of it in words, a line each: for the screen, and for comments of a file."""
         lost = [line for sensor in self.sensors for line in sensor.lines()]
-        said = [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
-        return [line(text) for text in said]
+        texts = [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
+        return [line(text) for text in texts]
 
     def as_json(self) -> dict[str, Any]:
         """Return all of it for `loss.json`."""

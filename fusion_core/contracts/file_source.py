@@ -9,10 +9,9 @@ A kind of file gives a `Table`: named columns, each with a unit where the file k
 START and STOP are seconds from the first row. The range begins with the first row at or after START and ends
 before the first one at or after STOP: consecutive ranges share no row.
 
-What a file is by its first bytes: said where a source is given a file of another kind.
-
-Which kind reads it follows from the `signatures` of the file sources that are installed, so what a message advises can
-be done. The names of formats are known here, also of those that nothing reads.
+The format of a file is recognised by its first bytes where a source is given a file of another kind. The kind that
+reads it follows from the `signatures` of the installed file sources, so that the advice of a message can be followed;
+formats that nothing reads have their names here, too.
 """
 
 from __future__ import annotations
@@ -106,7 +105,7 @@ class FileSource(Source):
         """
 
     def about(self, channel: str) -> Mapping[str, str]:
-        """Return what the file says of the device that a channel is of."""
+        """Return the properties of a channel's device that the file holds."""
         if self.path is None or channel not in self.channels:
             return {}
         with self.open(self.path, Faults()) as table:
@@ -119,13 +118,13 @@ class FileSource(Source):
                 f"{self.kind}: no recording is named; write path: FILE under source, or give --input FILE"
             )
         self._check_range()
-        window, seen = Window(self.start, self.stop), 0
+        window, rows_read = Window(self.start, self.stop), 0
         with self.open(self.path, faults) as table:
             units = {name: self._conversions(table, name) for name in self.channels}
             paths = list(dict.fromkeys(path for channel in self.channels.values() for path in channel.paths))
             for block in table.blocks(paths, size):
-                t = self._time(block, units, seen)
-                seen += block.rows
+                t = self._time(block, units, rows_read)
+                rows_read += block.rows
                 rows = window.cut(t)
                 faults.first_row = None if np.isnan(window.first) else float(window.first)
                 if rows.start < rows.stop:
@@ -134,7 +133,7 @@ class FileSource(Source):
                 if window.ended and window.rows:
                     return
         if window.rows == 0:
-            raise self._empty(window, seen, table.noun, faults)
+            raise self._empty(window, rows_read, table.noun, faults)
 
     def _check_range(self) -> None:
         for word, value in (("START", self.start), ("STOP", self.stop)):
@@ -143,16 +142,16 @@ class FileSource(Source):
                     f"{self.name}: {word} is {value:.12g} s, seconds from the first row were expected; write 0 or more"
                 )
 
-    def _empty(self, window: Window, seen: int, noun: str, faults: Faults) -> EmptyRecording:
-        if seen == 0 and (wrong := faults.lines(notes=False)):
+    def _empty(self, window: Window, rows_read: int, noun: str, faults: Faults) -> EmptyRecording:
+        if rows_read == 0 and (wrong := faults.lines(notes=False)):
             return EmptyRecording(f"{self.path}: has no rows that can be read ({'; '.join(wrong)}); copy it again")
-        if seen == 0:
+        if rows_read == 0:
             return EmptyRecording(
                 f"{self.path}: has {noun}s and no rows; check that the recording was not stopped at once"
             )
         if np.isnan(window.first):
             return EmptyRecording(
-                f"{self.name}: none of {seen} time stamps is a number; check the path of channel time"
+                f"{self.name}: none of {rows_read} time stamps is a number; check the path of channel time"
             )
         return EmptyRecording(
             f"{self.name}: has no row in this range, the recording is {window.last - window.first:.6g} s "
@@ -173,10 +172,10 @@ class FileSource(Source):
                 )
         return [channel.conversion(self.path or Path(), name, path, table.unit(path)) for path in channel.paths]
 
-    def _time(self, block: Block, conversions: Conversions, seen: int) -> Array:
+    def _time(self, block: Block, conversions: Conversions, rows_read: int) -> Array:
         if self.interval is None:
             return self._values("time", block, conversions)
-        return np.arange(seen, seen + block.rows, dtype=np.float64) * self.interval
+        return np.arange(rows_read, rows_read + block.rows, dtype=np.float64) * self.interval
 
     def _values(self, name: str, block: Block, conversions: Conversions) -> Array:
         """Return a channel of a block in SI: (N, d) for vectors, (N,) for scalars."""
@@ -227,12 +226,12 @@ FORMATS = {  # the first bytes of a file: what it is, and what to do with it whe
 
 def kinds_of(first: bytes) -> list[str]:
     """Return the kinds of the installed sources whose files begin as `first` does."""
-    found = [cls for cls in installed() if any(map(first.startswith, getattr(cls, "signatures", ())))]
-    return sorted(map(kind_default, found))
+    classes = [cls for cls in installed() if any(map(first.startswith, getattr(cls, "signatures", ())))]
+    return sorted(map(kind_default, classes))
 
 
 def recognised(first: bytes) -> bool:
-    """Whether it is known what a file is that begins so."""
+    """Whether the format of a file that begins so is known."""
     return any(map(first.startswith, FORMATS)) or bool(kinds_of(first))
 
 

@@ -1,4 +1,4 @@
-"""The contract of the framings: how samples are cut out of a stream of bytes.
+"""The contract of the framings: samples are cut out of a stream of bytes.
 
 A stream may begin anywhere, be torn anywhere, and hold bytes that belong to no sample. A framing is asked for the
 samples in the next bytes and hands back what it could not use yet as its memory. The law: any split of a stream gives
@@ -60,7 +60,7 @@ class Frames:
 
 
 class Framing(Plugin):
-    """How a device puts its samples into bytes."""
+    """The form in which a device puts its samples into bytes."""
 
     @property
     def device_counter(self) -> Counter | None:

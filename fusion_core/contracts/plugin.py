@@ -1,4 +1,4 @@
-"""What every plugin is: its own configuration.
+"""The base of every plugin, which is its own configuration.
 
 A plugin class is a frozen pydantic model whose fields are what the user writes and whose methods speak arrays for a
 whole chunk of samples, never one sample. `kind` names it.
@@ -8,10 +8,9 @@ start). Plugins have no hidden state. The law that follows: any split of a recor
 
 What a plugin is given cannot be written to: it is shared with the rest of the program.
 
-What a family of plugins is: its hook, its contract, and how what its plugins answer is checked.
-
-The layer that owns a contract declares its family. A distribution adds one of its own by the hook `families()`; plugins
-of it are then found wherever they are installed, and `Annotated[ItsContract, Installed()]` accepts them in a config.
+A family of plugins has a hook, a contract, and a check of each answer. The layer that owns a contract declares its
+family. A distribution adds one of its own by the hook `families()`; plugins of it are then found wherever they are
+installed, and `Annotated[ItsContract, Installed()]` accepts them in a config.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ HOME = "driftlab"  # the distribution of the built-in plugins
 
 
 class Origin(NamedTuple):
-    """Where an installed class is from."""
+    """Family and distribution of an installed class."""
 
     family: str
     distribution: str
@@ -64,7 +63,7 @@ _KINDS: dict[type, str] = {}  # of the plugin that makes objects of a class whic
 
 
 def claim(cls: type, origin: Origin, kind: str | None = None) -> None:
-    """Note where a class is from; the host does so when it registers one. What a distribution brought stays its own.
+    """Note the origin of a class; the host does so when it registers one. What a distribution brought stays its own.
 
     `kind` is that of the plugin which makes objects of the class, where the class is no plugin itself.
     """
@@ -75,12 +74,12 @@ def claim(cls: type, origin: Origin, kind: str | None = None) -> None:
 
 
 def origin_of(cls: type) -> Origin | None:
-    """Return where a class is from; None where it is not installed as a plugin."""
+    """Return the origin of a class; None where it is not installed as a plugin."""
     return _ORIGINS.get(cls)
 
 
 def built_in(plugin: Any) -> bool:
-    """Return whether a plugin's class came with driftlab."""
+    """Whether a plugin's class came with driftlab."""
     origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
     return origin is not None and origin.distribution == HOME
 
@@ -95,15 +94,15 @@ def kind_default(cls: type[Plugin]) -> str:
     return str(cls.model_fields["kind"].default)
 
 
-def broken(plugin: Any, what: str, advice: str = "this is a defect of the plugin") -> PluginError:
+def plugin_error(plugin: Any, what: str, advice: str = "this is a defect of the plugin") -> PluginError:
     """Return the error of a plugin, its class, or what it made, by name: `acme_gp (driftlab-acme 0.1.0): ...`."""
     cls = plugin if isinstance(plugin, type) else type(plugin)
     record = getattr(plugin, "record", None)
-    own = getattr(record or plugin, "kind", None) or _KINDS.get(cls, cls.__name__)
-    kind = str(kind_default(cls) if plugin is cls else own)
+    named = getattr(record or plugin, "kind", None) or _KINDS.get(cls, cls.__name__)
+    kind = str(kind_default(cls) if plugin is cls else named)
     origin = origin_of(cls)
-    named = f"{kind} ({origin.distribution} {origin.version})" if origin and origin.distribution else kind
-    return PluginError(f"{named}: {what}; {advice}", plugin=kind, family=origin.family if origin else None)
+    title = f"{kind} ({origin.distribution} {origin.version})" if origin and origin.distribution else kind
+    return PluginError(f"{title}: {what}; {advice}", plugin=kind, family=origin.family if origin else None)
 
 
 Check = Callable[..., Any]

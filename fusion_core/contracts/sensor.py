@@ -1,6 +1,6 @@
-"""What a measurement model knows of a sensor, and of the place that it is at.
+"""The sensors of a measurement model, their site, the alignment on a stretch at rest, and the detector of motion.
 
-What is frozen from a stretch at rest, and what tells rest from motion. N epochs, d axes of a sensor, D of all.
+N epochs, d axes of a sensor, D of all.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
-from fusion_core.contracts.plugin import Memory, broken
+from fusion_core.contracts.plugin import Memory, plugin_error
 from fusion_core.contracts.thermal_map import ThermalMap
 from fusion_core.model import Flags
 from fusion_core.statespace import Block
@@ -71,29 +71,29 @@ class Sensor:
         try:
             return Block(name, tuple(f"{name}_{label}" for label in bias.labels), tuple(bias.units(self.unit)))
         except ValueError as error:
-            raise broken(bias, str(error)) from None
+            raise plugin_error(bias, str(error)) from None
 
     @cached_property
     def factor(self) -> float:
-        """How many of the unit that is shown are one SI unit."""
+        """Factor from the SI unit to the unit of tables and figures."""
         return 1.0 / float(convert(1.0, self.shown, self.unit))
 
 
 def axis_of(channel: str) -> str:
-    """Return what the one axis of a sensor is called that is no triad: as its channel, as far as an axis can be."""
+    """Return the name of the one axis of a sensor that is no triad: its channel's, as far as possible."""
     plain = re.sub(r"[^A-Za-z0-9]", "", channel)[:16]
     return plain if plain[:1].isalpha() else "value"
 
 
 class Site(NamedTuple):
-    """Where the sensors are: latitude and heading of the x axis (from north, clockwise), rad; None: not known."""
+    """Latitude of the sensors and heading of the x axis (from north, clockwise), rad; None: not known."""
 
     latitude: float | None = None
     heading: float | None = None
 
 
 class Patience(NamedTuple):
-    """When a measurement is refused, and after how many seconds of refusals at a new rest the filter begins anew."""
+    """False-alarm rate of the gate, and seconds of refusals at a new rest after which the filter begins anew."""
 
     false_alarm: float
     realign_after: float
@@ -101,7 +101,7 @@ class Patience(NamedTuple):
 
 @dataclass(frozen=True)
 class Alignment:
-    """What is frozen at the end of a stretch at rest.
+    """The values that are frozen at the end of a stretch at rest.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class Alignment:
 
     @cached_property
     def gate_scale(self) -> float:
-        """How much larger the innovations may be because the declared noise is too small."""
+        """Factor on the gate where the declared noise is too small."""
         worst = max((float(np.mean(ratio**2)) for ratio in self.noise_ratio.values()), default=1.0)
         return max(1.0, worst)
 
@@ -150,7 +150,7 @@ class Detector(ABC):
 
     @abstractmethod
     def look(self, chunk: Chunk, memory: Memory) -> tuple[Flags, Flags, Memory]:
-        """Return which epochs are still (N,), which axes stand out in each (N, D), and the memory."""
+        """Return the flags of still epochs (N,), of axes that stand out in each (N, D), and the memory."""
 
 
 @dataclass(frozen=True)
@@ -164,5 +164,5 @@ class AlwaysStill(Detector):
         return None
 
     def look(self, chunk: Chunk, memory: Memory) -> tuple[Flags, Flags, Memory]:
-        """Return that every epoch is still."""
+        """Return the flags of epochs that are all still."""
         return np.ones(len(chunk), dtype=np.bool_), np.zeros((len(chunk), len(self.axes)), dtype=np.bool_), memory

@@ -21,7 +21,7 @@ from fusion_core.units import Unit
 
 
 class Source(Plugin):
-    """Where samples come from."""
+    """A source of samples."""
 
     live: ClassVar[bool] = False  # whether samples come as they are measured, without an end
 
@@ -36,7 +36,7 @@ class Source(Plugin):
         """
 
     def about(self, channel: str) -> Mapping[str, str]:
-        """Return what the recording says of the device that a channel is of, by name, for the record of its map."""
+        """Return the properties of a channel's device that the recording holds, by name, for the record of its map."""
         return {}
 
     def of_file(self, path: Path) -> Source | None:
@@ -45,13 +45,13 @@ class Source(Plugin):
 
     @property
     def name(self) -> str:
-        """What the source is called in messages and provenance, e.g. its path."""
+        """Name of the source in messages and provenance, e.g. its path."""
         return self.kind
 
 
 @dataclass(frozen=True)
 class Twin:
-    """What a simulated unit is, and the chamber that it is in: what is not known of a real one.
+    """The truth of a simulated unit and its chamber, which is not known of a real one.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class SimulatedSource(Source):
 
     @property
     def site(self) -> Site | None:
-        """Where the sensors are taken to be, None where that says nothing; no latitude: the Earth stands still."""
+        """Site of the sensors, None where the source has none; no latitude: the Earth stands still."""
         return None
 
     @property

@@ -1,12 +1,9 @@
-"""An open file as named columns that are read block after block: what a kind of file gives to its `FileSource`.
-
-One channel of a recording: where it is in the file, in which unit, and what is usual for its name.
-"""
+"""An open file as named columns, read block after block, and the channels of a recording: place, unit, usual names."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
@@ -15,9 +12,11 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core.budget import check_regular
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import UnitConflict, UnitError, UnreadableFile, shown
 from fusion_core.settings import Settings
+from fusion_core.thermal.rate_estimators import CONDITIONED
+from fusion_core.thermal.thermometer import READINGS
 from fusion_core.units import convert, si_unit_of
 
 
@@ -76,7 +75,7 @@ class Table(ABC):
         return None
 
     def about(self, path: str) -> Mapping[str, str]:
-        """Return what the file says of the device that `path` is of, by name (`device_id`); nothing by default."""
+        """Return the properties of the device of `path` that the file holds, by name (`device_id`); none by default."""
         return {}
 
 
@@ -106,12 +105,12 @@ class Window:
         return slice(begin, end)
 
 
-def _first(found: np.ndarray) -> int:
-    return int(np.argmax(found)) if np.any(found) else len(found)
+def _first(flags: np.ndarray) -> int:
+    return int(np.argmax(flags)) if np.any(flags) else len(flags)
 
 
 class Usual(NamedTuple):
-    """What is known of a channel by its name alone.
+    """Unit and axes of a channel, known by its name alone.
 
     Attributes
     ----------
@@ -137,11 +136,24 @@ USUAL: Mapping[str, Usual] = {
 }
 """The names that mean the same in every recording; any other name is a channel of the unit that it is given."""
 
+DERIVED = frozenset({"dt", "tau", "residual", *CONDITIONED, *READINGS})
+"""Channels that the program makes from others: a recording has none of these names."""
+
 Name = Annotated[str, Field(min_length=1)]
 
 
+def auxiliary(chunks: Iterable[Chunk]) -> list[str]:
+    """Return the channels that all chunks have and that are neither a sensor's nor made by the program."""
+    parts = list(chunks)
+    return [
+        name
+        for name in (parts[0].channels if parts else ())
+        if name not in DERIVED and all(name in part.channels and name not in part.sensors for part in parts)
+    ]
+
+
 class Channel(Settings):
-    """Where one channel is in the file."""
+    """The place of one channel in the file."""
 
     path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
     """The column or data set in the file; a list of them, one an axis."""
@@ -169,7 +181,7 @@ class Channel(Settings):
             advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
             raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {usual.si}; {advice}")
 
-    def conversion(self, file: Path, name: str, path: str, found: str | None) -> tuple[str, str] | None:
+    def conversion(self, file: Path, name: str, path: str, in_file: str | None) -> tuple[str, str] | None:
         """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
 
         Raises
@@ -180,11 +192,11 @@ class Channel(Settings):
             If config and file give units of the same dimension and different size.
         """
         usual = USUAL.get(name)
-        si = usual.si if usual else _si(self.unit or found)
-        theirs = None if found is None or si is None else _scale(found, si)
+        si = usual.si if usual else _si(self.unit or in_file)
+        theirs = None if in_file is None or si is None else _scale(in_file, si)
         if self.unit is not None and si is not None:
             if theirs is not None and not np.allclose(_scale(self.unit, si) or np.nan, theirs, rtol=1e-9, atol=0):
-                ours, other = shown(self.unit), shown(found)
+                ours, other = shown(self.unit), shown(in_file)
                 raise UnitConflict(
                     f"{file}: channel {name} is in '{ours}' by the config and in '{other}' by the file ('{path}'); "
                     f"remove the wrong one, e.g. source.channels.{name}.unit"
@@ -192,13 +204,13 @@ class Channel(Settings):
             return self.unit, si
         if usual and usual.example:
             advice = f"write unit: {usual.example} under source.channels.{name}"
-            if found is None:
+            if in_file is None:
                 raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
             if theirs is None:
                 raise UnitError(
-                    f"{file}: channel {name} is in '{shown(found)}' by the file, which is no unit of {si}; {advice}"
+                    f"{file}: channel {name} is in '{shown(in_file)}' by the file, which is no unit of {si}; {advice}"
                 )
-        return None if theirs is None or found is None or si is None else (found, si)
+        return None if theirs is None or in_file is None or si is None else (in_file, si)
 
 
 def _si(unit: str | None) -> str | None:
@@ -209,7 +221,7 @@ def _si(unit: str | None) -> str | None:
 
 
 def _scale(unit: str, si: str) -> list[float] | None:
-    """Return what 0 and 1 `unit` are in `si`, or None where the unit is unknown or of another dimension."""
+    """Return 0 and 1 `unit` in `si`, or None where the unit is unknown or of another dimension."""
     try:
         zero, one = convert([0.0, 1.0], unit, si)
         return [float(zero), float(one)]

@@ -1,4 +1,4 @@
-"""The contract of bias models that follow a thermal map and carry effects: what a loop reads and writes."""
+"""The contract of bias models that follow a thermal map and carry effects, as identification needs it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ThermalBias(BiasModel):
         return None if self.map is None else self.map.load()
 
     @classmethod
-    def hosting(cls, declared: BiasModel) -> Self:
+    def from_random_walk(cls, declared: BiasModel) -> Self:
         """Return the model of this class that says what `declared` says, without map and effects.
 
         Raises

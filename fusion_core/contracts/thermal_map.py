@@ -1,13 +1,10 @@
-"""The contract of thermal maps: a bias as a function of temperature.
-
-The contract of thermal maps that are a network, of which somebody has to say how large it is.
-"""
+"""The contract of thermal maps: a bias as a function of temperature; of a network the size is chosen by trial, too."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -18,41 +15,13 @@ from fusion_core.chunk import Array
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.errors import MapError
 from fusion_core.settings import ConfigPath
-from fusion_core.thermal.curve_uncertainty import HOLE, Smoother
+from fusion_core.thermal.curve_uncertainty import HOLE
 from fusion_core.thermal.fitted_map import FittedMap, MapRecord, Outside
-from fusion_core.thermal.penalised import penalised
-from fusion_core.thermal.soak_noise import Blocks, cells_of
+from fusion_core.thermal.penalised import Basis, penalised_smoother, smooth_lines
+from fusion_core.thermal.soak_noise import Smoother
 from fusion_core.units import Quantity, Unit
 
 POINTS = 4000  # of a curve that another map follows
-
-
-@dataclass(frozen=True)
-class Basis:
-    """Curves whose combination c is a map: values(T (N,)) -> (N, q), and penalty (q, q) of roughness c' penalty c."""
-
-    values: Callable[[Array], Array]
-    penalty: Array
-
-
-def smooth_lines(domain: tuple[float, float]) -> Basis:
-    """Return straight lines between knots 1 K apart, at most 150 pieces, whose bends are penalised."""
-    count = int(np.clip(np.ceil(domain[1] - domain[0]), 4, 150)) + 1
-    knots = np.linspace(*domain, count)
-    bends = np.diff(np.eye(count), n=2, axis=0)
-    return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
-
-
-def _penalised(basis: Basis, T: Array, bias: Array) -> Smoother:
-    """Return the answer of penalised least squares to T (N,) and bias (N, d), as smooth as cross-validation has it."""
-    cells = cells_of(T, bias)
-    B = basis.values(cells.T)
-    operators = [penalised(B, y, cells.n, basis.penalty).operator for y in cells.y.T]
-
-    def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-        return np.asarray(basis.values(grid) @ (operators[axis] @ blocks.shares(cells.of_sample, len(cells.T))))
-
-    return smoother
 
 
 class ThermalMap(Plugin):
@@ -69,49 +38,7 @@ class ThermalMap(Plugin):
 
     _held: FittedMap | None = PrivateAttr(None)
 
-    def holding(self, fitted: FittedMap) -> Self:
-        """Return these settings with a map that is in memory: `load` returns it, and no file is read."""
-        copy = self.model_copy()
-        copy._held = fitted
-        return copy
-
-    @property
-    def has_map(self) -> bool:
-        """Whether there is a map to load: in memory, or in a file that is named."""
-        return self._held is not None or self.path is not None
-
-    def basis(self, domain: tuple[float, float]) -> Basis:
-        """Return curves that stand for this kind of map where it is fitted jointly with other effects.
-
-        By default straight lines between knots 1 K apart (at most 150 pieces), as smooth as the samples say; a kind
-        that is linear in its coefficients gives its own.
-        """
-        return smooth_lines(domain)
-
-    def variants(self) -> Iterable[Self]:
-        """Return settings like these that are worth a trial where kinds are compared, the simplest first.
-
-        By default these alone.
-        """
-        return (self,)
-
-    @property
-    def called(self) -> str:
-        """What a sentence calls it: `a cubic`, `a spline with knots 1 K apart`."""
-        return f"kind {self.kind}"
-
-    @property
-    def looser(self) -> str:
-        """What to set so that its curve bends more, as advice in a sentence; empty where nothing is known."""
-        return ""
-
-    def smoother(self, T: Array, bias: Array) -> Smoother:
-        """Return how a fit to samples T (N,) in degC and bias (N, d) in rad/s answers to their noise, to first order.
-
-        By default that of `basis`, as smooth as the samples say. Nothing is fitted by it: with samples that are made up
-        it says how sure a map will be (`expected_curve_error`).
-        """
-        return _penalised(self.basis((float(T.min()), float(T.max()))), T, bias)
+    # must: what every kind writes
 
     @abstractmethod
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> FittedMap:
@@ -125,7 +52,36 @@ class ThermalMap(Plugin):
             If the samples cannot determine the coefficients.
         """
 
-    def following(self, T: Array, bias: Array, record: MapRecord) -> FittedMap:
+    @abstractmethod
+    def read(self, path: Path) -> FittedMap:
+        """Read a map of this kind from its file; raises MapError."""
+
+    # may: what a kind can do better than the default
+
+    def basis(self, domain: tuple[float, float]) -> Basis:
+        """Return curves that stand for this kind of map where it is fitted jointly with other effects.
+
+        By default straight lines between knots 1 K apart (at most 150 pieces), as smooth as the samples say; a kind
+        that is linear in its coefficients gives its own.
+        """
+        return smooth_lines(domain)
+
+    def smoother(self, T: Array, bias: Array) -> Smoother:
+        """Return the response of a fit to the noise of samples T (N,) in degC and bias (N, d) in rad/s, to first order.
+
+        By default that of `basis`, as smooth as the samples say. Nothing is fitted by it: with samples that are made up
+        it says how sure a map will be (`expected_curve_error`).
+        """
+        return penalised_smoother(self.basis((float(T.min()), float(T.max()))), T, bias)
+
+    def variants(self) -> Iterable[Self]:
+        """Return settings like these that are worth a trial where kinds are compared, the simplest first.
+
+        By default these alone.
+        """
+        return (self,)
+
+    def from_curve(self, T: Array, bias: Array, record: MapRecord) -> FittedMap:
         """Return a map of this kind along a curve that is known, of which the record is written already.
 
         By default it is fitted to the curve's points; a kind that goes through points has a shorter way.
@@ -139,6 +95,46 @@ class ThermalMap(Plugin):
         """
         fitted = self.fit(T, bias, {})
         return replace(fitted, record=record.model_copy(update={"kind": self.kind}))
+
+    def _over(self, fitted: FittedMap, record: MapRecord) -> FittedMap:
+        """Return a map with another record, whose domain is wider."""
+        T = np.linspace(*record.domain, POINTS)
+        return self.from_curve(T, replace(fitted, outside="tangent").bias(T), record)
+
+    # text: what reports and advice say of it
+
+    @property
+    def description(self) -> str:
+        """Its name in a sentence: `a cubic`, `a spline with knots 1 K apart`."""
+        return f"kind {self.kind}"
+
+    @property
+    def advice(self) -> str:
+        """The setting with which its curve bends more, as advice in a sentence; empty where nothing is known."""
+        return ""
+
+    # given: the same for every kind
+
+    def with_fitted(self, fitted: FittedMap) -> Self:
+        """Return these settings with a map that is in memory: `load` returns it, and no file is read."""
+        copy = self.model_copy()
+        copy._held = fitted
+        return copy
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map to load: in memory, or in a file that is named."""
+        return self._held is not None or self.path is not None
+
+    def load(self) -> FittedMap:
+        """Return the map that these settings hold, or else read the one that the config names."""
+        if self._held is not None:
+            return replace(self._held, outside=self.outside)
+        if self.path is None:
+            raise MapError(f"{self.kind}: no map file is named; fit one and set path: FILE")
+        if not self.path.is_file():
+            raise MapError(f"{self.kind}: map file {self.path} does not exist; fit the map first, or name its file")
+        return self.read(self.path)
 
     def over(self, fitted: FittedMap, domain: tuple[float, float]) -> FittedMap:
         """Return a map that was fitted with these settings over a wider domain: as it is inside, and on beyond.
@@ -161,25 +157,6 @@ class ThermalMap(Plugin):
             holes = tuple(end for end in ends if end[1] - end[0] > HOLE * (high - low))
             error = error.model_copy(update={"holes": tuple(sorted((*error.holes, *holes)))})
         return self._over(fitted, record.model_copy(update={"domain": (low, high), "error": error}))
-
-    def _over(self, fitted: FittedMap, record: MapRecord) -> FittedMap:
-        """Return a map with another record, whose domain is wider."""
-        T = np.linspace(*record.domain, POINTS)
-        return self.following(T, replace(fitted, outside="tangent").bias(T), record)
-
-    @abstractmethod
-    def read(self, path: Path) -> FittedMap:
-        """Read a map of this kind from its file; raises MapError."""
-
-    def load(self) -> FittedMap:
-        """Return the map that these settings hold, or else read the one that the config names."""
-        if self._held is not None:
-            return replace(self._held, outside=self.outside)
-        if self.path is None:
-            raise MapError(f"{self.kind}: no map file is named; fit one and set path: FILE")
-        if not self.path.is_file():
-            raise MapError(f"{self.kind}: map file {self.path} does not exist; fit the map first, or name its file")
-        return self.read(self.path)
 
 
 Target = Literal["bias", "slope"]

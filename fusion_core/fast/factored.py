@@ -74,7 +74,7 @@ def correct(U: Array, D: Array, h: Array, r: float) -> tuple[Array, float]:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def wide(
-    state: State, groups: IndependentGroups, model: Model, data: Data, found: SampleArrays, first: int
+    state: State, groups: IndependentGroups, model: Model, data: Data, out: SampleArrays, first: int
 ) -> tuple[State, int]:
     """Run the filter as `recursive` does, until P is narrow; return the state then, and after how many samples.
 
@@ -94,7 +94,7 @@ def wide(
         if np.any(widths > (WIDEST if len(x) > 1 else WIDEST_ALONE)):
             raise TooWide(first + k)
         before = x, U.copy(), D.copy()
-        x, squares, logs = _measured(x, U, D, H, r, data, found, k, groups)
+        x, squares, logs = _measured(x, U, D, H, r, data, out, k, groups)
         dof = int(np.sum(data.used[k]))
         used = dof > 0 and squares <= data.gates[dof]
         if not used:
@@ -106,9 +106,15 @@ def wide(
         sigma = np.sqrt(np.diagonal(P))
         if not np.isfinite(np.sum(x) + np.sum(sigma) + squares + logs):
             raise NotFinite(first + k)
-        found.x[k], found.sigma[k], found.nis[k], found.log_det[k], found.used[k] = x, sigma, squares, logs, used
-        if len(found.P):
-            found.P[k] = groups.blocks(P, groups.states, groups.states)
+        out.x[k], out.sigma[k], out.nis[k], out.log_det[k], out.used[k] = (
+            x,
+            sigma,
+            squares,
+            logs,
+            used,
+        )
+        if len(out.P):
+            out.P[k] = groups.blocks(P, groups.states, groups.states)
         if np.all(widths <= NARROW):
             return State(x, P), k + 1
         if k == LONGEST:
@@ -117,7 +123,7 @@ def wide(
 
 
 def _measured(
-    x: Array, U: Array, D: Array, H: Array, r: Array, data: Data, found: SampleArrays, k: int, groups: IndependentGroups
+    x: Array, U: Array, D: Array, H: Array, r: Array, data: Data, out: SampleArrays, k: int, groups: IndependentGroups
 ) -> tuple[Array, float, float]:  # fmt: skip
     """Correct U and D in place with sample k; return x, the sum of squares of innovations and their log determinant."""
     predicted, squares, logs = x, 0.0, 0.0
@@ -125,10 +131,10 @@ def _measured(
         y = data.z[k, row] - H[row] @ x
         K, S = correct(U, D, H[row], r[row])
         x = x + K * y
-        found.y[k, row], found.white[k, row] = data.z[k, row] - H[row] @ predicted, y / np.sqrt(S)
+        out.y[k, row], out.white[k, row] = data.z[k, row] - H[row] @ predicted, y / np.sqrt(S)
         squares, logs = squares + y**2 / S, logs + np.log(S)
-        if len(found.K):
+        if len(out.K):
             at = groups.rows == row
-            found.K[k, at] = np.append(K, 0.0)[groups.states[np.any(at, axis=1)]]
-            found.root[k, at] = 1 / np.sqrt(S)
+            out.K[k, at] = np.append(K, 0.0)[groups.states[np.any(at, axis=1)]]
+            out.root[k, at] = 1 / np.sqrt(S)
     return x, squares, logs

@@ -87,26 +87,26 @@ class IndependentGroups:
 
 def find_groups(F: Array, Q: Array, H: Array, P: Array) -> IndependentGroups:
     """Return the groups of a model: F, Q (K, n, n), H (K, m, n) with R diagonal, and P (n, n) at the start."""
-    seen = _nonzero(H)
-    return _groups((_nonzero(F) | _nonzero(Q) | (P != 0)).tobytes(), seen.tobytes(), seen.shape)
+    measured = _nonzero(H)
+    return _groups((_nonzero(F) | _nonzero(Q) | (P != 0)).tobytes(), measured.tobytes(), measured.shape)
 
 
 @lru_cache(maxsize=64)  # a recording comes in many stretches, nearly all of them coupled alike
-def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> IndependentGroups:
+def _groups(coupling: bytes, measuring: bytes, shape: tuple[int, int]) -> IndependentGroups:
     """Return the groups from which states are coupled (n, n), and which components see which (m, n)."""
     n = shape[1]
-    seen = np.frombuffer(seeing, dtype=np.bool_).reshape(shape)
-    coupled = np.frombuffer(coupling, dtype=np.bool_).reshape(n, n) | (seen.T @ seen)
+    measured = np.frombuffer(measuring, dtype=np.bool_).reshape(shape)
+    coupled = np.frombuffer(coupling, dtype=np.bool_).reshape(n, n) | (measured.T @ measured)
     coupled = coupled | coupled.T | np.eye(n, dtype=np.bool_)
     for _ in range(n.bit_length()):
         coupled = coupled @ coupled
     first = np.argmax(coupled, axis=1)  # of the states that each one reaches
     leaders = np.unique(first)
     states = [np.flatnonzero(first == leader) for leader in leaders]
-    rows = [np.flatnonzero(np.any(seen[:, group], axis=1)) for group in states]
-    blind = np.flatnonzero(~np.any(seen, axis=1))  # a component that sees no state is anyone's
+    rows = [np.flatnonzero(np.any(measured[:, group], axis=1)) for group in states]
+    blind = np.flatnonzero(~np.any(measured, axis=1))  # a component that sees no state is anyone's
     rows[0] = np.sort(np.concatenate([rows[0], blind]))
-    return IndependentGroups(_filled(states, n), _filled(rows, len(seen)), n, len(seen))
+    return IndependentGroups(_filled(states, n), _filled(rows, len(measured)), n, len(measured))
 
 
 def _filled(lists: list[Index], filling: int) -> Index:
@@ -115,20 +115,20 @@ def _filled(lists: list[Index], filling: int) -> Index:
 
 
 def _nonzero(matrices: Array) -> Flags:
-    """Return which entries (i, j) of matrices (K, i, j) are ever other than zero, by their bits less the sign."""
+    """Return the flags of entries (i, j) that are not zero in all matrices (K, i, j), by their bits less the sign."""
     if len(matrices) == 1:
         once: Flags = matrices[0] != 0
         return once
     rows, columns = matrices.shape[1:]
     flat = np.ascontiguousarray(matrices).reshape(len(matrices), rows * columns).view(np.uint64)
-    found: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
-    return found
+    nonzero: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
+    return nonzero
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _bits(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    found = np.zeros(rows.shape[1], dtype=np.uint64)
+    bits = np.zeros(rows.shape[1], dtype=np.uint64)
     for k in range(len(rows)):
-        for i in range(len(found)):
-            found[i] |= rows[k, i]
-    return found
+        for i in range(len(bits)):
+            bits[i] |= rows[k, i]
+    return bits

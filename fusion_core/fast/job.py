@@ -32,20 +32,20 @@ def run(
     state: State, transition: Transition, measurement: Measurement, gates: Array, reset: Flags, *, steady: bool,
     keep_P: bool,
 ) -> Estimates:  # fmt: skip
-    """Return what `fusion_core.kalman.estimate` returns; everything has been checked."""
+    """Return the estimates of `fusion_core.kalman.estimate`; everything has been checked."""
     model, z, root = whitened(transition, measurement)
-    ahead = invariant(model.F[0], model.Q[0], model.H[0], model.r[0], state.P) if steady else None
-    groups = find_groups(model.F, model.Q, model.H, state.P) if ahead is None else ahead.groups
+    known = invariant(model.F[0], model.Q[0], model.H[0], model.r[0], state.P) if steady else None
+    groups = find_groups(model.F, model.Q, model.H, state.P) if known is None else known.groups
     job = Job(state, model, groups, Data(z, measurement.used, gates, reset), keep_P=keep_P)
     start, span, N = 0, SPAN, len(z)
     while start < N:
-        if ahead is None:
+        if known is None:
             start = job.recursive(start, N)
             continue
-        gains, length = ahead.ahead(job.P, min(N - start, span))
+        gains, length = known.gains_from(job.P, min(N - start, span))
         stop = start + length
-        start, span = job.steady(start, stop, ahead, gains), 4 * span
-        if start < stop:  # a sample was refused: it is judged again, with those after it
+        start, span = job.steady(start, stop, known, gains), 4 * span
+        if start < stop:  # a sample was refused: it is filtered again, with those after it
             start, span = job.recursive(start, min(N, start + DETOUR)), DETOUR
     return job.estimates(root)
 
@@ -70,14 +70,8 @@ def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, A
     return Model(F, Q, u, np.ascontiguousarray(to_white @ H), np.ones(R.shape[:2])), white, root
 
 
-def places_of(groups: IndependentGroups, *, keep_K: bool) -> Places:
-    """Return where the groups stand, as the compiled loops want it."""
-    s, c, _ = groups.size
-    return Places(*groups.unsigned, s, c, (0.0,) if keep_K else ())
-
-
 class Job:
-    """One call in progress: the groups' states x (G, s), P (G, s, s), and what was found so far."""
+    """One call in progress: the groups' states x (G, s), P (G, s, s), and the results so far."""
 
     def __init__(
         self,
@@ -89,7 +83,8 @@ class Job:
         keep_P: bool = False,
         keep_K: bool = False,
     ) -> None:
-        self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups, keep_K=keep_K)
+        self.groups, self.model, self.data = groups, model, data
+        self.places = Places(*groups.unsigned, *groups.size[:2], (0.0,) if keep_K else ())
         self.complete = bool(data.used.all())
         self.x, self.P = self._by_groups(state)
         (N, m), n = data.z.shape, len(state.x)
@@ -98,7 +93,7 @@ class Job:
         y, white = (np.empty((N, m)) if self.complete else np.full((N, m), np.nan) for _ in range(2))
         x, sigma, nis, log_det = np.empty((N, n)), np.empty((N, n)), np.empty(N), np.empty(N)
         P, K, root = np.empty((N if keep_P else 0, G, s, s)), np.zeros((some, G, c, s)), np.zeros((some, G, c))
-        self.found = SampleArrays(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
+        self.results = SampleArrays(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
 
     def recursive(self, start: int, stop: int) -> int:
         """Run up to `stop`, or further while P is wide; return where."""
@@ -136,28 +131,28 @@ class Job:
         return x[groups.states], groups.blocks(state.P, groups.states, groups.states)
 
     def _part(self, start: int, stop: int) -> tuple[Model, Data, SampleArrays]:
-        """Return what a stretch is run on."""
-        given, model, found = self.data, self.model, self.found
+        """Return the arrays of a stretch."""
+        given, model, results = self.data, self.model, self.results
         if stop - start < len(given.z):
             rows = slice(start, stop)
             model = Model._make(a if len(a) == 1 else a[rows] for a in model)
-            found = SampleArrays._make(a[rows] for a in found)
+            results = SampleArrays._make(a[rows] for a in results)
             given = Data(given.z[rows], given.used[rows], given.gates, given.reset)
-        return model, given, found
+        return model, given, results
 
-    def steady(self, start: int, stop: int, ahead: Invariant, gains: Gains) -> int:
+    def steady(self, start: int, stop: int, known: Invariant, gains: Gains) -> int:
         """Run up to `stop`, or to the first sample that the gate refuses or that is not finite; return which."""
-        groups, found, rows, N = self.groups, self.found, slice(start, stop), len(self.found.nis)
+        groups, results, rows, N = self.groups, self.results, slice(start, stop), len(self.results.nis)
         states, places, model = groups.states, groups.rows, self.model
         u = groups.lanes(model.u if len(model.u) == 1 else model.u[rows], states)
         z = groups.lanes(self.data.z[rows], places)
-        out = Lanes._make(a[rows] for a in (found.x, found.y, found.white, found.nis))
-        if groups.ordered:  # lanes are views of what was found
+        out = Lanes._make(a[rows] for a in (results.x, results.y, results.white, results.nis))
+        if groups.ordered:  # lanes are views of the results
             lanes = Lanes(out.x.reshape(-1, *u.shape[1:]), out.y.reshape(z.shape), out.white.reshape(z.shape), out.nis)
         else:
             lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
         x = self.x.T.copy()
-        steady(Sizes(*groups.size), x, GroupModel(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
+        steady(Sizes(*groups.size), x, GroupModel(known.F, known.H, gains.kinds, gains.K, gains.root), u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
@@ -171,30 +166,30 @@ class Job:
             out.x[:] = groups.from_lanes(lanes.x, states, n)
             out.y[:], out.white[:] = (groups.from_lanes(a, places, m) for a in (lanes.y, lanes.white))
         self.x, self.P = np.ascontiguousarray(x.T), gains.last
-        found.used[rows] = True
+        results.used[rows] = True
         if len(gains.P) == 1 and stop - start == N:  # all of it: nothing to write down for each sample
             sigma, log_det = gains.sigma(groups), gains.log_det
-            self.found = found._replace(
-                sigma=np.broadcast_to(sigma, found.sigma.shape), log_det=np.broadcast_to(log_det, N)
+            self.results = results._replace(
+                sigma=np.broadcast_to(sigma, results.sigma.shape), log_det=np.broadcast_to(log_det, N)
             )
         else:
-            found.sigma[rows], found.log_det[rows] = gains.sigma(groups), gains.log_det
-        if len(found.P):
-            found.P[rows] = gains.P[:, gains.kind]
+            results.sigma[rows], results.log_det[rows] = gains.sigma(groups), gains.log_det
+        if len(results.P):
+            results.P[rows] = gains.P[:, gains.kind]
         return stop
 
     def estimates(self, root: Array | None) -> Estimates:
-        """Return what was found; `root` takes the innovations back to where R was not diagonal."""
-        found, groups, used = self.found, self.groups, self.data.used
-        y, log_det = found.y, found.log_det
+        """Return the estimates; `root` takes the innovations back to where R was not diagonal."""
+        results, groups, used = self.results, self.groups, self.data.used
+        y, log_det = results.y, results.log_det
         dof = np.full(len(used), used.shape[1]) if self.complete else np.sum(used, axis=1)
         if root is not None:
             y = np.einsum("...ij,...j->...i", root, np.where(used, y, 0.0))
             y[~used] = np.nan
             log_det = log_det + 2 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
         return Estimates(
-            found.x, found.sigma, y, found.white, found.nis, log_det, dof, found.used,
-            State(self._all(self.x), groups.whole(self.P)), groups.whole(found.P) if self.keep_P else None,
+            results.x, results.sigma, y, results.white, results.nis, log_det, dof, results.used,
+            State(self._all(self.x), groups.whole(self.P)), groups.whole(results.P) if self.keep_P else None,
         )  # fmt: skip
 
 
@@ -202,7 +197,7 @@ Size = tuple[float, ...]
 
 
 class Sizes(NamedTuple):
-    """How many states and components a group has, and how many groups there are, as lengths."""
+    """Number of states and components of a group, and of groups, as lengths."""
 
     s: Size
     c: Size
@@ -220,7 +215,7 @@ class GroupModel(NamedTuple):
 
 
 class Lanes(NamedTuple):
-    """What is written down for each sample."""
+    """The results of each sample."""
 
     x: Array  # (N, s, G)
     y: Array  # (N, c, G)

@@ -26,7 +26,7 @@ Size = tuple[float, ...]
 
 
 class Places(NamedTuple):
-    """Where the groups' states and components stand in the model, and how many a group has.
+    """The places of the groups' states and components in the model, and their number in a group.
 
     A place that is filled up, because groups differ in size, is n for a state and m for a component.
     """
@@ -35,11 +35,11 @@ class Places(NamedTuple):
     rows: Index  # (G, c)
     s: Size
     c: Size
-    kept: Size  # of length 0 where gains are not written down: the compiler then leaves that out
+    gains: Size  # of length 0 where gains are not written down: the compiler then leaves that out
 
 
 class Model(NamedTuple):
-    """What `Transition` and `Measurement` hold, R diagonal; K is N, or 1 for what is the same at every sample."""
+    """`Transition` and `Measurement` with R diagonal; K is N, or 1 for what is the same at every sample."""
 
     F: Array  # (K, n, n)
     Q: Array  # (K, n, n)
@@ -49,7 +49,7 @@ class Model(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What was measured, and when it is not taken."""
+    """The measured values, and the rules by which they are not taken."""
 
     z: Array  # (N, m)
     used: Flags  # (N, m)
@@ -58,7 +58,7 @@ class Data(NamedTuple):
 
 
 class SampleStep(NamedTuple):
-    """What leads to a sample, and is measured there, group by group."""
+    """The step to a sample and its measurement, group by group."""
 
     F: Array  # (G, s, s)
     Q: Array  # (G, s, s)
@@ -69,7 +69,7 @@ class SampleStep(NamedTuple):
 
 
 class InnovationSums(NamedTuple):
-    """What the innovations of one sample add up to."""
+    """Sums over the innovations of one sample."""
 
     nis: float
     log_det: float
@@ -78,7 +78,7 @@ class InnovationSums(NamedTuple):
 
 
 class SampleArrays(NamedTuple):
-    """What is written down for each sample, as in `Estimates`; P is (N, G, s, s), or of length 0."""
+    """The results of each sample, as in `Estimates`; P is (N, G, s, s), or of length 0."""
 
     x: Array
     sigma: Array
@@ -100,7 +100,7 @@ inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 @compiled  # type: ignore[untyped-decorator]
 def uneven(Q: Array) -> bool:
-    """Return whether a covariance is not symmetric, by more than rounding."""
+    """Whether a covariance is not symmetric, by more than rounding."""
     sigma = np.sqrt(np.diag(Q))
     return not np.all(np.abs(Q - Q.T) <= 1e-9 * np.outer(sigma, sigma))
 
@@ -192,14 +192,14 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
 @inlined  # type: ignore[untyped-decorator]
 def measure(
     places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: SampleStep,
-    told: InnovationSums, found: SampleArrays,
+    sums: InnovationSums, results: SampleArrays,
 ) -> InnovationSums:  # fmt: skip
-    """Correct x and P of group g, as predicted, with what was measured of it at sample k; return what that told."""
+    """Correct x and P of group g, as predicted, with its measurement at sample k; return the new sums."""
     s, m = places.s, np.uint64(data.z.shape[1])
     for i in range(len(s)):
         step.x[i] = x[i]
     k_r = min(k, len(model.r) - 1)
-    nis, log_det, det, count = told
+    nis, log_det, det, count = sums
     for c in range(len(places.c)):
         row = places.rows[g, c]
         if row == m or not data.used[k, row]:
@@ -210,11 +210,11 @@ def measure(
             innovation -= h[j] * step.x[j]
         y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w)
         white = y * np.sqrt(inverse)
-        found.y[k, row], found.white[k, row] = innovation, white
-        if len(places.kept):
-            found.root[k, g, c] = np.sqrt(inverse)
+        results.y[k, row], results.white[k, row] = innovation, white
+        if len(places.gains):
+            results.root[k, g, c] = np.sqrt(inverse)
             for j in range(len(s)):
-                found.K[k, g, c, j] = step.w[j] * inverse
+                results.K[k, g, c, j] = step.w[j] * inverse
         nis += white * white
         count += 1
         det *= inverse
@@ -225,7 +225,7 @@ def measure(
 
 @compiled  # type: ignore[untyped-decorator]
 def recursive(
-    places: Places, x: Array, P: Array, model: Model, data: Data, found: SampleArrays
+    places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays
 ) -> tuple[Array, Array, int]:
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
@@ -238,19 +238,19 @@ def recursive(
     F, H, u = np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s))
     step = SampleStep(F, F.copy(), H, u, np.zeros(s), np.zeros(s))
     for k in range(len(data.z)):
-        told = InnovationSums(0.0, 0.0, 1.0, 0)
+        sums = InnovationSums(0.0, 0.0, 1.0, 0)
         for g in range(G):
             if not gather(places, g, model, k, step) and uneven(model.Q[k]):
                 return x, P, k
             predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
-            told = measure(places, g, model, data, k, x_[g], P_[g], step, told, found)
-        used = told.dof > 0 and told.nis <= data.gates[told.dof]
-        if not used and told.dof > 0:
+            sums = measure(places, g, model, data, k, x_[g], P_[g], step, sums, results)
+        used = sums.dof > 0 and sums.nis <= data.gates[sums.dof]
+        if not used and sums.dof > 0:
             for g in range(G):
                 predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
         x, P, x_, P_ = x_, P_, x, P
-        log_det = told.log_det - np.log(told.inverse)
-        check = told.nis + log_det
+        log_det = sums.log_det - np.log(sums.inverse)
+        check = sums.nis + log_det
         for g in range(G):
             for i in range(len(places.s)):
                 at = places.states[g, i]
@@ -258,13 +258,13 @@ def recursive(
                     break
                 if data.reset[at] and not used:
                     x[g, i], P[g, i], P[g, :, i] = 0.0, 0.0, 0.0
-                found.x[k, at], found.sigma[k, at] = x[g, i], np.sqrt(P[g, i, i])
-                check += found.x[k, at] + found.sigma[k, at]
-            if len(found.P):
+                results.x[k, at], results.sigma[k, at] = x[g, i], np.sqrt(P[g, i, i])
+                check += results.x[k, at] + results.sigma[k, at]
+            if len(results.P):
                 for i in range(len(places.s)):
                     for j in range(len(places.s)):
-                        found.P[k, g, i, j] = P[g, i, j]
-        found.nis[k], found.log_det[k], found.used[k] = told.nis, log_det, used
+                        results.P[k, g, i, j] = P[g, i, j]
+        results.nis[k], results.log_det[k], results.used[k] = sums.nis, log_det, used
         if not np.isfinite(check):
             return x, P, k
     return x, P, len(data.z)
@@ -279,8 +279,8 @@ class Alike(NamedTuple):
     r: Array
 
 
-class Ahead(NamedTuple):
-    """What is known of N samples before they are measured: P after each, gain and 1 / deviation of each innovation."""
+class GainArrays(NamedTuple):
+    """Results of N samples that do not depend on the data: P after each, gain and 1 / deviation of each innovation."""
 
     P: Array  # (N, D, s, s)
     K: Array  # (N, D, c, s)
@@ -289,7 +289,7 @@ class Ahead(NamedTuple):
 
 
 @compiled  # type: ignore[untyped-decorator]
-def gains(s: Size, c: Size, P: Array, model: Alike, out: Ahead) -> None:
+def gains(s: Size, c: Size, P: Array, model: Alike, out: GainArrays) -> None:
     """Run the covariance alone over N steps, from P (D, s, s)."""
     nothing, p, w = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s))
     x, u = np.zeros(len(s)), np.zeros(len(s))

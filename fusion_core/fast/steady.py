@@ -19,7 +19,7 @@ from fusion_core.fast.groups import IndependentGroups, Index, find_groups
 from fusion_core.model import Flags
 
 TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
-KEPT = 8  # transients of a model that are kept: recordings begin alike, and so do units of one config
+MAX_TRANSIENTS = 8  # of a model in the cache: recordings begin alike, and so do units of one config
 SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a tenth of what is promised of P
 
 
@@ -76,7 +76,7 @@ def _riccati(F: Array, Q: Array, H: Array, R: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class Gains:
-    """What N steps have in common whatever is measured; N = 1 stands for any number.
+    """Covariances and gains of N steps, whatever is measured; N = 1 stands for any number.
 
     Of D kinds of groups: those of one kind are alike, with s states and c components.
 
@@ -139,21 +139,21 @@ class Invariant:
         self.F, self.Q = groups.blocks(F, states, states), groups.blocks(Q, states, states)
         self.H, self.r = groups.blocks(H, rows, states), np.append(r, 1.0)[rows]
         self.steady = self._steady()
-        self._transient = lru_cache(KEPT)(self._from)
+        self._transient = lru_cache(MAX_TRANSIENTS)(self._from)
 
     def _steady(self) -> Gains | None:
         P = np.zeros_like(self.F)
         for g, (states, rows) in enumerate(zip(self.groups.states, self.groups.rows, strict=True)):
             a, b = states < self.groups.n, rows < self.groups.m  # what is filled up is zero and stays so
             square = np.ix_(a, a)
-            found = steady_state(self.F[g][square], self.Q[g][square], self.H[g][np.ix_(b, a)], np.diag(self.r[g][b]))
-            if found is None:
+            limit = steady_state(self.F[g][square], self.Q[g][square], self.H[g][np.ix_(b, a)], np.diag(self.r[g][b]))
+            if limit is None:
                 return None
-            P[g][square] = found.P
+            P[g][square] = limit.P
         gains = self._gains(P, 1)
         return gains if np.all(np.isfinite(gains.log_det)) else None
 
-    def ahead(self, P: Array, N: int) -> tuple[Gains, int]:
+    def gains_from(self, P: Array, N: int) -> tuple[Gains, int]:
         """Return gains from covariances P (G, s, s) on, and for how many steps: N, unless they still change."""
         if self.steady is not None:
             limit = self.steady.P[0, self.steady.kind]
@@ -168,7 +168,7 @@ class Invariant:
         return self._gains(np.frombuffer(P).reshape(self.F.shape), N)
 
     def _gains(self, P: Array, N: int) -> Gains:
-        from fusion_core.fast.loop import Ahead, Alike, gains
+        from fusion_core.fast.loop import Alike, GainArrays, gains
 
         parts = self.F, self.Q, self.H, self.r, P
         first: dict[bytes, int] = {}  # group of each kind
@@ -176,7 +176,7 @@ class Invariant:
         leaders = list(first.values())
         s, c, _ = self.groups.size
         D = len(leaders)
-        out = Ahead(
+        out = GainArrays(
             np.empty((N, D, len(s), len(s))), np.empty((N, D, len(c), len(s))), np.empty((N, D, len(c))),
             np.empty((N, D)),
         )  # fmt: skip

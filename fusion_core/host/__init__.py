@@ -1,1 +1,1 @@
-"""Where plugins and configurations meet: reading, the registry, and checks of what plugins answer."""
+"""The host of plugins: reading configurations, the registry, and the guard about each plugin."""

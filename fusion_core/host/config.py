@@ -22,8 +22,9 @@ from pydantic import BaseModel, ValidationError
 
 from fusion_core.errors import ConfigError, shown
 from fusion_core.host.document import Lines, Location, parse, parse_value
+from fusion_core.host.provenance import parts
 from fusion_core.settings import can_be_path, nearest
-from fusion_core.units import Quantity, Unit
+from fusion_core.units import Quantity
 
 Model = TypeVar("Model", bound=BaseModel)
 CHANNELS = ("source", "channels")  # a channel of null is one that the base has and this config goes without
@@ -54,15 +55,22 @@ class Document:
         return str(self.path)
 
 
-def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Document:
-    """Read a YAML file and everything that it extends.
+def read_document(path: Path, products: Mapping[str, Path] | None = None, chain: tuple[Path, ...] = ()) -> Document:
+    """Read a YAML file and everything that it extends; `chain` are the files that led here.
 
     Raises
     ------
     ConfigError
         If a file is missing, is not YAML, or extends itself.
     """
-    return _read(path, products or {}, ())
+    real = Path(os.path.realpath(path))  # which a circle of links does not end
+    if real in chain:
+        circle = " -> ".join(str(p) for p in (*chain[-4:], path))
+        raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
+    if len(chain) > LONGEST:
+        raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
+    data, lines = parse(path)
+    return _extended(Document(path, data, lines), products or {}, (*chain, real))
 
 
 def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] | None = None) -> Document:
@@ -80,31 +88,22 @@ def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] |
     return _extended(Document(Path("config"), dict(content)), products or {}, ())
 
 
-def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
-    real = Path(os.path.realpath(path))  # which a circle of links does not end
-    if real in seen:
-        circle = " -> ".join(str(p) for p in (*seen[-4:], path))
-        raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
-    if len(seen) > LONGEST:
-        raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
-    data, lines = parse(path)
-    return _extended(Document(path, data, lines), products, (*seen, real))
-
-
-def _extended(document: Document, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
+def _extended(document: Document, products: Mapping[str, Path], chain: tuple[Path, ...]) -> Document:
     """Return the document with what it extends below it; `seen` are the files that led here."""
     base = document.data.pop("extends", None)
     if base is None:
         return document
-    found = _base_path(str(base), document, products)
-    parent = _read(found, products, seen)
+    path = _base_path(str(base), document, products)
+    parent = read_document(path, products, chain)
     replaced: set[Location] = set()
     merged = _merge(parent.data, document.data, (), replaced)
-    kept = {at: line for at, line in parent.lines.items() if not any(at[:k] in replaced for k in range(len(at) + 1))}
+    inherited = {
+        at: line for at, line in parent.lines.items() if not any(at[:k] in replaced for k in range(len(at) + 1))
+    }
     extends = parent.extends
     if str(base) in products:  # and what it extends itself
-        extends = dict.fromkeys((found, *extends), (str(base), document.where(("extends",))))
-    return Document(document.path, merged, {**kept, **document.lines}, extends)
+        extends = dict.fromkeys((path, *extends), (str(base), document.where(("extends",))))
+    return Document(document.path, merged, {**inherited, **document.lines}, extends)
 
 
 def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:
@@ -120,13 +119,13 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
     )
 
 
-def _merge(base: dict[str, Any], own: dict[str, Any], at: Location, replaced: set[Location]) -> dict[str, Any]:
+def _merge(base: dict[str, Any], over: dict[str, Any], at: Location, replaced: set[Location]) -> dict[str, Any]:
     """Return both mappings merged, and add to `replaced` where nothing is left of the base."""
-    if "kind" in own and own["kind"] != base.get("kind", own["kind"]):
+    if "kind" in over and over["kind"] != base.get("kind", over["kind"]):
         replaced.add(at)
-        return own
+        return over
     merged = dict(base)
-    for key, value in own.items():
+    for key, value in over.items():
         both = isinstance(value, dict) and isinstance(base.get(key), dict)
         if not both:
             replaced.add((*at, key))
@@ -189,26 +188,12 @@ def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
     )
 
 
-def quantities(model: BaseModel, at: str = "") -> Iterator[tuple[str, Quantity]]:
+def quantities(model: BaseModel) -> Iterator[tuple[str, Quantity]]:
     """Yield every quantity of a config, defaults too: its place (`filter.gyro.noise`), text, unit and value in SI."""
-    for name, value in model:
-        info = type(model).model_fields.get(name)
-        unit = next((item.unit for item in info.metadata if isinstance(item, Unit)), None) if info else None
-        yield from _quantities(value, f"{at}.{name}" if at else name, unit)
-
-
-def _quantities(value: Any, at: str, unit: str | None) -> Iterator[tuple[str, Quantity]]:
-    if isinstance(value, BaseModel):
-        yield from quantities(value, at)
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _quantities(item, f"{at}.{key}", unit)
-    elif isinstance(value, tuple | list):
-        for k, item in enumerate(value):
-            yield from _quantities(item, f"{at}.{k}", unit)
-    elif isinstance(value, float) and (unit or isinstance(value, Quantity)):
-        own = value if isinstance(value, Quantity) else Quantity(value, f"{value!r} {unit}", unit)
-        yield at, Quantity(value, own.text, own.unit or unit)
+    for at, value, unit in parts(model):
+        if isinstance(value, float) and (unit or isinstance(value, Quantity)):
+            quantity = value if isinstance(value, Quantity) else Quantity(value, f"{value!r} {unit}", unit)
+            yield at, Quantity(value, quantity.text, quantity.unit or unit)
 
 
 def _written_location(location: Location, data: Any, *, missing: bool) -> Location:
@@ -250,8 +235,8 @@ def override(document: Document, setting: str) -> Document:
     data = _set(document.data, at, parse_value(text, origin), (), origin)
     replaced = at[:-1] if at[-1] == "kind" and len(at) > 1 else at
     lines = {place: line for place, line in document.lines.items() if place[: len(replaced)] != replaced}
-    own: Lines = {at[:depth]: (origin, 0) for depth in range(1, len(at) + 1)}
-    return replace(document, data=data, lines={**own, **lines, at: (origin, 0)})
+    above: Lines = {at[:depth]: (origin, 0) for depth in range(1, len(at) + 1)}
+    return replace(document, data=data, lines={**above, **lines, at: (origin, 0)})
 
 
 def _set(data: Any, at: Location, value: Any, above: Location, origin: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ Lines = dict[Location, tuple[Path, int]]
 
 LARGEST = 1 << 18  # bytes of a file
 DEEPEST = 32  # mappings and lists within one another
-MOST = 20_000  # values
+MAX_VALUES = 20_000  # values
 _TAG = "tag:yaml.org,2002:"
 _STRANGE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _BREAK = re.compile(r"[\n\r\x85\u2028\u2029]")  # in a value, which stands on one line in all that names it
@@ -104,8 +104,8 @@ class _Loader(yaml.SafeLoader):
         line = self.peek_event().start_mark.line + 1  # type: ignore[no-untyped-call]
         if self.depth > DEEPEST:
             raise ConfigError(f"{self.path}:{line}: is more than {DEEPEST} levels deep; write a config with fewer")
-        if self.count > MOST:
-            raise ConfigError(f"{self.path}:{line}: holds more than {MOST} values; write a config with fewer")
+        if self.count > MAX_VALUES:
+            raise ConfigError(f"{self.path}:{line}: holds more than {MAX_VALUES} values; write a config with fewer")
         node: yaml.Node | None = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -121,7 +121,7 @@ class _Reader:
 
     def mapping(self, node: yaml.MappingNode, at: Location) -> dict[str, Any]:
         """Read a mapping."""
-        found: dict[str, Any] = {}
+        content: dict[str, Any] = {}
         known: dict[str, int] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
@@ -138,16 +138,16 @@ class _Reader:
             self._check_line(key_node, at)
             known[key] = line
             self.lines[*at, key] = (self.path, line)
-            found[key] = self.value(value_node, (*at, key))
-        return found
+            content[key] = self.value(value_node, (*at, key))
+        return content
 
     def value(self, node: yaml.Node, at: Location) -> Any:
         """Read any node."""
         self.count += 1
         if node in self.within:
             raise self._wrong(node, "an alias stands within its own anchor", "write the values out")
-        if self.count > MOST:
-            raise self._wrong(node, f"with its aliases written out it holds more than {MOST} values", "use fewer")
+        if self.count > MAX_VALUES:
+            raise self._wrong(node, f"with its aliases written out it holds more than {MAX_VALUES} values", "use fewer")
         if len(at) > DEEPEST:
             raise self._wrong(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
         self._plain_tag(node)

@@ -16,8 +16,8 @@ import numpy as np
 
 from fusion_core.chunk import read_only
 from fusion_core.contracts import Plugin
-from fusion_core.contracts.output_checks import OF_PARTS
-from fusion_core.contracts.plugin import Check, Family, Origin, broken, built_in, claim, origin_of
+from fusion_core.contracts.families import PARTS
+from fusion_core.contracts.plugin import Check, Family, Origin, built_in, claim, origin_of, plugin_error
 from fusion_core.errors import FusionError, told
 
 WRITERS = ("save", "export")  # a full disk is no defect of theirs
@@ -44,24 +44,28 @@ def guard(cls: type[Plugin], family: Family, origin: Origin) -> None:
 
 def _guard(cls: type, checks: Mapping[str, Check | None], contract: type) -> None:
     for name in sorted(checks):
-        own = inspect.getattr_static(cls, name, None)
-        if own is None or own is inspect.getattr_static(contract, name, None):
-            continue  # the contract's own default: what it calls is guarded
-        wrapped = _wrapped(own, name, checks[name])
+        member = inspect.getattr_static(cls, name, None)
+        if member is None or member is inspect.getattr_static(contract, name, None):
+            continue  # the contract's member default: what it calls is guarded
+        wrapped = _wrapped(member, name, checks[name])
         if wrapped is not None:
             setattr(cls, name, wrapped)
 
 
-def _wrapped(own: Any, name: str, check: Check | None) -> Any:
+def _wrapped(member: Any, name: str, check: Check | None) -> Any:
     """Return a method or property with the boundary about it; None where there is none to put."""
-    if inspect.isfunction(own):
-        return None if hasattr(own, "__guarded__") else _call(own, name, check)
-    if isinstance(own, property) and own.fget is not None:
-        return None if hasattr(own.fget, "__guarded__") else property(_call(own.fget, name, check), doc=own.__doc__)
-    if isinstance(own, cached_property) and not hasattr(own.func, "__guarded__"):
-        found: cached_property[Any] = cached_property(_call(own.func, name, check))
-        found.__set_name__(None, name)  # type: ignore[arg-type]
-        return found
+    if inspect.isfunction(member):
+        return None if hasattr(member, "__guarded__") else _call(member, name, check)
+    if isinstance(member, property) and member.fget is not None:
+        return (
+            None
+            if hasattr(member.fget, "__guarded__")
+            else property(_call(member.fget, name, check), doc=member.__doc__)
+        )
+    if isinstance(member, cached_property) and not hasattr(member.func, "__guarded__"):
+        cached: cached_property[Any] = cached_property(_call(member.func, name, check))
+        cached.__set_name__(None, name)  # type: ignore[arg-type]
+        return cached
     return None
 
 
@@ -74,7 +78,7 @@ def _call(method: Callable[..., Any], name: str, check: Check | None) -> Callabl
             answer = method(self, *given, **named)
             if isinstance(answer, Iterator):
                 answer = _one_by_one(self, name, answer)
-            elif isinstance(answer, tuple(OF_PARTS)):
+            elif isinstance(answer, tuple(PARTS)):
                 _guard_part(type(answer), self)
         except (FusionError, KeyboardInterrupt, GeneratorExit):
             raise
@@ -94,10 +98,10 @@ def _one_by_one(plugin: Any, name: str, answer: Any) -> Iterator[Any]:
 def _guard_part(cls: type, maker: Any) -> None:
     """Put the boundary about a fitted map or a detector, which is of the one who made or read it."""
     origin = origin_of(type(maker))
-    contract = next(base for base in OF_PARTS if issubclass(cls, base))
+    contract = next(base for base in PARTS if issubclass(cls, base))
     if origin_of(cls) is None and origin is not None and cls.__module__ != contract.__module__:
         claim(cls, origin, maker.kind)
-        _guard(cls, {**OF_PARTS[contract], "save": None, "start": None}, contract)
+        _guard(cls, {**PARTS[contract], "save": None, "start": None}, contract)
 
 
 def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
@@ -109,4 +113,4 @@ def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
     advice = "this is a defect of the built-in plugin, report it" if ours else "mend or remove the plugin"
     if isinstance(error, ValueError) and "read-only" in str(error):
         advice = "what a plugin is given is shared, copy it before you write to it"
-    raise broken(plugin, text, advice) from error
+    raise plugin_error(plugin, text, advice) from error

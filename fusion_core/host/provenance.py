@@ -1,4 +1,4 @@
-"""Which plugins take part in a result."""
+"""The plugins that take part in a result, with their distributions and versions."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.plugin import Origin, Plugin, kind_default, origin_of
+from fusion_core.units import Unit
 
 Participant = dict[str, str]
 
@@ -18,9 +20,9 @@ def participants(config: Any, *others: type[Plugin]) -> list[Participant]:
 
     Distribution and version are empty for a class that is not installed.
     """
-    classes = {*map(type, _plugins(config)), *others}
-    found = {tuple(_participant(cls).items()): None for cls in classes}
-    return [dict(items) for items in sorted(found)]
+    classes = {*(type(part) for _, part, _ in parts(config) if isinstance(part, Plugin)), *others}
+    distinct = {tuple(_participant(cls).items()): None for cls in classes}
+    return [dict(items) for items in sorted(distinct)]
 
 
 def upgraded(before: Iterable[Participant], now: Iterable[Participant]) -> list[str]:
@@ -41,23 +43,23 @@ def _release(item: Participant) -> str:
 def _participant(cls: type[Plugin]) -> Participant:
     family = next((family.name for family in FAMILIES if issubclass(cls, family.contract)), "")
     origin = origin_of(cls) or Origin(family, "", "")
-    return {
-        "family": origin.family,
-        "kind": kind_default(cls),
-        "distribution": origin.distribution,
-        "version": origin.version,
-    }
+    return {"family": origin.family, "kind": kind_default(cls), **origin._asdict()}
 
 
-def _plugins(value: Any) -> Iterator[Plugin]:
-    if isinstance(value, Plugin):
-        yield value
+def parts(value: Any, at: str = "", unit: str | None = None) -> Iterator[tuple[str, Any, str | None]]:
+    """Yield a value of a config and each part of it, defaults too: its place, itself, and the unit of its field."""
+    yield at, value, unit
+    items: Iterable[tuple[Any, Any, str | None]] = ()
     if isinstance(value, BaseModel):
-        for _, item in value:
-            yield from _plugins(item)
+        known = type(value).model_fields
+        items = ((name, item, _unit_of(known.get(name))) for name, item in value)
     elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _plugins(item)
+        items = ((key, item, unit) for key, item in value.items())
     elif isinstance(value, tuple | list | set | frozenset):
-        for item in value:
-            yield from _plugins(item)
+        items = ((k, item, unit) for k, item in enumerate(value))
+    for key, item, unit_of_item in items:
+        yield from parts(item, f"{at}.{key}" if at else str(key), unit_of_item)
+
+
+def _unit_of(info: FieldInfo | None) -> str | None:
+    return next((item.unit for item in (info.metadata if info else ()) if isinstance(item, Unit)), None)

@@ -1,10 +1,10 @@
-"""Finding the installed plugins, and putting them into configurations.
+"""Discovery of the installed plugins, and their place in configurations.
 
 Entry points are loaded one by one and registered by their value: one that fails is kept with its error and does not
 stop the others, and two distributions may use the same entry-point name. The built-in ones come first, and who comes
 second does not get a name that is taken.
 
-What a class needs to be a plugin: a whole class of its family, with a kind, for a config to hold.
+A class is a plugin where it is a whole class of its family, with a kind, that a config can hold.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from functools import cache, partial, reduce
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from operator import or_
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-import pluggy
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit, PydanticUseDefault, core_schema
 
-from fusion_core import hookspecs
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.plugin import HOME, Family, Origin, Plugin
 from fusion_core.errors import FusionError, PluginError, shown, told
+from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
 from fusion_core.settings import nearest
 from fusion_core.units import bias_unit, unsettled
@@ -56,19 +54,15 @@ class Registry:
     """The plugins of one environment, by family and kind."""
 
     def __init__(self) -> None:
-        self._manager = pluggy.PluginManager(hookspecs.PROJECT)
-        self._manager.add_hookspecs(hookspecs)
-        self.families: dict[str, Family] = {}
+        self.families = {family.name: family for family in FAMILIES}
         self.entries: list[Entry] = []
-        for family in FAMILIES:
-            self._add_family(family)
 
     def load(self) -> None:
         """Load every entry point of the group, each on its own; families before the plugins that may be of them."""
         modules: dict[str, tuple[Any, EntryPoint]] = {}
-        for point in sorted(entry_points(group=hookspecs.PROJECT), key=_order):
-            if point.value not in modules and (found := self._attempt(point, point.load)) is not None:
-                modules[point.value] = found, point
+        for point in sorted(entry_points(group=PROJECT), key=_order):
+            if point.value not in modules and (module := self._attempt(point, point.load)) is not None:
+                modules[point.value] = module, point
         for value, (module, point) in list(modules.items()):
             if self._attempt(point, partial(self._bring_families, module)) is None:
                 del modules[value]
@@ -101,7 +95,7 @@ class Registry:
         return {e.kind: e.error for e in self.entries if e.error is not None}
 
     def _attempt(self, point: EntryPoint, do: Callable[[], Any]) -> Any:
-        """Return what is done with an entry point; None where it raises, were it an end of the program, and say so."""
+        """Return the result of an action on an entry point; None, and an entry, where it raises, were it SystemExit."""
         try:
             return do()
         except KeyboardInterrupt:
@@ -116,32 +110,20 @@ class Registry:
                 raise PluginError(f"families() returned {shown(repr(family))}; return a list of Family(...)")
             if family.name in (*self.families, PRODUCTS) or not family.name.isidentifier():
                 raise PluginError(f"family '{shown(family.name)}' is taken, or is no name; give it one of its own")
-            self._add_family(family)
+            self.families[family.name] = family
         return True
 
-    def _add_family(self, family: Family) -> None:
-        def hook() -> list[type[Plugin]]:
-            raise NotImplementedError  # a specification is never called
-
-        hook.__name__, hook.__doc__ = family.name, f"Return {family.contract.__name__}s: {family.purpose}."
-        space: Any = SimpleNamespace(**{family.name: hookspecs.hookspec(hook)})
-        self._manager.add_hookspecs(space)
-        self.families[family.name] = family
-
     def _answers(self, module: Any, hook: str) -> Iterator[Any]:
-        """Yield what a module's implementation of a hook returns; nothing where it has none."""
-        implementation = getattr(module, hook, None)
-        if implementation is not None and self._manager.parse_hookimpl_opts(module, hook) is not None:
-            found = implementation()
-            yield from found.items() if isinstance(found, Mapping) else found
+        """Yield the items that a module's implementation of a hook returns; nothing where it has none."""
+        if hook in _hooks_of(module):
+            items = getattr(module, hook)()
+            yield from items.items() if isinstance(items, Mapping) else items
 
     def _register(self, module: Any, name: str, point: EntryPoint | None) -> None:
-        self._manager.register(module, name)
-        hooks = [caller.name for caller in self._manager.get_hookcallers(module) or []]
+        hooks = _hooks_of(module)
         known = (*self.families, PRODUCTS, "families")
         unknown = [hook for hook in hooks if hook not in known]
         if unknown or not hooks:
-            self._manager.unregister(module)
             hint = nearest(unknown[0], known) if unknown else None
             advice = f"did you mean {hint}?" if hint else f"decorate a function named like one of {', '.join(known)}"
             raise PluginError(
@@ -183,6 +165,12 @@ class Registry:
         self.entries.append(Entry(family, kind, *_distribution(point), module, error=told(error, 300)))
 
 
+def _hooks_of(module: Any) -> list[str]:
+    """Return the names of the functions of a module that are marked as implementations of hooks."""
+    members = {name: getattr(module, name, None) for name in dir(module)}
+    return [name for name, item in members.items() if inspect.isroutine(item) and hasattr(item, f"{PROJECT}_impl")]
+
+
 def _product(name: Any, place: Any) -> tuple[str, Path]:
     path = Path(str(place))
     if not (isinstance(name, str) and name and name.isprintable() and "/" not in name):
@@ -193,7 +181,7 @@ def _product(name: Any, place: Any) -> tuple[str, Path]:
 
 
 def _called(item: Any) -> str:
-    """Return what something that is broken is called: its kind or name where it has one."""
+    """Return the name of something that is broken: its kind or name where it has one."""
     if isinstance(item, tuple):
         return shown(item[0])
     try:
@@ -245,7 +233,11 @@ class Installed:
             return core_schema.any_schema()
         classes = registry().classes(source)
         if not classes:
-            refuse = _refuse(registry().family_of(source).name)
+            text = f"no plugin of the family {registry().family_of(source).name} is installed; install one"
+
+            def refuse(value: Any) -> Any:
+                raise PydanticCustomError("no_plugin", "{text}", {"text": text})
+
             return core_schema.no_info_before_validator_function(refuse, core_schema.any_schema())
         union = reduce(or_, classes.values())
         tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
@@ -270,14 +262,6 @@ class Installed:
         return core_schema.no_info_wrap_validator_function(validate, schema)
 
 
-def _refuse(family: str) -> Callable[[Any], Any]:
-    def refuse(value: Any) -> Any:
-        text = f"no plugin of the family {family} is installed; install one"
-        raise PydanticCustomError("no_plugin", "{text}", {"text": text})
-
-    return refuse
-
-
 alone: ContextVar[bool] = ContextVar("alone", default=False)  # a class is looked at without the plugins within it
 
 
@@ -291,8 +275,8 @@ def check_class(family: Family, plugin: Any) -> None:
     if inspect.isabstract(plugin):
         missing = ", ".join(sorted(plugin.__abstractmethods__))
         raise PluginError(f"{plugin.__name__} does not define {missing}, which every {name} must")
-    own = plugin.__mro__[: plugin.__mro__.index(family.contract)]
-    written = next((vars(base)["contract"] for base in own if "contract" in vars(base)), 1)
+    classes = plugin.__mro__[: plugin.__mro__.index(family.contract)]
+    written = next((vars(base)["contract"] for base in classes if "contract" in vars(base)), 1)
     if written != family.contract.contract:
         raise PluginError(
             f"{plugin.__name__} was written for version {shown(written)} of the contract {name}, version "

@@ -52,12 +52,12 @@ def _partial(schema: Any) -> Any:
         return schema
     if "$ref" in schema:
         return {**schema, "$ref": schema["$ref"].replace("#/$defs/", f"#/$defs/{PART}")}
-    kept = {name: value for name, value in schema.items() if name not in ("required", "discriminator", "minProperties")}
-    if "oneOf" in kept:  # with nothing required, a part may be one of several kinds
-        kept["anyOf"] = kept.pop("oneOf")
+    part = {name: value for name, value in schema.items() if name not in ("required", "discriminator", "minProperties")}
+    if "oneOf" in part:  # with nothing required, a part may be one of several kinds
+        part["anyOf"] = part.pop("oneOf")
     for name in ("anyOf", "allOf", "additionalProperties"):
-        if name in kept:
-            kept[name] = _partial(kept[name])
-    if "properties" in kept:
-        kept["properties"] = {name: _partial(value) for name, value in kept["properties"].items()}
-    return kept
+        if name in part:
+            part[name] = _partial(part[name])
+    if "properties" in part:
+        part["properties"] = {name: _partial(value) for name, value in part["properties"].items()}
+    return part

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from inspect import isfunction
+from types import ModuleType
 
 from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Plugin, Source, ThermalMap
 from fusion_core.testing import (
@@ -23,20 +25,22 @@ from fusion_core.testing import (
     exporters,
     framings,
     measurement_models,
-    settings,
+    samples,
     sources,
     thermal_maps,
 )
 
 __all__ = ["Law", "check_plugin", "laws"]
 
-FAMILIES: Mapping[type[Plugin], Mapping[str, Callable[[Any], None]]] = {
-    BiasModel: bias_models.LAWS,
-    ThermalMap: thermal_maps.LAWS,
-    Source: sources.LAWS,
-    Effect: effects.LAWS,
-    MeasurementModel: measurement_models.LAWS,
-    Exporter: exporters.LAWS,
+MODULES: Mapping[type[Plugin], ModuleType] = {
+    Plugin: samples,
+    BiasModel: bias_models,
+    ThermalMap: thermal_maps,
+    Source: sources,
+    Framing: framings,
+    Effect: effects,
+    MeasurementModel: measurement_models,
+    Exporter: exporters,
 }
 
 
@@ -76,15 +80,30 @@ def laws(cls: type[Plugin], examples: Iterable[Plugin] | None = None, *, stream:
     stream : bytes
         Of a framing: some whole frames as the device sends them, from the first byte on.
     """
-    found = []
+    every = []
     chosen = list(cls.examples() if examples is None else examples)
     for k, plugin in enumerate(chosen):
         of = plugin.kind if len(chosen) == 1 else f"{plugin.kind}[{k}]"
-        family = next((own for base, own in FAMILIES.items() if isinstance(plugin, base)), {})
-        own = framings.laws_on(stream) if isinstance(plugin, Framing) else family
-        for name, check in {**settings.LAWS, **own}.items():
-            found.append(Law(name, of, lambda check=check, plugin=plugin: check(plugin)))  # type: ignore[misc]
-    return found
+        for contract, module in MODULES.items():
+            for name, check in _laws_in(module, contract) if isinstance(plugin, contract) else ():
+                more = {"stream": stream} if contract is Framing else {}
+                every.append(Law(name, of, partial(check, plugin, **more)))
+    return every
+
+
+def _laws_in(module: ModuleType, contract: type[Plugin]) -> list[tuple[str, Callable[..., None]]]:
+    """Return the laws of a family: the public functions of its module that take a plugin of it, named as they are.
+
+    In the name of a function `_` stands for a space and `__` for a hyphen.
+    """
+    functions = {
+        name: item for name, item in vars(module).items() if isfunction(item) and item.__module__ == module.__name__
+    }
+    return [
+        (name.replace("__", "-").replace("_", " "), item)
+        for name, item in functions.items()
+        if not name.startswith("_") and contract.__name__ in item.__annotations__.values()
+    ]
 
 
 def check_plugin(cls: type[Plugin], examples: Iterable[Plugin] | None = None, *, stream: bytes = b"") -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import pickle
+from dataclasses import replace
 
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import BiasModel, Transition
+from fusion_core.contracts import BiasModel, Memory, Transition
 from fusion_core.contracts.output_checks import check_prior, check_transition
-from fusion_core.testing.samples import CUTS, N, pieces, recording
+from fusion_core.testing.samples import N, check_any_split, check_memory, recording
 
 
 def states_have_names_and_units(model: BiasModel) -> None:
@@ -18,9 +18,9 @@ def states_have_names_and_units(model: BiasModel) -> None:
     assert len(model.units("rad/s")) == len(model.labels), "there is not one unit for each label"
 
 
-def prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
+def the_prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
     """X (n,), P (n, n) symmetric without a negative eigenvalue; so also at the first sample, and after the last."""
-    chunk = recording(model.requires, regular=True, columns=model.channel_columns)
+    chunk = _recording(model, regular=True)
     check_prior(model, model.prior())
     check_prior(model, model.prior_at(chunk))
     check_prior(model, model.prior_again(model.transition(chunk, None)[1]))
@@ -29,24 +29,28 @@ def prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
 def steps_have_their_shapes(model: BiasModel) -> None:
     """F, Q, u and C have their shapes and are finite, Q is a covariance; on one sample too."""
     for regular in (True, False):
-        chunk = recording(model.requires, regular=regular, columns=model.channel_columns)
+        chunk = _recording(model, regular=regular)
         for part in (chunk, chunk.part(0, 1), chunk.part(5, 6)):
             check_transition(model, model.transition(part, None)[0], len(part))
 
 
 def any_split_gives_the_same_steps(model: BiasModel) -> None:
     """Cut anywhere, F, Q, u and C are the same to the last bit."""
+    n, d = len(model.labels), len(model.axes)
+    shapes = {"F": (n, n), "Q": (n, n), "u": (n,), "C": (d, n)}
+
+    def steps(piece: Chunk, memory: Memory) -> tuple[dict[str, Array], Memory]:
+        step, memory = model.transition(piece, memory)
+        step = replace(step, C=np.eye(d, n)) if step.C is None else step
+        return {k: np.broadcast_to(getattr(step, k), (len(piece), *shape)) for k, shape in shapes.items()}, memory
+
     for regular in (True, False):
-        chunk = recording(model.requires, regular=regular, columns=model.channel_columns)
-        whole = _steps(model, chunk, ())
-        for cuts in CUTS[1:]:
-            for name, one, other in zip("FQuC", whole, _steps(model, chunk, cuts), strict=True):
-                np.testing.assert_allclose(other, one, rtol=1e-12, atol=0, err_msg=f"{name}, cut at {cuts[:5]}")
+        check_any_split(steps, _recording(model, regular=regular))
 
 
 def two_steps_are_one_long_step(model: BiasModel) -> None:
     """F(a + b) = F(b) F(a) and Q(a + b) = F(b) Q(a) F(b)' + Q(b), where the channels stand still."""
-    chunk = recording(model.requires, regular=True, columns=model.channel_columns)
+    chunk = _recording(model, regular=True)
 
     def over(dt: float) -> Transition:
         channels = {name: values[:1] for name, values in chunk.channels.items()}
@@ -61,40 +65,16 @@ def two_steps_are_one_long_step(model: BiasModel) -> None:
 
 def equal_steps_are_said_to_be_equal(model: BiasModel) -> None:
     """Over equal steps F and Q have no leading N where they are the same for all: the filter is many times faster."""
-    step, _ = model.transition(recording(model.requires, regular=True, columns=model.channel_columns).part(1, N), None)
+    step, _ = model.transition(_recording(model, regular=True).part(1, N), None)
     for name, array in (("F", step.F), ("Q", step.Q)):
         same = array.ndim == 3 and len(array) > 1 and np.array_equal(array, np.broadcast_to(array[:1], array.shape))
         assert not same, f"{name} is the same for all steps and has a leading N; leave it out where chunk.dt is 0-d"
 
 
-def memory_that_came_in_is_not_changed(model: BiasModel) -> None:
+def the_memory_that_came_in_is_not_changed(model: BiasModel) -> None:
     """The memory is a value: after the next chunk it is what it was."""
-    first, second = pieces(recording(model.requires, regular=False, columns=model.channel_columns), (50,))
-    _, memory = model.transition(first, None)
-    before = pickle.dumps(memory)
-    model.transition(second, memory)
-    assert pickle.dumps(memory) == before, "transition changes the memory that it is given; return a new one"
+    check_memory("transition", model.transition, _recording(model, regular=False))
 
 
-def _steps(model: BiasModel, chunk: Chunk, cuts: tuple[int, ...]) -> list[Array]:
-    """Return F, Q, u and C of every sample, from the recording cut into pieces."""
-    memory, parts = None, []
-    n, d = len(model.labels), len(model.axes)
-    for piece in pieces(chunk, cuts):
-        step, memory = model.transition(piece, memory)
-        C = np.eye(d, n) if step.C is None else step.C
-        shapes = ((n, n), (n, n), (n,), (d, n))
-        parts.append([np.broadcast_to(a, (len(piece), *shape)) for a, shape in
-                      zip((step.F, step.Q, step.u, C), shapes, strict=True)])  # fmt: skip
-    return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-
-
-LAWS = {
-    "states have names and units": states_have_names_and_units,
-    "the prior is a mean and a covariance": prior_is_a_mean_and_a_covariance,
-    "steps have their shapes": steps_have_their_shapes,
-    "any split gives the same steps": any_split_gives_the_same_steps,
-    "two steps are one long step": two_steps_are_one_long_step,
-    "equal steps are said to be equal": equal_steps_are_said_to_be_equal,
-    "the memory that came in is not changed": memory_that_came_in_is_not_changed,
-}
+def _recording(model: BiasModel, *, regular: bool) -> Chunk:
+    return recording(model.requires, regular=regular, columns=model.channel_columns)

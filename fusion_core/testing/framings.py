@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Frames, Framing
 
-MOST = 1 << 18  # bytes of a memory that is small
+MAX_MEMORY = 1 << 18  # bytes of a memory that is small
 GARBAGE = {
     "random bytes": np.random.default_rng(0).bytes(5000),
     "zeros": bytes(5000),
@@ -20,17 +19,6 @@ GARBAGE = {
     "text": b"a,b,c\n1,2\n,,,\n\n1,2,x\nnan,inf,1e999\n" * 50,
     "one long line": b"1,2,3," * 1000,
 }
-
-
-def laws_on(stream: bytes) -> dict[str, Callable[[Framing], None]]:
-    """Return the laws by name, on a stream of whole frames."""
-    return {
-        "samples have their shapes": partial(samples_have_their_shapes, stream=stream),
-        "any split gives the same samples": partial(any_split_gives_the_same_samples, stream=stream),
-        "a stream may begin anywhere": partial(stream_may_begin_anywhere, stream=stream),
-        "what is no frame is passed over": partial(garbage_is_passed_over, stream=stream),
-        "the memory stays small": partial(memory_stays_small, stream=stream),
-    }
 
 
 def samples_have_their_shapes(framing: Framing, stream: bytes) -> None:
@@ -52,7 +40,7 @@ def any_split_gives_the_same_samples(framing: Framing, stream: bytes) -> None:
         _same(_decoded(framing, _cut(noisy, sizes)), whole)
 
 
-def stream_may_begin_anywhere(framing: Framing, stream: bytes) -> None:
+def a_stream_may_begin_anywhere(framing: Framing, stream: bytes) -> None:
     """From the middle of a frame on, the samples are the last of those of the whole stream: none is made of a part."""
     whole, _ = _decoded(framing, [stream])
     steps = max(1, len(stream) // 200)
@@ -64,27 +52,27 @@ def stream_may_begin_anywhere(framing: Framing, stream: bytes) -> None:
             np.testing.assert_array_equal(values, last, err_msg=f"{name}, from byte {k} on: a sample of a torn frame")
 
 
-def garbage_is_passed_over(framing: Framing, stream: bytes) -> None:
+def what_is_no_frame_is_passed_over(framing: Framing, stream: bytes) -> None:
     """Bytes that are no frames raise nothing, and the frames after them are found."""
     n = framing.decode(stream + stream, None)[0].N
     for what, garbage in GARBAGE.items():
         for data in (garbage, stream + garbage + b"\n" + stream + stream):
             try:
-                found = framing.decode(data, None)[0].N
+                count = framing.decode(data, None)[0].N
             except Exception as error:
                 raise AssertionError(f"{what}: {type(error).__name__}: {error}") from error
-        assert not n or found >= n // 2, f"after {what}, {found} of {n} samples are found"
+        assert not n or count >= n // 2, f"after {what}, {count} of {n} samples are found"
 
 
-def memory_stays_small(framing: Framing, stream: bytes) -> None:
-    """Whatever comes, the memory does not grow with it."""
+def the_memory_stays_small(framing: Framing, stream: bytes) -> None:
+    """The memory does not grow with the bytes that come."""
     for what, garbage in {**GARBAGE, "frames": stream}.items():
         memory = None
         for _ in range(200 if garbage else 0):
             _, memory = framing.decode(garbage, memory)
         size = len(pickle.dumps(memory))
-        assert size < MOST, (
-            f"after {200 * len(garbage)} bytes ({what}) the memory has {size}, less than {MOST} expected"
+        assert size < MAX_MEMORY, (
+            f"after {200 * len(garbage)} bytes ({what}) the memory has {size}, less than {MAX_MEMORY} expected"
         )
 
 
@@ -99,16 +87,18 @@ def _cut(stream: bytes, sizes: Iterable[int]) -> list[bytes]:
 
 
 def _decoded(framing: Framing, parts: Iterable[bytes]) -> tuple[dict[str, Array], Counter[str]]:
-    memory, found, rejected = None, list[Frames](), Counter[str]()
+    memory, frames_of_parts, rejected = None, list[Frames](), Counter[str]()
     for part in parts:
         frames, memory = framing.decode(part, memory)
-        found.append(frames)
+        frames_of_parts.append(frames)
         rejected.update(frames.rejected)
-    arrays = [{**f.channels, **({} if f.count is None else {"count": f.count})} for f in found]
-    return {name: np.concatenate([own[name] for own in arrays]) for name in arrays[0]} if arrays else {}, +rejected
+    arrays = [{**f.channels, **({} if f.count is None else {"count": f.count})} for f in frames_of_parts]
+    return {
+        name: np.concatenate([arrays_of_part[name] for arrays_of_part in arrays]) for name in arrays[0]
+    } if arrays else {}, +rejected
 
 
-def _same(found: tuple[dict[str, Array], Counter[str]], expected: tuple[dict[str, Array], Counter[str]]) -> None:
-    assert found[1] == expected[1], f"rejected are {dict(found[1])} and {dict(expected[1])} in one piece"
+def _same(got: tuple[dict[str, Array], Counter[str]], expected: tuple[dict[str, Array], Counter[str]]) -> None:
+    assert got[1] == expected[1], f"rejected are {dict(got[1])} and {dict(expected[1])} in one piece"
     for name, values in expected[0].items():
-        np.testing.assert_array_equal(found[0][name], values, err_msg=name)
+        np.testing.assert_array_equal(got[0][name], values, err_msg=name)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, MeasurementModel, Memory, Site
-from fusion_core.testing.samples import pieces
+from fusion_core.contracts.output_checks import expect_array, expect_covariance
+from fusion_core.testing.samples import CUTS, Method, check_any_split, check_memory, joined
 
 SITE = Site(latitude=0.7, heading=0.3)
-CUTS: tuple[tuple[int, ...], ...] = ((1,), (60,), (7, 8, 9, 100))
 
 
-def epochs(model: MeasurementModel, site: Site = SITE, N: int = 400) -> Chunk:
+def _epochs(model: MeasurementModel, site: Site = SITE, N: int = 400) -> Chunk:
     """Return N epochs as the model itself makes them up, at rest; every other channel that is needed stands still."""
     tau = float(model.update_interval)
     needed = {*model.requires, *(name for sensor in model.sensors for name in sensor.bias.requires)}
@@ -40,7 +38,7 @@ def states_and_components_have_names(model: MeasurementModel) -> None:
 def rest_is_taken_for_rest(model: MeasurementModel) -> None:
     """Epochs that the model makes up at rest are at rest, can be aligned on, and set off no alarm."""
     for site in (SITE, Site()):
-        chunk = epochs(model, site)
+        chunk = _epochs(model, site)
         assert model.still(chunk), f"what it simulates at rest at {site} is taken for motion"
         model.check(chunk, site)
         alignment = model.aligned(chunk, site)
@@ -53,77 +51,58 @@ def rest_is_taken_for_rest(model: MeasurementModel) -> None:
 
 def equations_have_their_shapes(model: MeasurementModel) -> None:
     """F, Q, u, z, H and R have their shapes and are finite; Q has no eigenvalue below zero, R none at zero either."""
-    chunk = epochs(model)
+    chunk = _epochs(model)
     n, m = model.n, model.m
     shapes = {"F": (n, n), "Q": (n, n), "u": (n,), "z": (m,), "H": (m, n), "R": (m, m)}
     for part in (chunk, chunk.part(5, 6)):
-        for name, values in _equations(model, part, model.aligned(chunk, SITE), ()).items():
-            assert values.shape == (len(part), *shapes[name]), f"{name} has shape {values.shape}"
-            assert np.all(np.isfinite(values)), f"{name} is not finite"
+        equations = joined(_equations(model, model.aligned(chunk, SITE)), part, ())
+        for name, values in equations.items():
+            expect_array(model, name, values, ((len(part), *shapes[name]),))
             if name in "QR":
-                _covariances(name, values[:1], least=0.0 if name == "Q" else None)
+                expect_covariance(model, name, values[:1])
+        assert np.min(np.linalg.eigvalsh(equations["R"][:1])) > 0, "R has an eigenvalue of zero"
 
 
 def any_split_gives_the_same(model: MeasurementModel) -> None:
     """Cut anywhere, the equations are the same, and so is what the detector says."""
-    chunk = epochs(model, N=400).part(200, 320)
-    alignment = model.aligned(epochs(model).part(0, 200), SITE)
-    whole, seen = _equations(model, chunk, alignment, ()), _looked(model, chunk, alignment, ())
-    for cuts in CUTS:
-        for name, values in _equations(model, chunk, alignment, cuts).items():
-            np.testing.assert_allclose(values, whole[name], rtol=1e-12, atol=1e-300, err_msg=f"{name}, cut at {cuts}")
-        np.testing.assert_array_equal(_looked(model, chunk, alignment, cuts), seen, err_msg=f"detector, cut at {cuts}")
+    chunk = _epochs(model).part(200, 320)
+    alignment = model.aligned(_epochs(model).part(0, 200), SITE)
+    for method in (_equations(model, alignment), _detections(model, alignment)):
+        check_any_split(method, chunk, CUTS[1:4])
 
 
-def memory_of_the_detector_is_not_changed(model: MeasurementModel) -> None:
+def the_memory_of_the_detector_is_not_changed(model: MeasurementModel) -> None:
     """The memory is a value: after the next chunk it is what it was."""
-    chunk = epochs(model)
+    chunk = _epochs(model)
     detector = model.detector(model.aligned(chunk, SITE))
-    *_, memory = detector.look(chunk.part(0, 50), detector.start())
-    before = pickle.dumps(memory)
-    detector.look(chunk.part(50, 100), memory)
-    assert pickle.dumps(memory) == before, "look changes the memory that it is given; return a new one"
+
+    check_memory("look", detector.look, chunk.part(0, 100), detector.start())
 
 
-def _equations(model: MeasurementModel, chunk: Chunk, alignment: Alignment, cuts: tuple[int, ...]) -> dict[str, Array]:
-    """Return F, Q, u, z, H and R of every epoch, from the recording cut into pieces."""
-    memories: list[Memory] = [None] * len(model.sensors)
-    parts: dict[str, list[Array]] = {name: [] for name in ("F", "Q", "u", "z", "H", "R")}
-    for piece in pieces(chunk, cuts):
-        found = [s.bias.transition(piece, memory) for s, memory in zip(model.sensors, memories, strict=True)]
-        memories = [memory for _, memory in found]
-        step, measured = model.equations(piece, [step for step, _ in found], alignment)
-        values = {"F": step.F, "Q": step.Q, "H": measured.H, "R": measured.R}
-        for name, value in {**values, "u": step.u, "z": measured.z}.items():
-            whole = (
-                value if value.ndim > (1 if name in "uz" else 2) else np.broadcast_to(value, (len(piece), *value.shape))
-            )
-            parts[name].append(whole)
-    return {name: np.concatenate(values) for name, values in parts.items()}
+def _equations(model: MeasurementModel, alignment: Alignment) -> Method:
+    """Return the method that gives F, Q, u, z, H and R of every epoch."""
+
+    def equations(piece: Chunk, memory: Memory) -> tuple[dict[str, Array], Memory]:
+        memories = [None] * len(model.sensors) if memory is None else memory
+        steps = [s.bias.transition(piece, memory) for s, memory in zip(model.sensors, memories, strict=True)]
+        step, measured = model.equations(piece, [one for one, _ in steps], alignment)
+        arrays = {"F": (step.F, 2), "Q": (step.Q, 2), "u": (step.u, 1), "z": (measured.z, 1), "H": (measured.H, 2)}
+        arrays["R"] = measured.R, 2
+        each = {
+            name: a if a.ndim > ndim else np.broadcast_to(a, (len(piece), *a.shape))
+            for name, (a, ndim) in arrays.items()
+        }
+        return each, [memory for _, memory in steps]
+
+    return equations
 
 
-def _looked(model: MeasurementModel, chunk: Chunk, alignment: Alignment, cuts: tuple[int, ...]) -> Array:
+def _detections(model: MeasurementModel, alignment: Alignment) -> Method:
+    """Return the method that gives what the detector shows of every epoch."""
     detector = model.detector(alignment)
-    memory, parts = detector.start(), []
-    for piece in pieces(chunk, cuts):
-        still, standing_out, memory = detector.look(piece, memory)
-        parts.append(np.column_stack([still, standing_out]))
-    return np.concatenate(parts)
 
+    def detections(piece: Chunk, memory: Memory) -> tuple[dict[str, Array], Memory]:
+        still, standing_out, memory = detector.look(piece, detector.start() if memory is None else memory)
+        return {"detector": np.column_stack([still, standing_out]).astype(np.float64)}, memory
 
-def _covariances(name: str, matrices: Array, least: float | None) -> None:
-    scale = float(np.max(np.abs(matrices)))
-    np.testing.assert_allclose(
-        matrices, np.swapaxes(matrices, -1, -2), atol=1e-12 * scale, err_msg=f"{name}: symmetric"
-    )
-    smallest = float(np.min(np.linalg.eigvalsh(matrices)))
-    assert smallest > 0 if least is None else smallest >= -1e-12 * scale, f"{name} has the eigenvalue {smallest:g}"
-
-
-LAWS = {
-    "states and components have names": states_and_components_have_names,
-    "rest is taken for rest": rest_is_taken_for_rest,
-    "equations have their shapes": equations_have_their_shapes,
-    "any split gives the same": any_split_gives_the_same,
-    "the memory of the detector is not changed": memory_of_the_detector_is_not_changed,
-}
+    return detections

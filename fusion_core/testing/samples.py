@@ -1,21 +1,27 @@
-"""Samples to try plugins on: read-only, with nothing in them but the channels that a plugin says it reads."""
+"""Machinery of the laws: samples to try plugins on, checks that several families share, and the laws of every plugin.
+
+Samples are read-only, with nothing in them but the channels that a plugin says it reads.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import USUAL
+from fusion_core.contracts import USUAL, Memory, Plugin
 
 N = 120
 CUTS = ((), (1,), (60,), (7, 8, 9, 100), tuple(range(1, N)))
 """Where recordings are cut: the first is not."""
 
-
 NONE: Mapping[str, int] = MappingProxyType({})
+Method = Callable[[Chunk, Memory], tuple[Mapping[str, Array], Memory]]
 
 
 def recording(channels: Iterable[str], *, regular: bool, columns: Mapping[str, int] = NONE, seed: int = 0) -> Chunk:
@@ -50,3 +56,53 @@ def _frozen(chunk: Chunk) -> Chunk:
     for values in (chunk.t, *chunk.channels.values()):
         values.setflags(write=False)
     return chunk
+
+
+def joined(method: Method, chunk: Chunk, cuts: tuple[int, ...]) -> dict[str, Array]:
+    """Return the arrays that a method gives over a recording cut into pieces, its memory passed on."""
+    memory, parts = None, []
+    for piece in pieces(chunk, cuts):
+        arrays, memory = method(piece, memory)
+        parts.append(arrays)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def check_any_split(method: Method, chunk: Chunk, ways: Iterable[tuple[int, ...]] = CUTS[1:]) -> None:
+    """Raise AssertionError where a method gives other arrays once the recording is cut."""
+    whole = joined(method, chunk, ())
+    for cuts in ways:
+        for name, values in joined(method, chunk, cuts).items():
+            message = f"{name}, cut at {cuts[:5]}"
+            np.testing.assert_allclose(values, whole[name], rtol=1e-12, atol=1e-300, err_msg=message)
+
+
+def check_memory(name: str, method: Callable[[Chunk, Memory], Any], chunk: Chunk, start: Memory = None) -> None:
+    """Raise AssertionError where a method changes the memory, which it returns last, that it is given."""
+    first, second = pieces(chunk, (50,))
+    *_, memory = method(first, start)
+    before = pickle.dumps(memory)
+    method(second, memory)
+    assert pickle.dumps(memory) == before, f"{name} changes the memory that it is given; return a new one"
+
+
+def check_refused(error: type[Exception], text: str, action: Callable[..., Any], *arguments: Any) -> None:
+    """Raise AssertionError with a text where an action does not raise an error."""
+    try:
+        action(*arguments)
+    except error:
+        return
+    raise AssertionError(text)
+
+
+def settings_can_be_written_and_read_again(plugin: Plugin) -> None:
+    """`model_validate(model_dump())` gives the same plugin, also through JSON."""
+    cls = type(plugin)
+    assert cls.model_validate(plugin.model_dump()) == plugin, "model_dump() is read as other settings"
+    again = cls.model_validate(json.loads(plugin.model_dump_json()))
+    assert again == plugin, "model_dump_json() is read as other settings"
+
+
+def says_what_it_is(plugin: Plugin) -> None:
+    """The class has a docstring, and `kind` a default."""
+    assert type(plugin).__doc__, "the class has no docstring; say in a sentence what it is"
+    assert type(plugin).model_fields["kind"].default == plugin.kind, "kind has no default; write it beside its type"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import DataError, MapError, OutsideDomain
+from fusion_core.testing.samples import check_refused
 from fusion_core.thermal.soak_noise import blocks_of
 
 LOW, HIGH = -10.0, 50.0
@@ -23,12 +24,15 @@ def soak(d: int = 3) -> tuple[Array, Array]:
     """Return T (N,) up and down again and a bias (N, d) of 1e-3 rad/s that follows it, with noise; read-only."""
     rng = np.random.default_rng(0)
     T = np.concatenate([np.linspace(LOW, HIGH, 3000), np.linspace(HIGH, LOW, 3000)])
-    x = (T - 20) / 30
-    curves = np.stack([x, x**2 - 0.3 * x, np.sin(2 * x)], axis=1)[:, :d]
-    bias = 1e-3 * curves + 1e-5 * rng.normal(size=(len(T), d))
+    bias = 1e-3 * _curves(T)[:, :d] + 1e-5 * rng.normal(size=(len(T), d))
     T.setflags(write=False)
     bias.setflags(write=False)
     return T, bias
+
+
+def _curves(T: Array) -> Array:
+    x = (T - 20) / 30
+    return np.stack([x, x**2 - 0.3 * x, np.sin(2 * x)], axis=1)
 
 
 @lru_cache(maxsize=8)
@@ -44,16 +48,16 @@ def follows_the_soak(settings: ThermalMap) -> None:
         record = fitted.record
         assert (record.kind, record.d) == (settings.kind, d), f"the record is of {record.d} axes and kind {record.kind}"
         assert record.domain == (T.min(), T.max()), f"domain is {record.domain}"
-        found = fitted.bias(T)
-        assert found.shape == fitted.slope(T).shape == bias.shape, f"bias has shape {found.shape}"
-        left = np.sqrt(np.mean((bias - found) ** 2, axis=0))
+        curve = fitted.bias(T)
+        assert curve.shape == fitted.slope(T).shape == bias.shape, f"bias has shape {curve.shape}"
+        left = np.sqrt(np.mean((bias - curve) ** 2, axis=0))
         assert np.all(left < 0.5 * np.std(bias, axis=0)), f"the fit leaves {left} rad/s of {np.std(bias, axis=0)}"
         if record.residual is not None:
             np.testing.assert_allclose(record.residual, left, rtol=1e-3, err_msg="residual is not what the fit leaves")
         assert np.all(fitted.sigma(T) >= 0), "sigma is negative"
 
 
-def slope_is_the_derivative(settings: ThermalMap) -> None:
+def the_slope_is_the_derivative(settings: ThermalMap) -> None:
     """`slope` agrees with differences of `bias`."""
     fitted = _fitted(settings)
     T, h = np.linspace(LOW + 1.03, HIGH - 1.07, 301), 1e-3
@@ -80,25 +84,23 @@ def damaged_files_are_refused(settings: ThermalMap) -> None:
     """A file that is missing or cut short is a MapError, and one with changed bytes no other error."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"map{settings.suffix}"
-        own = settings.model_copy(update={"path": path})
-        _refused(own.load, "a missing file")
+        with_path = settings.model_copy(update={"path": path})
+        check_refused(MapError, "a missing file is loaded", with_path.load)
         _fitted(settings).save(path)
         whole = path.read_bytes()
         for share in (0.0, 0.1, 0.5, 0.9):
             path.write_bytes(whole[: int(share * len(whole))])
-            _refused(own.load, f"the first {share:.0%} of a file")
+            check_refused(MapError, f"the first {share:.0%} of a file is loaded", with_path.load)
         rng = np.random.default_rng(0)
         for _ in range(30):
             damaged = bytearray(whole)
             damaged[int(rng.integers(len(whole)))] ^= int(rng.integers(1, 256))
             path.write_bytes(damaged)
-            try:
-                own.load().bias(np.array([20.0]))
-            except DataError:
-                continue
+            with suppress(DataError):
+                with_path.load().bias(np.array([20.0]))
 
 
-def domain_is_kept(settings: ThermalMap) -> None:
+def the_domain_is_kept(settings: ThermalMap) -> None:
     """Beyond the soak a map refuses, keeps the value at the end, or goes straight on, as `outside` says."""
     T = np.array([LOW - 5.0, LOW, HIGH, HIGH + 5.0])
     with tempfile.TemporaryDirectory() as folder:
@@ -107,12 +109,7 @@ def domain_is_kept(settings: ThermalMap) -> None:
         refusing, clamped, straight = (
             settings.model_copy(update={"outside": outside}).read(path) for outside in ("refuse", "clamp", "tangent")
         )
-    try:
-        refusing.bias(T)
-    except OutsideDomain:
-        pass
-    else:
-        raise AssertionError("outside: refuse gives a bias beyond the domain")
+    check_refused(OutsideDomain, "outside: refuse gives a bias beyond the domain", refusing.bias, T)
     bias, slope = clamped.bias(T), clamped.slope(T)
     np.testing.assert_array_equal(bias[[0, 3]], bias[[1, 2]], err_msg="outside: clamp moves beyond the domain")
     assert not np.any(slope[[0, 3]]), "outside: clamp has a slope beyond the domain"
@@ -129,14 +126,10 @@ def samples_that_cannot_be_fitted_are_refused(settings: ThermalMap) -> None:
         where.flat[7] = np.nan
     cases["a NaN"] = (T, bias)
     for what, samples in cases.items():
-        try:
-            settings.fit(*samples, PROVENANCE)
-        except DataError:
-            continue
-        raise AssertionError(f"a soak with {what} is fitted")
+        check_refused(DataError, f"a soak with {what} is fitted", settings.fit, *samples, PROVENANCE)
 
 
-def basis_can_be_fitted(settings: ThermalMap) -> None:
+def the_basis_can_be_fitted(settings: ThermalMap) -> None:
     """`basis` gives finite curves (N, q), and a penalty (q, q) that is symmetric and not negative."""
     basis = settings.basis((LOW, HIGH))
     T = np.linspace(LOW, HIGH, 400)
@@ -149,7 +142,7 @@ def basis_can_be_fitted(settings: ThermalMap) -> None:
     assert np.min(np.linalg.eigvalsh(penalty)) >= -1e-9 * max(float(np.max(penalty)), 1e-300), "penalty is negative"
 
 
-def answers_to_noise(settings: ThermalMap) -> None:
+def it_answers_to_noise(settings: ThermalMap) -> None:
     """`smoother` gives a finite answer (G, K) to the noise of K blocks, and takes a constant for what it is."""
     T, bias = soak()
     blocks, grid = blocks_of(T, bias), np.linspace(LOW, HIGH, 31)
@@ -162,34 +155,12 @@ def answers_to_noise(settings: ThermalMap) -> None:
 
 
 def follows_a_curve_that_is_known(settings: ThermalMap) -> None:
-    """`following` gives the curve that a fit to its points would have, and the record that it was given."""
+    """`from_curve` gives the curve that a fit to its points would have, and the record that it was given."""
     T = np.linspace(LOW, HIGH, 2001)
-    x = (T - 20) / 30
-    curve = 1e-3 * np.stack([x, x**2 - 0.3 * x], axis=1)
+    curve = 1e-3 * _curves(T)[:, :2]
     record = _fitted(settings, 1).record.model_copy(update={"axes": ("x", "y"), "residual": None, "error": None})
-    found = settings.following(T, curve, record)
-    assert found.record == record, "the record has changed"
-    left = np.std(curve - found.bias(T), axis=0)
+    fitted = settings.from_curve(T, curve, record)
+    assert fitted.record == record, "the record has changed"
+    left = np.std(curve - fitted.bias(T), axis=0)
     limit = np.std(curve - settings.fit(T, curve, {}).bias(T), axis=0) + 1e-6 * np.std(curve, axis=0)
     assert np.all(left <= 1.01 * limit), f"the curve is left by {left} rad/s, a fit leaves {limit}"
-
-
-def _refused(load: Callable[[], FittedMap], what: str) -> None:
-    try:
-        load()
-    except MapError:
-        return
-    raise AssertionError(f"{what} is loaded")
-
-
-LAWS = {
-    "follows the soak": follows_the_soak,
-    "the slope is the derivative": slope_is_the_derivative,
-    "is the same after save and load": is_the_same_after_save_and_load,
-    "damaged files are refused": damaged_files_are_refused,
-    "the domain is kept": domain_is_kept,
-    "samples that cannot be fitted are refused": samples_that_cannot_be_fitted_are_refused,
-    "the basis can be fitted": basis_can_be_fitted,
-    "it answers to noise": answers_to_noise,
-    "follows a curve that is known": follows_a_curve_that_is_known,
-}

@@ -1,4 +1,4 @@
-"""How far a fitted curve may be off: its error as a few modes, so that errors at two inputs know of one another.
+"""The error of a fitted curve as a few modes, so that errors at two inputs are correlated.
 
 The error of a curve of d axes at T is taken as::
 
@@ -11,19 +11,19 @@ way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid point
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
+from fusion_core.settings import Frozen
 
 
-class Misfit(BaseModel):
-    """Where an axis bends more than its curve can follow, beyond what noise leaves by chance.
+class Misfit(Frozen):
+    """A place at which an axis bends more than its curve can follow, beyond what noise leaves by chance.
 
     Attributes
     ----------
@@ -36,15 +36,13 @@ class Misfit(BaseModel):
         curve.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     axis: Annotated[int, Field(ge=0)]
     T: FiniteFloat
     left: FiniteFloat
     noise: Annotated[FiniteFloat, Field(ge=0)]
 
 
-class CurveError(BaseModel):
+class CurveError(Frozen):
     """The error of a fitted curve.
 
     Attributes
@@ -61,8 +59,6 @@ class CurveError(BaseModel):
         At most one an axis. Their part of the error is among the modes.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     T: tuple[FiniteFloat, ...]
     modes: tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
     bend: tuple[FiniteFloat, ...]
@@ -75,24 +71,9 @@ class CurveError(BaseModel):
             raise ValueError("the grid T does not rise")
         if self.modes and np.shape(self.modes)[1:] != (len(self.T), len(self.bend)):
             raise ValueError(f"modes have the shape {np.shape(self.modes)}, not (r, {len(self.T)}, {len(self.bend)})")
-        if any(found.axis >= len(self.bend) for found in self.misfits):
-            raise ValueError(f"a misfit is of axis {max(found.axis for found in self.misfits)} of {len(self.bend)}")
+        if any(misfit.axis >= len(self.bend) for misfit in self.misfits):
+            raise ValueError(f"a misfit is of axis {max(misfit.axis for misfit in self.misfits)} of {len(self.bend)}")
         return self
-
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with other fields; the arrays of the old ones are left behind."""
-        copy = super().model_copy(update=update, deep=deep)
-        copy.__dict__.pop("_arrays", None)
-        return copy
-
-    def __eq__(self, other: object) -> bool:
-        """Whether all that the other says is the same, whatever has been made of it since."""
-        return isinstance(other, CurveError) and all(
-            getattr(self, k) == getattr(other, k) for k in type(self).model_fields
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.T, self.modes))
 
     @cached_property
     def _arrays(self) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""How sure a fitted curve is: what the noise of the soak does to it, where it misfits, and where it was never seen.
+"""The uncertainty of a fitted curve: noise of the soak, misfit, and ranges without a sample.
 
 A kind of map answers to the noise e of the soak's blocks (`soak_noise.py`) with H e, which gives the modes of its
 error. What a penalty takes of the curve as well is one mode more, and so is the difference where the curve is further
@@ -20,10 +20,11 @@ from fusion_core.errors import SingularFit
 from fusion_core.thermal.curve_error import CurveError, Misfit
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.soak_noise import (
-    FEWEST,
+    MIN_BLOCKS,
     BlockNoise,
     Blocks,
     Contrasts,
+    Smoother,
     blocks_of,
     cells_of,
     straight_pieces,
@@ -31,11 +32,9 @@ from fusion_core.thermal.soak_noise import (
 )
 
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
-Smoother = Callable[[Blocks, Array, int], Array]
-"""How a kind of map answers to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
 
 GRID = 121
-KEPT = 1e-3  # of the largest variance: modes with less are left out
+MIN_VARIANCE = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
 HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
 TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
@@ -56,8 +55,8 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     d = bias.shape[1]
     blocks = blocks_of(T, bias - predict(T))
     holes = find_holes(T)
-    seen = predict(np.sort(blocks.T))
-    swing = np.ptp(seen, axis=0)
+    fitted = predict(np.sort(blocks.T))
+    swing = np.ptp(fitted, axis=0)
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
     smoothed = _smoothed(cells_of(T, bias), grid, predict, smoother)
@@ -81,23 +80,23 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     errors : (K, r) arrays, one an axis
         Root of their covariance.
     """
-    own = fitted.record.error
-    if own is None:
+    error = fitted.record.error
+    if error is None:
         return fitted
-    grid = np.asarray(own.T)
+    grid = np.asarray(error.T)
     more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
     r = max(map(len, more))
     modes = np.zeros((r, len(grid), len(more)))
-    for axis, found in enumerate(more):
-        modes[: len(found), :, axis] = found
-    kept = own.modes if own.misfits else own.modes[len(own.modes) - len(own.holes) :]
-    joined = (*kept, *(tuple(map(tuple, mode)) for mode in modes.tolist()))
-    error = own.model_copy(update={"modes": joined})
+    for axis, of_axis in enumerate(more):
+        modes[: len(of_axis), :, axis] = of_axis
+    modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
+    joined = (*modes_kept, *(tuple(map(tuple, mode)) for mode in modes.tolist()))
+    error = error.model_copy(update={"modes": joined})
     return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
-    """Return what noise will make of the error of the curve that is fitted to samples at T (N,) in degC.
+    """Return the error that noise will give the curve that is fitted to samples at T (N,) in degC.
 
     It has the modes that `curve_error` finds where noise and walk are as they are taken here.
 
@@ -124,16 +123,16 @@ def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoothe
 
 
 def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> CurveError:
-    """Return what a map of d axes will leave of a curve `shape` that is known, at samples T (N,) in degC: one mode.
+    """Return the part of a known curve `shape` that a map of d axes will leave, at samples T (N,) in degC: one mode.
 
     Beyond T and in its holes it bends as the shape does.
     """
     grid = np.linspace(T.min(), T.max(), GRID)
     cells = cells_of(T, np.zeros((len(T), d)))
-    true, seen = shape(grid), shape(cells.T)
-    level = cells.n @ seen / len(T)
-    left = [_answer(cells, grid, smoother, axis) @ seen[:, axis] - true[:, axis] + level[axis] for axis in range(d)]
-    bend = _bend(grid, shape, (), np.ptp(seen, axis=0))
+    true, at_cells = shape(grid), shape(cells.T)
+    level = cells.n @ at_cells / len(T)
+    left = [_answer(cells, grid, smoother, axis) @ at_cells[:, axis] - true[:, axis] + level[axis] for axis in range(d)]
+    bend = _bend(grid, shape, (), np.ptp(at_cells, axis=0))
     return _joined(grid, [mode[None, :] for mode in left], bend, find_holes(T))
 
 
@@ -149,12 +148,12 @@ def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tupl
     """
     blocks = blocks_of(T, left)
     contrasts = Contrasts(blocks)
-    found = np.zeros((2, left.shape[1]))
+    variances = np.zeros((2, left.shape[1]))
     for axis in range(left.shape[1]):
         free = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
         noise = contrasts.noise(blocks.y[:, axis], free)
-        found[:, axis] = noise.white * np.mean(blocks.n) * dt, noise.walk / (len(T) * dt)
-    white, walk = np.sqrt(found)
+        variances[:, axis] = noise.white * np.mean(blocks.n) * dt, noise.walk / (len(T) * dt)
+    white, walk = np.sqrt(variances)
     return white, walk
 
 
@@ -168,8 +167,8 @@ def _joined(
     """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
     r = max(len(modes) for modes in per_axis)
     modes = np.zeros((r + len(holes), len(grid), len(per_axis)))
-    for axis, own in enumerate(per_axis):
-        modes[: len(own), :, axis] = own
+    for axis, of_axis in enumerate(per_axis):
+        modes[: len(of_axis), :, axis] = of_axis
     for k, (low, high) in enumerate(holes):
         modes[r + k] = np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend)
     return CurveError(
@@ -178,10 +177,10 @@ def _joined(
     )  # fmt: skip
 
 
-def _check_holes(kind: str, found: CurveError, swing: Array) -> None:
-    for low, high in found.holes:
+def _check_holes(kind: str, error: CurveError, swing: Array) -> None:
+    for low, high in error.holes:
         inside = np.linspace(low, high, 20)[1:-1]
-        sigma = np.sqrt(found.variance(inside, low))
+        sigma = np.sqrt(error.variance(inside, low))
         axis = int(np.argmax(np.max(sigma, axis=0) / np.maximum(swing, np.finfo(float).tiny)))
         if np.max(sigma[:, axis]) > swing[axis] > 0:
             names = "xyz" if len(swing) in (2, 3) else ""
@@ -210,8 +209,8 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
     second = np.diff(predict(grid), n=2, axis=0) / step**2
     inside = np.any([(grid > low) & (grid < high) for low, high in holes] or [np.zeros(len(grid), bool)], axis=0)
     known = ~inside[1:-1]
-    own = np.sqrt(np.mean(second[known] ** 2, axis=0)) if np.any(known) else np.zeros(len(swing))
-    return np.asarray(np.maximum(own, 8 * swing / (grid[-1] - grid[0]) ** 2))
+    bend = np.sqrt(np.mean(second[known] ** 2, axis=0)) if np.any(known) else np.zeros(len(swing))
+    return np.asarray(np.maximum(bend, 8 * swing / (grid[-1] - grid[0]) ** 2))
 
 
 def _axis_modes(
@@ -234,7 +233,7 @@ def _axis_modes(
 
 
 def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) -> Array:
-    """Return what a penalty takes of a curve (G, d), but for its mean over the fit, by what it takes of the fitted one.
+    """Return the part (G, d) of a curve that a penalty takes, without its mean, from that of the fitted one.
 
     The map follows a part h of each shape that a curve f is made of: H f = h f, and takes (1 - h) f. Of the fitted
     curve it would take h (1 - h) f once more, which is seen. Most of that is of shapes for which penalty and samples
@@ -244,14 +243,14 @@ def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) ->
     Source: W. Stuetzle and Y. Mittal, Some comments on the asymptotic behavior of robust smoothers, Lecture Notes in
     Mathematics 757 (1979) 191: twicing.
     """
-    own, there = predict(cells.T), predict(grid)
-    left = np.stack([there[:, k] - smoother(cells, grid, k) @ values for k, values in enumerate(own.T)], axis=1)
+    at_cells, on_grid = predict(cells.T), predict(grid)
+    left = np.stack([on_grid[:, k] - smoother(cells, grid, k) @ values for k, values in enumerate(at_cells.T)], axis=1)
     weight = straight_pieces(grid, cells.T).T @ cells.n
     return np.asarray((left - weight @ left / np.sum(weight)) / HALF)
 
 
 def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array:
-    """Return what the map takes of the blocks' noise on the grid (G, K); its mean over the fit is not its error."""
+    """Return the map's response to the blocks' noise on the grid (G, K); its mean over the fit is not its error."""
     level = (blocks.n / np.sum(blocks.n)) @ blocks.over
     return np.asarray(smoother(blocks, grid, axis) - level @ smoother(blocks, blocks.fine, axis))
 
@@ -259,7 +258,7 @@ def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array
 def _largest(modes: Array) -> Array:
     """Return the modes (G, m) as few that are orthogonal (r, G)."""
     U, s = _left_vectors(modes)
-    keep = s**2 > KEPT * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
+    keep = s**2 > MIN_VARIANCE * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
     return np.asarray((U[:, keep] * s[keep]).T)
 
 
@@ -268,14 +267,14 @@ def _left_vectors(modes: Array) -> tuple[Array, Array]:
     if modes.shape[1] <= len(modes):
         U, s, _ = np.linalg.svd(modes, full_matrices=False)
         return U, s
-    own, U = np.linalg.eigh(modes @ modes.T)  # the small ones are left out: squares lose nothing of the others
-    return U[:, ::-1], np.sqrt(np.clip(own[::-1], 0.0, None))
+    squares, U = np.linalg.eigh(modes @ modes.T)  # the small ones are left out: squares lose nothing of the others
+    return U[:, ::-1], np.sqrt(np.clip(squares[::-1], 0.0, None))
 
 
 def _misfit(
     blocks: Blocks, contrasts: Contrasts, noise: BlockNoise, left: Array, axis: int
 ) -> tuple[Misfit | None, Array]:
-    """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
+    """Return the part (p,) of the free curve that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
     it can follow says nothing of its misfit. Of what is found, as chi-square with its degrees of freedom, the part that
@@ -285,23 +284,23 @@ def _misfit(
 
     knots = contrasts.knots
     nothing = None, np.zeros(len(knots))
-    if len(blocks.T) < FEWEST or len(knots) < 3:
+    if len(blocks.T) < MIN_BLOCKS or len(knots) < 3:
         return nothing
     weight = contrasts.X.mean(axis=0)
     mean = weight / np.sum(weight)
     curve, operator = noise.curve - mean @ noise.curve, noise.operator - mean @ noise.operator
     expected = _expected_to_be_left(contrasts, noise, operator, left)
-    own, U = np.linalg.eigh(expected)
+    variances, U = np.linalg.eigh(expected)
     whole = np.sum((U.T @ operator @ noise.root) ** 2, axis=1)
-    seen = (own > TAKEN**2 * whole) & (own > NOTHING * own[-1])
-    shape = (U.T @ curve)[seen]
-    found, freedom = float(np.sum(shape**2 / own[seen])), int(np.sum(seen))
-    if freedom == 0 or found < chdtri(freedom, CHANCE):
+    unfollowed = (variances > TAKEN**2 * whole) & (variances > NOTHING * variances[-1])
+    shape = (U.T @ curve)[unfollowed]
+    chi_square, freedom = float(np.sum(shape**2 / variances[unfollowed])), int(np.sum(unfollowed))
+    if freedom == 0 or chi_square < chdtri(freedom, CHANCE):
         return nothing
     sigma = np.sqrt(np.clip(np.diagonal(expected), 0.0, None))
     k = int(np.argmax(np.abs(curve) - 2 * sigma))
     where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
-    return where, np.asarray(U[:, seen] @ shape * np.sqrt(1 - freedom / found))
+    return where, np.asarray(U[:, unfollowed] @ shape * np.sqrt(1 - freedom / chi_square))
 
 
 def _expected_to_be_left(contrasts: Contrasts, noise: BlockNoise, operator: Array, left: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A map that has been fitted, and what its file says of it."""
+"""A fitted map, and its record in a file."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.errors import BadValue, OutsideDomain
 from fusion_core.faults import RANGES
+from fusion_core.settings import Frozen
 from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 from fusion_core.thermal.thermometer import Steps
@@ -26,10 +27,8 @@ COLDEST, HOTTEST, _ = RANGES["temperature"]  # degC
 Rms = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
-class MapRecord(BaseModel):
-    """What every map file says of itself."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class MapRecord(Frozen):
+    """The record of a fitted map, which every map file holds."""
 
     kind: Name
     domain: tuple[float, float]
@@ -101,7 +100,7 @@ class MapRecord(BaseModel):
 
     @property
     def d(self) -> int:
-        """How many axes the map has."""
+        """Number of axes."""
         return len(self.axes) if self.residual is None else len(self.residual)
 
 
@@ -132,10 +131,10 @@ class FittedMap(ABC):
         """
         T = self._temperatures(T)
         inside = self._inside(T, t)
-        found = self._bias(inside)
+        bias = self._bias(inside)
         if self.outside == "tangent" and inside is not T:
-            found = found + (T - inside)[:, None] * self._slope(inside)
-        return found
+            bias = bias + (T - inside)[:, None] * self._slope(inside)
+        return bias
 
     def slope(self, T: Array, t: Array | None = None) -> Array:
         """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""

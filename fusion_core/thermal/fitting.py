@@ -1,4 +1,4 @@
-"""What every fit of a map begins and ends with: checks of the samples, and the record of what was fitted."""
+"""Begin and end of every fit of a map: checks of the samples, and the record of the result."""
 
 from __future__ import annotations
 

@@ -19,19 +19,18 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.errors import MapError, shown
+from fusion_core.settings import Frozen
 from fusion_core.thermal.fitted_map import LARGEST, MapRecord
 from fusion_core.thermal.record_texts import parse_json
 
 
-class MapFile(BaseModel):
+class MapFile(Frozen):
     """The part that every map file has; a kind adds its coefficients."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     driftlab_map: Literal[1] = 1
     """Version of the format."""
@@ -101,8 +100,8 @@ def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) ->
     if not isinstance(data, dict) or "driftlab_map" not in data:
         raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that holds a fitted map")
     if data["driftlab_map"] != 1:
-        found = f"is of version {shown(repr(data['driftlab_map']))}"
-        raise _wrong(kind, path, found, "version 1", "refit it, or use the version that wrote it")
+        version = f"is of version {shown(repr(data['driftlab_map']))}"
+        raise _wrong(kind, path, version, "version 1", "refit it, or use the version that wrote it")
     written = data.get("record")
     found_kind = written.get("kind") if isinstance(written, dict) else None
     if found_kind is not None and found_kind != kind:
@@ -137,5 +136,5 @@ def expect_covariance(name: str, matrices: Array, rounding: float = 1e-9) -> Non
         raise ValueError(f"{name} is no covariance (symmetric, no eigenvalue below zero)")
 
 
-def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> MapError:
-    return MapError(f"{kind}: map file {path} {found}, expected {expected}; {remedy}")
+def _wrong(kind: str, path: Path, has: str, expected: str, remedy: str) -> MapError:
+    return MapError(f"{kind}: map file {path} {has}, expected {expected}; {remedy}")

@@ -13,11 +13,13 @@ Stat. Soc. B 66 (2004) 337.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from fusion_core.chunk import Array
+from fusion_core.thermal.soak_noise import Blocks, Smoother, cells_of
 
 LAMBDAS = np.logspace(-7, 7, 85)  # relative to what makes both terms of the criterion alike
 INFLATED = 1.4
@@ -45,7 +47,7 @@ class Penalised:
 
 
 def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAMBDAS) -> Penalised:
-    """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); what neither tells is zero."""
+    """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); the undetermined are zero."""
     (m, n), w = B.shape, w / np.mean(w)
     N = B.T @ (w[:, None] * B)
     N += RIDGE * np.trace(N) / n * np.eye(n)
@@ -63,3 +65,31 @@ def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAM
     variance = squares[best] / max(m - trace[best], 1.0)
     operator = (G * gain[best]) @ (G.T @ (B.T * w))
     return Penalised(coefficients[:, best], operator, G * np.sqrt(variance * gain[best]))
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Curves whose combination c is a map: values(T (N,)) -> (N, q), and penalty (q, q) of roughness c' penalty c."""
+
+    values: Callable[[Array], Array]
+    penalty: Array
+
+
+def smooth_lines(domain: tuple[float, float]) -> Basis:
+    """Return straight lines between knots 1 K apart, at most 150 pieces, whose bends are penalised."""
+    count = int(np.clip(np.ceil(domain[1] - domain[0]), 4, 150)) + 1
+    knots = np.linspace(*domain, count)
+    bends = np.diff(np.eye(count), n=2, axis=0)
+    return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
+
+
+def penalised_smoother(basis: Basis, T: Array, bias: Array) -> Smoother:
+    """Return the response of penalised least squares to the noise of T (N,) and bias (N, d), by cross-validation."""
+    cells = cells_of(T, bias)
+    B = basis.values(cells.T)
+    operators = [penalised(B, y, cells.n, basis.penalty).operator for y in cells.y.T]
+
+    def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+        return np.asarray(basis.values(grid) @ (operators[axis] @ blocks.shares(cells.of_sample, len(cells.T))))
+
+    return smoother

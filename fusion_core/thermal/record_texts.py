@@ -76,7 +76,7 @@ AxisNames = Annotated[tuple[str, ...], AfterValidator(_axes)]
 
 
 def parse_json(text: bytes | str, largest: float = 1e30) -> Any:
-    """Return what JSON holds: no key twice, every number finite and at most `largest`, `COUNT` values at most.
+    """Return the content of JSON: no key twice, every number finite and at most `largest`, `COUNT` values at most.
 
     Raises
     ------
@@ -103,9 +103,9 @@ def parse_json(text: bytes | str, largest: float = 1e30) -> Any:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names: set[str] = set()
+        twice = next(name for name, _ in pairs if name in names or names.add(name))  # type: ignore[func-returns-value]
         raise ValueError(f"the key '{shown(twice)}' is there twice")
-    return found
+    return content

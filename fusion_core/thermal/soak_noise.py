@@ -1,4 +1,4 @@
-"""What is left of a soak beside its curve: white noise, and the walk of a bias over hours.
+"""White noise of a soak and the walk of a bias over hours, beside its curve.
 
 The samples of a fit are in the order of time. In K blocks, of samples that follow one another at about one
 temperature, the bias is::
@@ -14,6 +14,7 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -22,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-from fusion_core.thermal.scaled_sum import ScaledSum
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -32,11 +32,11 @@ Index = NDArray[np.int64]
 SPANS = 240  # of time, at most
 BLOCKS = 360  # about, at most
 CELLS = 40  # of temperature: a block stays in one
-FEWEST = 24  # blocks with which a walk can be told from white noise
+MIN_BLOCKS = 24  # blocks with which a walk can be told from white noise
 KNOTS = 40  # at most, and at least GROUP blocks to each
 GROUP = 8
 FINE = 1000
-STRETCHES = 1920  # of time, in which it is told when a block was measured
+STRETCHES = 1920  # of time, at most: resolution of the times of a block
 RANK = 1e-9  # of the largest singular value: columns that are combinations of others
 TAKEN = 1e-6  # of the largest eigenvalue: a contrast of which the map leaves less says nothing
 RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
@@ -58,12 +58,12 @@ class Blocks:
 
     @cached_property
     def over(self) -> csr_array:
-        """How the samples of each are spread over the temperatures `fine` (K, FINE), sparse."""
+        """The spread of each block's samples over the temperatures `fine` (K, FINE), sparse."""
         return self._spread(self.nearest, FINE)
 
     @cached_property
     def during(self) -> csr_array:
-        """How the samples of each are spread over even stretches of time (K, S), sparse."""
+        """The spread of each block's samples over even stretches of time (K, S), sparse."""
         N = len(self.of_sample)
         stretches = min(STRETCHES, N)
         return self._spread(np.arange(N) * stretches // N, stretches)
@@ -72,15 +72,19 @@ class Blocks:
         from scipy.sparse import csr_array
 
         K = len(self.T)
-        places, seen = np.unique(self.of_sample * count + which, return_counts=True)
+        places, counts = np.unique(self.of_sample * count + which, return_counts=True)
         of_block = places // count
-        return csr_array((seen / self.n[of_block], (of_block, places % count)), shape=(K, count))
+        return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
 
     def shares(self, group: Index, count: int) -> Array:
         """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
         K = len(self.T)
         table = np.bincount(group * K + self.of_sample, minlength=count * K).reshape(count, K)
         return np.asarray(table / np.maximum(table.sum(axis=1, keepdims=True), 1), dtype=np.float64)
+
+
+Smoother = Callable[[Blocks, Array, int], Array]
+"""How a kind of map answers to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
 
 
 def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
@@ -93,8 +97,8 @@ def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
     state = cell if group is None else group * CELLS + cell
     count, spans = int(state.max()) + 1, min(SPANS, N)
     while True:
-        found, of_sample = np.unique(np.arange(N) * spans // N * count + state, return_inverse=True)
-        if len(found) <= BLOCKS or spans <= 2:
+        blocks, of_sample = np.unique(np.arange(N) * spans // N * count + state, return_inverse=True)
+        if len(blocks) <= BLOCKS or spans <= 2:
             break
         spans //= 2
     return summed(T, left, of_sample)
@@ -131,7 +135,7 @@ class BlockNoise:
 
 
 class Contrasts:
-    """What no free curve of T can make of K blocks.
+    """Contrasts of K blocks that no free curve of T can make.
 
     Attributes
     ----------
@@ -165,7 +169,7 @@ class Contrasts:
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
         A = self.Z.T @ left  # the map has taken its part of the noise already
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
-        if len(A) >= FEWEST:
+        if len(A) >= MIN_BLOCKS:
             k2, s2 = _likeliest(self._turned(A, self.Z.T @ (y / scale)))
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
@@ -186,9 +190,9 @@ class Contrasts:
         inverse = lapack.dtrtri(root, lower=1)[0] if not failed else None
         # the smallest eigenvalue is at least one over the trace of the inverse
         if inverse is None or np.sum(inverse**2) * np.trace(R) > 1 / TAKEN:
-            own, V = np.linalg.eigh(R)
-            seen = own > TAKEN * own[-1]
-            inverse = (V[:, seen] / np.sqrt(own[seen])).T
+            values, V = np.linalg.eigh(R)
+            free = values > TAKEN * values[-1]
+            inverse = (V[:, free] / np.sqrt(values[free])).T
         return ScaledSum(inverse @ W @ inverse.T, (inverse @ u)[:, None])
 
 
@@ -215,8 +219,8 @@ def walk_root(blocks: Blocks) -> Array:
 
 
 def _root(covariance: Array) -> Array:
-    own, V = np.linalg.eigh(covariance)
-    return np.asarray(V * np.sqrt(np.clip(own, 0.0, None)))
+    values, V = np.linalg.eigh(covariance)
+    return np.asarray(V * np.sqrt(np.clip(values, 0.0, None)))
 
 
 def _solved(root: Array, X: Array) -> Array:
@@ -259,6 +263,42 @@ def straight_pieces(knots: Array, T: Array) -> Array:
     """Return the straight pieces between knots (p,) at T (N,), level beyond them (N, p)."""
     place = np.clip(np.searchsorted(knots, T, side="right") - 1, 0, len(knots) - 2)
     share = np.clip((T - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
-    found, rows = np.zeros((len(T), len(knots))), np.arange(len(T))
-    found[rows, place], found[rows, place + 1] = 1.0 - share, share
-    return found
+    pieces, rows = np.zeros((len(T), len(knots))), np.arange(len(T))
+    pieces[rows, place], pieces[rows, place + 1] = 1.0 - share, share
+    return pieces
+
+
+class ScaledSum:
+    """r M + I, M (m, m), for columns and many ratios r: one reduction to three diagonals, then O(m) a ratio.
+
+    `B` (m, p) are the columns as Q' B. M is symmetric and non-negative, m rows, p columns::
+
+        M = Q T Q',  T tridiagonal;    r M + I = Q (r T + I) Q'
+
+    so inner products of columns under noise of the covariance r M + I are those of Q' B and (r T + I)^-1 Q' B.
+
+    Source: G. H. Golub and C. F. Van Loan, Matrix Computations, 4th ed., sec. 4.3.6 and 8.3.1.
+    """
+
+    def __init__(self, M: Array, B: Array) -> None:
+        from scipy.linalg import lapack
+
+        if len(M) == 1:  # a further row that adds nothing: LAPACK takes no empty second diagonal
+            M, B = np.pad(M, (0, 1)), np.pad(B, ((0, 1), (0, 0)))
+        m = len(M)
+        reduced, self.d, self.e, tau, _ = lapack.dsytrd(np.asfortranarray(M), lower=1, lwork=64 * m)
+        # Q is 1 in the first row and column; its reflectors are those of a QR of what is below the diagonal
+        turned = np.array(B, dtype=np.float64, order="F")
+        rest = np.asfortranarray(turned[1:])
+        reflectors = np.asfortranarray(reduced[1:, :-1])
+        turned[1:] = lapack.dormqr("L", "T", reflectors, tau, rest, 64 * rest.shape[1])[0]
+        self.B = turned
+
+    def solved(self, ratio: float) -> tuple[Array, float]:
+        """Return (r T + I)^-1 Q' B (m, p), and log det (r M + I)."""
+        from scipy.linalg import lapack
+
+        d, e, failed = lapack.dpttrf(ratio * self.d + 1.0, ratio * self.e)
+        if failed:
+            raise np.linalg.LinAlgError("the matrix is not non-negative")
+        return lapack.dpttrs(d, e, self.B)[0], float(np.sum(np.log(d)))

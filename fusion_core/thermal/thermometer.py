@@ -1,4 +1,4 @@
-"""What the readings of a thermometer tell of its error: the steps it rounds to, and its noise before the rounding.
+"""The error of a thermometer from its readings: the steps it rounds to, and its noise before the rounding.
 
 A reading is ``r = round((T + n) / q) q`` with n ~ N(0, s^2), or a mean of such readings. Its mean at a temperature is::
 
@@ -20,10 +20,13 @@ import numpy as np
 
 from fusion_core.chunk import Array
 
+READINGS = ("temperature_step", "temperature_variance")
+"""Channels of what a thermometer's samples showed up to an epoch: its steps in K, and their variance in K^2."""
+
 FINE = 2e-3  # K, of the histogram of the readings
 STEPS = (0.02, 1.5)  # K, that are looked for; set points of a chamber are seldom so close
 LARGEST = 2.0  # K: a larger change is a jump of the temperature
-SEEN = 0.15  # of the characteristic function: with less, no steps are seen
+MIN_SPECTRUM = 0.15  # of the characteristic function: with less, no steps are seen
 CHANCE = 4.0  # times what so many readings of a fine thermometer have, in the mean
 PROMINENT = 3.0  # times what stands beside it
 PASSAGES = 200  # of a soak: a movement is taken over one of them
@@ -31,7 +34,7 @@ ALL_NOISE = 100.0  # of an exponent: beyond, nothing of the steps is left
 PASSED = 2.0  # movements from one reading to the next: shorter steps are averaged out
 STILL = 0.125  # of a step: so far the temperature may move within an average
 PART = 0.75  # of a step: a movement is taken over so much of it, to tell steps from holds
-KEPT = 0.5  # of the characteristic function: where less of it is left then, holds were taken for steps
+MIN_WHILE_MOVING = 0.5  # of the characteristic function: where less of it is left then, holds were taken for steps
 NOISELESS = 0.1  # of a step: with less noise before the rounding, steps are jumps
 DIVIDED = 0.4  # of the squares of jumps: a mean of readings leaves two thirds of them
 MEDIAN = 0.455  # of squares of normal numbers, of their mean
@@ -74,9 +77,9 @@ def steps_of(T: Array) -> Steps:
     unit = readings(T, started()).step[-1]  # which says exactly what the spectrum says to a part in a thousand
     if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
         size = float(round(size / unit) * unit)
-    seen = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
-    found = Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
-    return found if _jumps(T, found, float(np.sum(moved))) else NO_STEPS
+    noise = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
+    steps = Steps(size, max(noise, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
+    return steps if _jumps(T, steps, float(np.sum(moved))) else NO_STEPS
 
 
 def _jumps(T: Array, steps: Steps, path: float) -> bool:
@@ -94,7 +97,7 @@ def _jumps(T: Array, steps: Steps, path: float) -> bool:
 
 
 def _movement(T: Array, n: int = 0) -> Array:
-    """Return how far the temperature goes from one reading to the next (N,), whatever its steps and noise.
+    """Return the movement of the temperature from one reading to the next (N,), whatever its steps and noise.
 
     By the means of `n` readings before and after; 0: of one in PASSAGES of a soak.
     """
@@ -111,14 +114,14 @@ def _period(T: Array, moved: Array, least: float) -> float:
     """Return the largest period of the readings that stands out, `least` K or more; 0 where none does."""
     place = np.rint((T - T.min()) / FINE).astype(np.int64)
     count = 1 << int(np.ceil(np.log2(4 * (place.max() + 1))))
-    seen = np.abs(np.fft.rfft(np.bincount(place, moved, count))) / np.sum(moved)
-    f = np.arange(len(seen)) / (count * FINE)
-    seen[f < 1 / STEPS[1]] = 0.0
-    enough = max(SEEN, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
-    for k in np.flatnonzero((seen > enough) & (f < 1 / least)):
-        about = seen[int(0.8 * k) : int(1.25 * k) + 1]
-        prominent = seen[k] == about.max() and seen[k] > PROMINENT * np.sqrt(np.mean(about**2))
-        if prominent and _while_moving(T, moved, 1 / float(f[k])) > max(SEEN, KEPT * seen[k]):
+    spectrum = np.abs(np.fft.rfft(np.bincount(place, moved, count))) / np.sum(moved)
+    f = np.arange(len(spectrum)) / (count * FINE)
+    spectrum[f < 1 / STEPS[1]] = 0.0
+    enough = max(MIN_SPECTRUM, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
+    for k in np.flatnonzero((spectrum > enough) & (f < 1 / least)):
+        about = spectrum[int(0.8 * k) : int(1.25 * k) + 1]
+        prominent = spectrum[k] == about.max() and spectrum[k] > PROMINENT * np.sqrt(np.mean(about**2))
+        if prominent and _while_moving(T, moved, 1 / float(f[k])) > max(MIN_SPECTRUM, MIN_WHILE_MOVING * spectrum[k]):
             return 1 / float(f[k])
     return 0.0
 
@@ -161,8 +164,8 @@ def noise_before(step: float, variance: float) -> float:
     At one temperature they flicker between two steps or more: over all temperatures by
     s^2 + sum_h q^2 (1 - a^(2 h h)) / (2 pi^2 h^2).
     """
-    noise, seen = _flicker()
-    return float(step * np.interp(variance / step**2, seen, noise)) if step > 0 else 0.0
+    noise, variances = _flicker()
+    return float(step * np.interp(variance / step**2, variances, noise)) if step > 0 else 0.0
 
 
 def sawtooth(step: float, noise: float, harmonics: int = 5) -> Array:
@@ -174,7 +177,7 @@ def sawtooth(step: float, noise: float, harmonics: int = 5) -> Array:
 
 
 class ThermometerReadings(NamedTuple):
-    """What the readings up to each of N show: the step that all changes are multiples of, K, and their variance, K^2.
+    """Step of which all changes up to each of N readings are multiples, K, and variance of the readings, K^2.
 
     The step is 0 where there is none; the variance is that about a temperature that moves evenly.
     """

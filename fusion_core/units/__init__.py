@@ -1,66 +1,35 @@
 """Dimensional values as users write them: `3.18 deg/h/sqrt(Hz)`, `1.5e-4 deg/s`, `40.9 deg`.
 
-The text is read by `fusion_core.units.grammar`; what a unit means, `fusion_core.units.conversion` says.
+The text is read by `fusion_core.units.grammar`, and converted by `fusion_core.units.conversion`.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core.errors import UnitError, shown
-from fusion_core.units.conversion import (
-    convert,
-    dimension_of,
-    of_pint,
-    plain,
-    registry,
-    same_dimension,
-    si_unit,
-    si_unit_of,
-    to_si,
-    unit_of_density,
-)
+from fusion_core.units.conversion import convert as convert
+from fusion_core.units.conversion import dimension_of, of_pint, plain, si_unit
+from fusion_core.units.conversion import registry as registry
+from fusion_core.units.conversion import same_dimension as same_dimension
+from fusion_core.units.conversion import si_unit_of as si_unit_of
+from fusion_core.units.conversion import to_si as to_si
+from fusion_core.units.conversion import unit_of_density as unit_of_density
 from fusion_core.units.grammar import read_quantity
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
-
-__all__ = [
-    "LIMITS",
-    "Axes",
-    "Quantity",
-    "Unit",
-    "along_axes",
-    "axis_names",
-    "bias_unit",
-    "check_axes",
-    "check_triad",
-    "convert",
-    "registry",
-    "same_dimension",
-    "section_axes",
-    "si_unit_of",
-    "to_si",
-    "unit_of_density",
-    "unsettled",
-    "usual_axes",
-]
 
 LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1e-9, 1e4), "Hz": (1e-9, 1e9)}
 """Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
 
-_BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
-_BIAS_SHOWN: ContextVar[str | None] = ContextVar("bias_shown", default=None)
+_BIAS_UNIT: ContextVar[tuple[str | None, str | None]] = ContextVar("bias_unit", default=(None, None))  # and in messages
 _AXES: ContextVar[tuple[str, ...]] = ContextVar("axes", default=("x", "y", "z"))
 
 
@@ -70,12 +39,11 @@ def bias_unit(unit: str | None, shown: str | None = None) -> Iterator[None]:
 
     In the examples of messages it means `shown`, where that is given: a unit of the same dimension (`ppm`).
     """
-    tokens = _BIAS_UNIT.set(unit), _BIAS_SHOWN.set(shown)
+    token = _BIAS_UNIT.set((unit, shown))
     try:
         yield
     finally:
-        _BIAS_UNIT.reset(tokens[0])
-        _BIAS_SHOWN.reset(tokens[1])
+        _BIAS_UNIT.reset(token)
 
 
 @contextmanager
@@ -169,7 +137,7 @@ class Unit:
 
     def _of_number(self, number: float) -> Quantity:
         """Return a number in SI; where nothing says what the unit of the bias is, it has no unit either."""
-        known = "bias" not in self.unit or _BIAS_UNIT.get() is not None
+        known = "bias" not in self.unit or _BIAS_UNIT.get()[0] is not None
         unit = self._of_bias("") if known else ""
         text = f"{number!r} {plain(unit)}".rstrip()
         if not np.isfinite(number):
@@ -189,7 +157,7 @@ class Unit:
 
     def _of_bias(self, text: str) -> str:
         """Return the unit of the field; where nothing says of what the bias is, it is that of the text."""
-        bias = _BIAS_UNIT.get()
+        bias, _ = _BIAS_UNIT.get()
         if "bias" not in self.unit:
             return self.unit
         if bias is None:
@@ -199,9 +167,9 @@ class Unit:
 
     def _fitting_example(self) -> str:
         """Return an example in the unit of the bias; none where it is not known how that is written."""
-        if "bias" not in self.unit or _BIAS_UNIT.get() in (None, "rad/s"):  # that of which the example speaks
+        bias, written = _BIAS_UNIT.get()
+        if "bias" not in self.unit or bias in (None, "rad/s"):  # that of which the example speaks
             return self.example
-        written = _BIAS_SHOWN.get()
         return f"0.1 {plain(self.unit.replace('bias', written))}" if written else ""
 
     def _with_unit(self, value: Any) -> str:

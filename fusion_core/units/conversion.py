@@ -1,4 +1,4 @@
-"""What a unit means: pint's, with the definitions of `units.txt`.
+"""Conversion of units by pint, with the definitions of `units.txt`.
 
 An angle is a dimension of its own (so 5 Hz is not 5 rad/s), `g` is standard gravity and not a gram. Inside the program
 everything is SI, except that temperatures are in degC.
@@ -7,21 +7,20 @@ everything is SI, except that temperatures are in degC.
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Mapping
+from fractions import Fraction
 from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_core.errors import UnitError, shown
 from fusion_core.units.grammar import read_quantity, read_scaled_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from fractions import Fraction
-
     import pint
-    from numpy.typing import ArrayLike, NDArray
 
 PRODUCTS = ("V", "ohm", "Pa", "T", "W", "N", "J", "F", "H", "Wb")  # SI units that are products of others
 _THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
@@ -55,13 +54,13 @@ def to_si(text: str, unit: str) -> float:
     target = _known(unit)
     if not names and not target.dimensionless:
         raise UnitError(f"'{shown(text)}' has no unit")
-    found = of_pint(names, text)
-    if str(target).startswith("delta_") and _is_reading(found):
+    source = of_pint(names, text)
+    if str(target).startswith("delta_") and str(source) in _THERMOMETERS:
         raise UnitError(f"'{shown(text)}' is a temperature, a difference was expected; write it in K")
-    if found.dimensionality != target.dimensionality:
+    if source.dimensionality != target.dimensionality:
         raise UnitError(f"'{shown(text)}' cannot be converted to {plain(unit)}; write a quantity of that dimension")
     try:
-        value = float(registry().Quantity(number, found).to(target).magnitude)
+        value = float(registry().Quantity(number, source).to(target).magnitude)
     except (OverflowError, ZeroDivisionError):
         value = np.inf
     return _checked(value, number, text)
@@ -85,13 +84,13 @@ def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray
 @lru_cache(maxsize=256)  # a recording is converted block by block
 def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     """Return factor and offset from `unit` to `si_unit`."""
-    number, found = _scaled(unit)
+    number, source = _scaled(unit)
     target = _known(si_unit or si_unit_of(unit))
-    if found.dimensionality != target.dimensionality:
+    if source.dimensionality != target.dimensionality:
         raise UnitError(f"unit '{shown(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
     try:
-        zero = float(registry().Quantity(0.0, found).to(target).magnitude)
-        slope = float(registry().Quantity(1.0, found).to(target).magnitude) - zero
+        zero = float(registry().Quantity(0.0, source).to(target).magnitude)
+        slope = float(registry().Quantity(1.0, source).to(target).magnitude) - zero
     except (OverflowError, ZeroDivisionError):
         slope, zero = np.inf, 0.0
     except TypeError:  # pint's, for a difference of temperatures where a reading is meant
@@ -109,11 +108,11 @@ def si_unit_of(unit: str) -> str:
     return si_unit(_scaled(unit)[1])
 
 
-def si_unit(found: pint.Unit) -> str:
+def si_unit(unit: pint.Unit) -> str:
     """Return the unit in which a quantity of pint's unit is kept inside the program."""
-    if dict(found.dimensionality) == {"[temperature]": 1}:
+    if dict(unit.dimensionality) == {"[temperature]": 1}:
         return "degC"
-    return f"{registry().get_base_units(found)[1]:C}" or "1"
+    return f"{registry().get_base_units(unit)[1]:C}" or "1"
 
 
 def unit_of_density(text: str) -> tuple[str, str]:
@@ -151,7 +150,7 @@ def _symbols(unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Return whether two units are of one dimension; False where one is not known."""
+    """Whether two units are of one dimension; False where one is not known."""
     try:
         return _known(unit).dimensionality == _known(other).dimensionality
     except UnitError:
@@ -181,7 +180,7 @@ def of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
 
 
 def _canonical(name: str, text: str) -> str:
-    """Return what pint calls a unit; nothing but a single name is ever given to it."""
+    """Return pint's name of a unit; nothing but a single name is ever given to pint."""
     import pint
 
     try:
@@ -189,10 +188,6 @@ def _canonical(name: str, text: str) -> str:
     except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
         part = "" if name == text else f"'{shown(text)}': "
         raise UnitError(f"{part}unknown unit '{shown(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
-
-
-def _is_reading(unit: pint.Unit) -> bool:
-    return str(unit) in _THERMOMETERS
 
 
 def _checked(value: float, number: float, text: str) -> float:

@@ -77,15 +77,15 @@ def read_scaled_unit(text: str) -> tuple[float, Unit]:
 def read_number(text: str) -> Number:
     """Read the number in front of a text; raises UnitError where there is none, or it has no end."""
     plain = _bounded(text).strip()
-    found = NUMBER.match(plain)
-    if found is None:
+    match = NUMBER.match(plain)
+    if match is None:
         if re.match(r"[+-]?(nan|inf)", plain, re.IGNORECASE):
             raise UnitError(f"'{shown(text)}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
         raise _wrong(text, f"it begins with '{shown(plain[:1])}' and not with a number", "write e.g. '0.1 s'")
-    value, rest = float(found[0]), plain[found.end() :]
-    if abs(value) == float("inf") or (value == 0 and re.search("[1-9]", re.split("[eE]", found[0])[0])):
-        raise _wrong(text, f"{found[0]} is beyond the numbers of a computer", "write one like 5e-4")
-    _check_end(text, found[0], rest)
+    value, rest = float(match[0]), plain[match.end() :]
+    if abs(value) == float("inf") or (value == 0 and re.search("[1-9]", re.split("[eE]", match[0])[0])):
+        raise _wrong(text, f"{match[0]} is beyond the numbers of a computer", "write one like 5e-4")
+    _check_end(text, match[0], rest)
     return Number(value, rest.lstrip(_SPACE))
 
 
@@ -142,14 +142,14 @@ class _Reader:
             if text[at] in _SPACE:
                 at += 1
                 continue
-            found = _TOKENS.match(text, at)
-            if found is None or found.lastgroup is None:
+            match = _TOKENS.match(text, at)
+            if match is None or match.lastgroup is None:
                 advice = "write products and quotients of units, e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'"
                 raise _wrong(self.whole, f"'{shown(text[at : at + 12])}' is no part of a unit", advice)
-            kind, part = found.lastgroup, found[0]
+            kind, part = match.lastgroup, match[0]
             plain = _PLAIN_POWER.fullmatch(part) if kind == "name" else None
             tokens += [("name", plain[1]), ("power", plain[2])] if plain else [(kind, part)]
-            at = found.end()
+            at = match.end()
         return tokens
 
     def read(self) -> Unit:
@@ -165,9 +165,9 @@ class _Reader:
         return self.tokens[self.at][0] if self.at < len(self.tokens) else None
 
     def _take(self, *texts: str) -> bool:
-        found = self.at < len(self.tokens) and self.tokens[self.at][1] in texts
-        self.at += found
-        return found
+        taken = self.at < len(self.tokens) and self.tokens[self.at][1] in texts
+        self.at += taken
+        return taken
 
     def _product(self, depth: int, unit: Unit) -> Unit:
         """Multiply by what follows, up to a closing bracket or the end."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-import fusion_core.chunk as core
+import fusion_core.contracts.table as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory
 

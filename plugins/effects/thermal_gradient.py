@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, auxiliary
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Behind, Reading, Signal, Weighted
+from fusion_core.contracts.table import auxiliary
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.common import lag_of

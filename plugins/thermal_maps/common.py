@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord, record_of
-from fusion_core.thermal.curve_uncertainty import Curve, Smoother, curve_error
+from fusion_core.thermal.curve_uncertainty import Curve, curve_error
+from fusion_core.thermal.soak_noise import Smoother
 from fusion_core.thermal.thermometer import steps_of
 
 

@@ -43,8 +43,7 @@ from fusion_core import contracts
 from fusion_core.chunk import Array
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
-from fusion_core.thermal.curve_uncertainty import Smoother
-from fusion_core.thermal.soak_noise import Blocks
+from fusion_core.thermal.soak_noise import Blocks, Smoother
 from fusion_plugins.thermal_maps import network as net
 from fusion_plugins.thermal_maps import onnx_graph
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
@@ -146,19 +145,19 @@ class OnnxNetwork(contracts.NetworkMap):
         return (cls(starts=1),)
 
     @property
-    def called(self) -> str:
+    def description(self) -> str:
         """The network and its size."""
         return f"a network of 2 x {self.neurons} neurons an axis"
 
     @property
-    def looser(self) -> str:
+    def advice(self) -> str:
         """One neuron more in each layer is one bend more."""
         return f"neurons: {self.neurons + 1} (`fit-map --select` finds how many)"
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""
         T, bias = contracts.check_samples(self.kind, T, bias)
-        what = self.called
+        what = self.description
         weights = self.neurons**2 + 4 * self.neurons + 1
         contracts.check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
         bins = bin_samples(T, bias, net.BINS[self.target])

@@ -24,8 +24,7 @@ from fusion_core import contracts
 from fusion_core.chunk import Array
 from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
-from fusion_core.thermal.curve_uncertainty import Smoother
-from fusion_core.thermal.soak_noise import Blocks
+from fusion_core.thermal.soak_noise import Blocks, Smoother
 from fusion_plugins.thermal_maps.common import record_fit
 
 _TRIED = range(1, 8)  # orders that are compared, and that of the settings
@@ -91,20 +90,20 @@ class Polynomial(contracts.ThermalMap):
         return tuple(self.model_copy(update={"order": order}) for order in sorted({*_TRIED, self.order}))
 
     @property
-    def called(self) -> str:
+    def description(self) -> str:
         """Return the name of a polynomial of its order."""
         names = {1: "a straight line", 2: "a parabola", 3: "a cubic"}
         return names.get(self.order, f"a polynomial of order {self.order}")
 
     @property
-    def looser(self) -> str:
+    def advice(self) -> str:
         """A polynomial of high order bends everywhere where one place asks for it; a spline does not."""
         return "kind: spline"
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
         """Fit the coefficients by least squares, every sample with the same weight."""
         T, bias = contracts.check_samples(self.kind, T, bias)
-        contracts.check_swing(self.kind, T, self.min_swing, self.order + 1, self.called, "lower order")
+        contracts.check_swing(self.kind, T, self.min_swing, self.order + 1, self.description, "lower order")
         domain = (float(T.min()), float(T.max()))
         R, z, squares = _triangle(_scaled(T, domain), bias, self.order)
         values = np.linalg.svd(R, compute_uv=False)
@@ -112,7 +111,7 @@ class Polynomial(contracts.ThermalMap):
         if rank <= self.order:
             raise SingularFit(
                 f"{self.kind}: the temperatures determine only {rank} of {self.order + 1} coefficients, "
-                f"{self.called} needs all of them; fit it on a soak with more temperatures or lower order"
+                f"{self.description} needs all of them; fit it on a soak with more temperatures or lower order"
             )
         inverse = np.linalg.inv(R)
         variance = squares / max(len(T) - self.order - 1, 1)

@@ -28,9 +28,8 @@ from pydantic import Field, FiniteFloat, model_validator
 from fusion_core import contracts
 from fusion_core.chunk import Array
 from fusion_core.hookspecs import hookimpl
-from fusion_core.thermal.curve_uncertainty import Smoother
 from fusion_core.thermal.penalised import LAMBDAS, penalised
-from fusion_core.thermal.soak_noise import Blocks
+from fusion_core.thermal.soak_noise import Blocks, Smoother
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 
@@ -116,12 +115,12 @@ class Spline(contracts.ThermalMap):
         return int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
 
     @property
-    def called(self) -> str:
+    def description(self) -> str:
         """The spline and the distance of its knots."""
         return f"a spline with knots {self.interval:g} K apart"
 
     @property
-    def looser(self) -> str:
+    def advice(self) -> str:
         """A shorter interval, or no smoothing that is set."""
         return f"interval: {self.interval / 2:g} K" if self.smoothing is None else "smoothing out of the config"
 
@@ -149,7 +148,7 @@ class Spline(contracts.ThermalMap):
         axes = zip(bins.bias.T, bins.variance.T, strict=True)
         return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, lambdas, breaks) for y, variance in axes])
 
-    def following(self, T: Array, bias: Array, record: contracts.MapRecord) -> SplineMap:
+    def from_curve(self, T: Array, bias: Array, record: contracts.MapRecord) -> SplineMap:
         """Return the spline that is nearest to the points."""
         count = self._count(record.domain)
         coefficients = np.asarray(np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0])

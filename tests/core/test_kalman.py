@@ -251,7 +251,7 @@ def test_gains_ahead_of_the_data_are_those_of_the_textbook():
     F, Q, H, R = uneven()
     P = np.diag([0.0, 1e-6, 0.0, 1e-6, 1e-6, 1e-4])
     model = invariant(F, Q, H, np.diag(R), P)
-    gains, N = model.ahead(model.groups.blocks(P, model.groups.states, model.groups.states), 500)
+    gains, N = model.gains_from(model.groups.blocks(P, model.groups.states, model.groups.states), 500)
     assert N == 500
     state = State(np.zeros(6), P)
     for k in range(N):
@@ -267,7 +267,7 @@ def test_groups_that_are_alike_share_their_gains():
     F, Q, H, R = twelve()
     P = np.diag([0.0] * 3 + [1e-6] * 3 + [0.0] * 3 + [1e-4] * 3)
     model = invariant(F, Q, H, np.diag(R), P)
-    gains, _ = model.ahead(model.groups.blocks(P, model.groups.states, model.groups.states), 10)
+    gains, _ = model.gains_from(model.groups.blocks(P, model.groups.states, model.groups.states), 10)
     assert gains.kind.tolist() == [0, 0, 0, 1, 1, 1]
     assert gains.P.shape == (10, 2, 2, 2)
 

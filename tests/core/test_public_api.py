@@ -1,5 +1,6 @@
 """What `fusion_core` itself offers: all of it resolves, is what its module has, and is loaded only when asked for."""
 
+import ast
 import subprocess
 import sys
 from importlib import import_module
@@ -8,20 +9,17 @@ from pathlib import Path
 import pytest
 
 import fusion_core
+import fusion_core.contracts
 
 
-def test_every_public_name_is_that_of_its_module():
-    assert sorted(fusion_core._HOME) == fusion_core.__all__
-    for name, module in fusion_core._HOME.items():
-        assert getattr(fusion_core, name) is getattr(import_module(f"fusion_core.{module}"), name)
-        assert name in dir(fusion_core)
-
-
-def test_what_type_checkers_see_is_what_there_is():
-    source = Path(fusion_core.__file__).read_text()
-    for module, names in fusion_core._HOMES.items():
-        block = source.split(f"    from fusion_core.{module} import ")[1].split("\n    from ")[0].split("\n\n")[0]
-        assert sorted(block.replace("(", " ").replace(")", " ").replace(",", " ").split()) == sorted(names)
+@pytest.mark.parametrize("package", [fusion_core, fusion_core.contracts], ids=lambda package: package.__name__)
+def test_every_public_name_is_that_of_its_module(package):
+    stub = ast.parse(Path(package.__file__).with_suffix(".pyi").read_text())
+    home = {name.asname: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for name in node.names}
+    assert sorted(home) == package.__all__
+    for name, module in home.items():
+        assert getattr(package, name) is getattr(import_module(module), name)
+        assert name in dir(package)
 
 
 def test_a_name_is_loaded_when_it_is_asked_for():

@@ -73,7 +73,7 @@ def test_types_in_pairs_of_pairs_and_in_circles_end(tmp_path):
 
 
 def test_an_archive_keeps_to_its_budget_and_a_full_disk_is_told_apart(tmp_path, monkeypatch):
-    monkeypatch.setattr(budget, "LEAST", 10_000_000)
+    monkeypatch.setattr(budget, "MIN_UNPACKED", 10_000_000)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     path = tmp_path / "a.mcap.zstd"
     path.write_bytes(bombs.packed("zstd", bytes(1000), 50_000_000, MCAP))

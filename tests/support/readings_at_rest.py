@@ -36,7 +36,7 @@ def errors(seed, step, noise, interval, *, sizes=False):
     at = np.linspace(0, 40, 4000)
     fitted = Polynomial(order=2, outside="tangent").fit(at, curve(at), {})
     known = replace(fitted, record=fitted.record.model_copy(update={"resolution": step, "dither": noise}))
-    run = Run(config(interval, Polynomial(order=2, outside="tangent").holding(known)), RunLog())
+    run = Run(config(interval, Polynomial(order=2, outside="tangent").with_fitted(known)), RunLog())
     rows = Chunk(t, {"gyro": gyro, "temperature": read}, sensors=frozenset({"gyro"}))
     found = joined(run.over(epochs([rows], interval)))
     late = found["t"] > 900

@@ -12,7 +12,7 @@ from readings_at_rest import DEG_H, errors
 from driftlab.filtering.coasting import _of_estimate
 from driftlab.filtering.thermometer import ReadingError, ThermometerError
 from fusion_core.chunk import Chunk
-from fusion_core.rate_estimators import Regression, with_rate
+from fusion_core.thermal.rate_estimators import Regression, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, sawtooth
 
 # readings

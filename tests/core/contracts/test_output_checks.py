@@ -204,7 +204,7 @@ WRONG_ANSWERS = [  # family, member, its wrong answer, its arguments, what is sa
     ("thermal_maps", "basis", None, ((0.0, 1.0),), "basis is a NoneType, a Basis was expected"),
     ("thermal_maps", "smoother", 1, (np.zeros(N), np.zeros((N, 2))), "its smoother is a int, a function"),
     ("thermal_maps", "variants", (), (), "variants is empty, at least 1 was expected"),
-    ("thermal_maps", "called", None, (), "has a NoneType where a text was expected"),
+    ("thermal_maps", "description", None, (), "has a NoneType where a text was expected"),
     ("sources", "chunks", iter([1]), (9, Faults()), "what it yields is a int, a Chunk was expected"),
     ("sources", "chunks", iter([Chunk(np.zeros(2), {"a": np.ma.masked_all(2)})]), (9, Faults()),
      "channel 'a' is a MaskedArray"),

@@ -39,7 +39,7 @@ HOSTS = [ThermalDerivative, Host]
 @pytest.mark.parametrize("cls", HOSTS)
 def test_a_host_takes_over_what_a_random_walk_says(cls):
     walk = RandomWalk(axes=("x", "z"), walk=("2 deg/h/sqrt(s)", "3 deg/h/sqrt(s)"), sigma_0="5 deg/h")
-    host = cls.hosting(walk)
+    host = cls.from_random_walk(walk)
     assert (host.axes, host.walk, host.sigma_0) == (walk.axes, walk.walk, walk.sigma_0)
     assert (host.map, host.effects, host.fitted) == (None, (), None)
     np.testing.assert_array_equal(host.prior().P, walk.prior().P)
@@ -48,7 +48,7 @@ def test_a_host_takes_over_what_a_random_walk_says(cls):
 @pytest.mark.parametrize("cls", HOSTS)
 def test_what_is_no_random_walk_is_not_taken_over(cls):
     with pytest.raises(ConfigError, match="bias model constant is no random walk"):
-        cls.hosting(Constant())
+        cls.from_random_walk(Constant())
 
 
 @pytest.mark.parametrize("cls", HOSTS)

@@ -13,7 +13,7 @@ from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 from fusion_core.contracts.effect import TEMPERATURE, Behind
 from fusion_core.host.registry import registry
-from fusion_core.testing.effects import realisation_is_the_signature
+from fusion_core.testing.effects import what_it_is_made_of_is_the_signature
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.curve import Curve
 from fusion_plugins.effects.drift import Drift
@@ -226,7 +226,7 @@ def test_only_an_effect_with_a_memory_has_an_unknown_start(kind):
     ids=repr,
 )
 def test_forms_beside_the_defaults_are_made_of_what_they_say(effect):
-    realisation_is_the_signature(effect, field=np.random.default_rng(2).normal(size=(120, 3)))
+    what_it_is_made_of_is_the_signature(effect, field=np.random.default_rng(2).normal(size=(120, 3)))
 
 
 def test_a_realisation_of_another_lag_is_found_out():
@@ -235,4 +235,4 @@ def test_a_realisation_of_another_lag_is_found_out():
             return (Behind(TEMPERATURE, 2 * float(self.tau)),)
 
     with pytest.raises(AssertionError):
-        realisation_is_the_signature(Wrong())
+        what_it_is_made_of_is_the_signature(Wrong())

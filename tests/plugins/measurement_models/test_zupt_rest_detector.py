@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.segment import RunLog, Stretches
-from fusion_core.rate_estimators import with_rate
+from fusion_core.thermal.rate_estimators import with_rate
 from fusion_plugins.measurement_models.rest_detector import FORGET
 
 DT = 0.1

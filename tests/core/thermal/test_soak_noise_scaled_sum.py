@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion_core.thermal.scaled_sum import ScaledSum
+from fusion_core.thermal.soak_noise import ScaledSum
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 40])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusion_core.rate_estimators import Kalman, Regression
+from fusion_core.thermal.rate_estimators import Kalman, Regression
 
 
 @pytest.mark.parametrize("estimator", [Regression(window="60 s"), Kalman()], ids=lambda e: e.kind)

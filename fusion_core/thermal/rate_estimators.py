@@ -74,6 +74,9 @@ class Kalman(Settings):
         return kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
+CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
+"""Channels that a temperature gets with its smoothing: its rate, the measured values, the window in s."""
+
 PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
 
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
@@ -81,7 +84,7 @@ RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 @dataclass(frozen=True)
 class RateMemory:
-    """What is carried from chunk to chunk: numbers of rate and temperature, and the range measured so far in degC."""
+    """The memory from chunk to chunk: numbers of rate and temperature, and the range measured so far in degC."""
 
     numbers: Array
     range: tuple[float, float]
@@ -121,8 +124,8 @@ def with_rate(
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])
     smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
-    found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
-    return found, RateMemory(numbers, (float(low[-1]), float(high[-1])), value)
+    conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
+    return conditioned, RateMemory(numbers, (float(low[-1]), float(high[-1])), value)
 
 
 def _first(T: float) -> Array:
