@@ -18,7 +18,7 @@ from driftlab.identification.candidates import check_kinds
 from driftlab.identification.config_edit import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
-from driftlab.identification.result import Explanation, Identification, closed, investigate
+from driftlab.identification.result import Identification, closed, investigate
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
 from driftlab.jobs.recordings import Recordings
@@ -118,7 +118,7 @@ def _declared(
 
 def _explained(
     config: Config,
-    found: Explanation,
+    found: Identification,
     fitted: FittedMap | None,
     settings: ThermalMap | None,
     names: list[str],
