@@ -223,7 +223,7 @@ class GrowingMap:
             found = self._found
             # readings with steps show no temperature between two levels; the last fit knows of those
             T = blocks.blocks().T if found is None or found.steps.size == 0.0 else found.T
-            known = with_coverage(known, T, blocks.seen, blocks.samples)
+            known = with_coverage(known, T, blocks.ends, blocks.samples)
         self.status = known
         return known
 

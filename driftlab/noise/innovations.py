@@ -21,12 +21,11 @@ N updates, d axes, K lags.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy import special
 
-from driftlab.noise.local_level import innovation_variances, minimum_near, whitened
+from driftlab.noise.local_level import innovation_sums, minimum_near
 from fusion_core.chunk import Array
 from fusion_core.contracts import Factor, Inflation, Lag
 from fusion_core.errors import SingularFit
@@ -86,30 +85,13 @@ class _Axis:
     """The likelihood of one axis, in units of its declared noise."""
 
     def __init__(self, readings: SensorReadings, axis: int, noise: float, walk: float) -> None:
-        N = len(readings.t)
-        use = np.flatnonzero(np.isfinite(readings.d[:, axis]))
-        starts = np.flatnonzero(np.diff(np.cumsum(readings.fresh)[use], prepend=-1))
+        self.d = np.ascontiguousarray(readings.d[:, axis]) / noise
+        self.rest = readings.tau, np.diff(readings.t, prepend=readings.t[0]), readings.fresh
         self.declared = (walk / noise) ** 2
-        self.part, self.series = np.empty(0, dtype=np.int64), []
-        for start, stop in pairwise([*starts.tolist(), len(use)]):
-            own = use[start:stop]
-            d, R = readings.d[own, axis] / noise, 1.0 / readings.tau[own]
-            # from the first reading of a series on, which has its level
-            self.series.append(((d[1:] - d[0])[:, None], R[1:], R[0], np.diff(readings.t[own])))
-            self.part = np.concatenate([self.part, own[1:] * PARTS // N])
-        self.count = np.bincount(self.part, minlength=PARTS).astype(np.float64)
 
-    def sums(self, log_ratio: float) -> tuple[Array, Array, Array]:
-        """Return sums (B,) of nis and log S at alpha = 1, and the count."""
-        q = self.declared * np.exp(log_ratio)
-        nis, log_S = [], []
-        for d, R, first, dt in self.series:
-            walk = q * dt
-            walk[:1] += first
-            nis.append(whitened(d, R, walk)[:, 0] ** 2)
-            log_S.append(np.log(innovation_variances(R, walk)))
-        of_nis, of_S = (np.bincount(self.part, np.concatenate(one), minlength=PARTS) for one in (nis, log_S))
-        return of_nis, of_S, self.count
+    def sums(self, log_ratio: float) -> Array:
+        """Return sums (3, B) of nis and log S at alpha = 1, and the count."""
+        return np.asarray(innovation_sums(self.d, *self.rest, self.declared * np.exp(log_ratio), PARTS))
 
     def concentrated(self, log_ratio: float) -> tuple[float, float]:
         """Return alpha^2, and less the log-likelihood at it."""

@@ -20,6 +20,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -51,23 +52,44 @@ def whitened(columns: Array, white: Array, walk: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def innovation_variances(white: Array, walk: Array) -> Array:
-    """Return the variances (R,) of the innovations that `whitened` normalises."""
-    P, S = 0.0, np.empty_like(white)
+def log_determinant(white: Array, walk: Array) -> float:
+    """Return the logarithm of the determinant of the covariance of the rows that `whitened` takes apart."""
+    P, total = 0.0, 0.0
     for k in range(len(white)):
         P += walk[k]
-        S[k] = P + white[k]
-        P -= P * P / S[k]
-    return S
+        S = P + white[k]
+        total += np.log(S)
+        P -= P * P / S
+    return total
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def log_determinant(white: Array, walk: Array) -> float:
-    """Return the logarithm of the determinant of the covariance of the rows that `whitened` takes apart."""
-    total = 0.0
-    for S in innovation_variances(white, walk):
-        total += np.log(S)
-    return total
+def innovation_sums(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, parts: int) -> Array:
+    """Return the sums of nis and log S, and the count, over parts of a series (3, parts).
+
+    The readings d (N,) are of a level of walk q in white noise 1 / tau, NaN where they do not count; the level is
+    unknown at the first one, and again from each on that is `fresh`.
+    """
+    sums = np.zeros((3, parts))
+    m, P, started = 0.0, 0.0, False
+    for k in range(len(d)):
+        if fresh[k]:
+            started = False
+        P += q * dt[k]
+        if not np.isfinite(d[k]):
+            continue
+        R = 1.0 / tau[k]
+        if not started:
+            m, P, started = d[k], R, True
+            continue
+        S, y = P + R, d[k] - m
+        part = k * parts // len(d)
+        sums[0, part] += y * y / S
+        sums[1, part] += np.log(S)
+        sums[2, part] += 1
+        m += P / S * y
+        P -= P * P / S
+    return sums
 
 
 def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:

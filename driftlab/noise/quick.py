@@ -17,7 +17,7 @@ import numpy as np
 from driftlab.noise.allan import curve
 from fusion_core.chunk import Array
 
-LEAST = 200  # samples of a stretch
+MIN_SAMPLES = 200  # of a stretch
 WINDOWS = 20  # in which the rows are looked at
 STILL = 2.0  # times the scatter of the quietest window: more is motion
 GAP = 1.5  # usual steps
@@ -58,7 +58,7 @@ def _quietest(t: Array, values: Array) -> slice | None:
     usual = float(np.median(step[step > 0])) if np.any(step > 0) else 0.0
     broken = ~good[1:] | ~good[:-1] | (step > GAP * usual) | (step <= 0)
     begin, end = _longest(np.concatenate([[True], broken, [True]]))
-    size = max(LEAST // 2, (end - begin) // WINDOWS)
+    size = max(MIN_SAMPLES // 2, (end - begin) // WINDOWS)
     count = (end - begin) // size
     if count < 2:
         return None
