@@ -1,8 +1,7 @@
-"""What a run does, the same from its first epoch to its last.
+"""Setup of a run: what stays the same from its first epoch to its last.
 
-What a measurement model needs of a recording and of its maps, checked before the filter runs.
-
-The bias blocks of a measurement model: what the bias models answer, put together; the host has checked it.
+Checks of a measurement model's recording and maps before the filter runs, and its bias blocks, put together from the
+bias models' own; the host has checked these.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What a run does.
+    """Settings and maps of a run.
 
     Attributes
     ----------
@@ -55,7 +54,7 @@ class RunSetup:
     gate : float
         The nis beyond which an epoch is not used.
     initial_error : float
-        Added to every axis of the tracked bias at the end of the alignment, in SI; the filter is not told.
+        Added to every axis of the tracked bias at the end of the alignment, in SI; unknown to the filter.
     keep_model : bool
         Whether the stretches keep the arrays that the filter was run on.
     """

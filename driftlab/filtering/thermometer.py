@@ -1,4 +1,4 @@
-"""The error of the thermometer: what it leaves in the temperature that the map sees, and in a bias that follows it.
+"""Error of the thermometer: in the temperature that the map sees, and in a bias that follows it.
 
 Of steps q and noise before them, a mean reading has a sawtooth over temperature and the rest is white
 (`fusion_core.thermal.thermometer`). The smoothing of the temperature, over w s, passes of both::
@@ -58,7 +58,7 @@ class ReadingError(NamedTuple):
 
 
 class ThermometerError:
-    """What a thermometer's own readings tell of its error, epoch by epoch.
+    """Estimate of a thermometer's error from its own readings, epoch by epoch.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class ThermometerError:
         self.memory = np.array([np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
 
     def snapshot(self) -> tuple[Array, Array]:
-        """Return what was learned so far."""
+        """Return the state so far."""
         return self.rows.copy(), self.memory.copy()
 
     def restore(self, snapshot: tuple[Array, Array]) -> None:

@@ -1,8 +1,7 @@
-"""What the filter answers, checked before it is believed.
+"""Tracker: the filter after its alignment, its state and memories, and the run of epochs through it.
 
-The filter after its alignment: its state and memories, and the run of epochs through it.
-
-The look-out for motion, and for a rest at another place, where the filter begins anew.
+Its estimates are checked to be finite. Motion is monitored, and so is a rest at another bias or attitude, where the
+filter begins anew.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class _Piece(NamedTuple):
     before: list[Memory]  # of the bias models
 
     def rows(self, start: int, stop: int) -> tuple[Chunk, list[Transition]]:
-        """Return what the filter is run on from start to stop."""
+        """Return the epochs and steps from start to stop."""
         return self.corrected.part(start, stop), [_rows(step, start, stop) for step in self.steps]
 
 
@@ -66,9 +65,9 @@ class Tracker:
 
     Parameters
     ----------
-    plan : Plan
-    journal : Journal
-        Which knows the alignments so far.
+    plan : RunSetup
+    journal : RunLog
+        With the alignments so far.
     alignment : Alignment
         The last of them.
     state : State
@@ -87,7 +86,7 @@ class Tracker:
         self.prediction = Prediction(plan, self.first)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the tracker has learned so far; between two calls of `advance`."""
+        """Return the tracker's state; between two calls of `advance`."""
         return {
             "alignment": self.alignment,
             "state": self.state,
@@ -184,14 +183,14 @@ class Tracker:
     ) -> RunSegment:
         channel = self.model.tracked.channel
         still = self.watch.look(done, found)
-        told = self.prediction.look(done, found, step, self.alignment)
+        output = self.prediction.look(done, found, step, self.alignment)
         return RunSegment(
             epochs=done,
             rate=done[channel] - self.model.known(done, self.alignment),
-            bias=told.bias + calibration,
-            sigma=told.sigma,
-            coast=told.coast + calibration,
-            coast_sigma=told.coast_sigma,
+            bias=output.bias + calibration,
+            sigma=output.sigma,
+            coast=output.coast + calibration,
+            coast_sigma=output.coast_sigma,
             calibration=calibration,
             still=still,
             estimates=found,
@@ -241,7 +240,7 @@ class RestMonitor:
         self.components = [axis_name(channel, axis) for channel, axis, _ in plan.model.components]
 
     def look(self, done: Chunk, found: Estimates) -> Flags:
-        """Return where the unit stood still (N,)."""
+        """Return the epochs at which the unit stood still (N,)."""
         still, out, self.memory = self.detector.look(done, self.memory)
         self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
         refused = still & ~found.used

@@ -68,7 +68,7 @@ class CandidateEvidence:
 
     @property
     def needed(self) -> float:
-        """What the ratio must be below; beside other effects more is asked, since what they misfit looks like one."""
+        """Upper limit of the ratio; lower beside other effects, since their misfit looks like one more."""
         return BESIDE if self.beside else FAST
 
     @property
@@ -114,7 +114,7 @@ class CandidateEvidence:
 
 
 def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) -> tuple[bool, str]:
-    """Return whether the evidence for a candidate is enough beside channels that are named already, and if not, why.
+    """Judge the evidence for a candidate beside channels that are named already; return the reason where it fails.
 
     An effect that is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time
     alone; a further term of a channel, by the first one's misfit.

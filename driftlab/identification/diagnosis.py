@@ -228,7 +228,7 @@ class Structure:
 
 
 def structures(search: Search, error: Array) -> list[Structure]:
-    """Return whether the residual varies beyond its noise, and the time scale at which some of it stands out.
+    """Return the structures of a residual that varies beyond its noise, or stands out at some time scale.
 
     `error` (d,) is that of the model on left-out parts, SI.
     """

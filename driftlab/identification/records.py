@@ -23,7 +23,7 @@ from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
-from driftlab.soak.sweeps import rise_and_fall
+from driftlab.soak.sweeps import one_way, ways
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import DERIVED, Array, Chunk, concatenate
@@ -204,7 +204,7 @@ def row_starts(t: Array, interval: float) -> NDArray[np.int64]:
 
 
 def lengths(longest: float, least: float) -> tuple[float, float]:
-    """Return how long means and rows are, in s, where the longest recording lasts `longest` and epochs `least`.
+    """Return the lengths of means and rows, in s, where the longest recording lasts `longest` and epochs `least`.
 
     They are whole multiples, so that all means are alike.
     """
@@ -267,8 +267,6 @@ def _check_same_channels(names: Sequence[str], chunks: Sequence[Chunk]) -> None:
             )
 
 
-TURN = 0.1  # of the whole swing: a smaller way back is no turning point
-ONE_WAY = 0.1  # of the way up (or down) that the other way must have at least
 STILL = 2.0  # K; a smaller swing shows nothing of temperature
 TOGETHER = 0.97  # correlation beyond which two channels are one
 
@@ -303,18 +301,3 @@ def _correlation(one: Array, other: Array) -> float:
     one, other = one - np.mean(one), other - np.mean(other)
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(one @ other) / size if size > 0 else 0.0
-
-
-def ways(recordings: Sequence[Array]) -> tuple[float, float]:
-    """Return by how much temperatures (N,) rise in all, and by how much they fall, between their turning points."""
-    least = TURN * (max(map(np.max, recordings)) - min(map(np.min, recordings)))
-    each = [rise_and_fall(T, least) for T in recordings]
-    return sum(up for up, _ in each), sum(down for _, down in each)
-
-
-def one_way(recordings: Sequence[Array]) -> str:
-    """Return the way of temperatures (N,) that hardly ever come back: `warms up` or `cools down`; else nothing."""
-    up, down = ways(recordings)
-    if min(up, down) >= ONE_WAY * max(up, down):
-        return ""
-    return "warms up" if up > down else "cools down"

@@ -163,7 +163,7 @@ class ErrorChange:
 
 
 def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
-    """Return how the error changes.
+    """Return the change of the error.
 
     With e the error before and s the change of the prediction, the sum of squares grows by s's + 2 s'e. Its deviation
     is 2 sqrt(s' Omega s), Omega what the periodogram of e says, smooth and falling: slow noise that happens to run
@@ -383,7 +383,7 @@ def size(search: Search, finding: Finding, fit: Joint) -> str:
 
 
 def predicts(search: Search, trial: Trial) -> str:
-    """Return how much better left-out parts are predicted, geometric mean over the axes."""
+    """Return the gain in the prediction of left-out parts, geometric mean over the axes."""
     ratio, unit, columns = float(np.sqrt(trial.evidence.ratio)), search.evidence.unit, search.columns
     rows = sum(part.rows.stop - part.window.stop for part in search.left_out)
     rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * columns.scale[columns.y[search.axes]]

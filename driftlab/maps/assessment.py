@@ -334,10 +334,10 @@ def as_json(placements: Placements, axes: Sequence[str]) -> dict[str, Any]:
             "level": levels.bias[k],
             "level_sigma": levels.sigma[k],
             "level_told": levels.level(k),
-            "scale": levels.scale[k] if levels.scale_told[k] else None,
+            "scale": levels.scale[k] if levels.scale_determined[k] else None,
             "scale_sigma": levels.scale_sigma[k],
-            "scale_change": change.value if change.told else None,
-            "scale_change_sigma": change.sigma if change.told else None,
+            "scale_change": change.value if change.determined else None,
+            "scale_change_sigma": change.sigma if change.determined else None,
         }
         for k, (axis, change) in enumerate(zip(axes, placements.changes, strict=True))
     ]
@@ -381,7 +381,7 @@ def _scales(placements: Placements, axes: Sequence[str]) -> list[str]:
     each = [
         f"{axis} {100 * levels.scale[k]:+.2g} ± {100 * levels.scale_sigma[k]:.1g} %"
         for k, axis in enumerate(axes)
-        if levels.scale_told[k] and abs(levels.scale[k]) > CLEAR * levels.scale_sigma[k]
+        if levels.scale_determined[k] and abs(levels.scale[k]) > CLEAR * levels.scale_sigma[k]
     ]
     return [f"scale factor off by {', '.join(each)}: the map is of the bias alone, and leaves that"] if each else []
 
@@ -389,22 +389,22 @@ def _scales(placements: Placements, axes: Sequence[str]) -> list[str]:
 def _changes(placements: Placements, axes: Sequence[str]) -> list[str]:
     """Return sentences on the scale factors over temperature."""
     lines = []
-    told = [k for k in range(len(axes)) if placements.changes[k].told]
-    moving = [k for k in told if abs(placements.changes[k].value) > CLEAR * placements.changes[k].sigma]
+    determined = [k for k in range(len(axes)) if placements.changes[k].determined]
+    moving = [k for k in determined if abs(placements.changes[k].value) > CLEAR * placements.changes[k].sigma]
     if moving:
         sizes = [
             f"{100 * placements.changes[k].value:+.2g} ± {100 * placements.changes[k].sigma:.1g} %" for k in moving
         ]
         each = ", ".join(f"{axes[k]} by {size}" for k, size in zip(moving, sizes, strict=True))
         lines.append(f"the scale factor changes from the coldest to the warmest sample, {each}: the map is without it")
-    if still := [k for k in told if k not in moving]:
+    if still := [k for k in determined if k not in moving]:
         known = max(placements.changes[k].sigma for k in still)
         names = ", ".join(axes[k] for k in still)
         lines.append(
             f"no change of the scale factor of {names} with temperature is seen (known to {100 * known:.1g} %)"
         )
     for k, axis in enumerate(axes):
-        if not placements.changes[k].told and np.max(np.abs(placements.up[:, k])) > VISIBLE:
+        if not placements.changes[k].determined and np.max(np.abs(placements.up[:, k])) > VISIBLE:
             lines.append(
                 f"{axis}: the change with temperature may be of its scale factor; one more placement with {axis} "
                 f"{_way(placements, k)}, warmed up too, tells them apart"

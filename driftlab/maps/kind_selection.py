@@ -87,7 +87,7 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class KindComparison:
-    """What was tried on blocks T (K,), bias (K, d), the chosen one, the one with the smallest error, and no map."""
+    """Kinds tried on blocks T (K,), bias (K, d), the chosen one, the one with the smallest error, and no map."""
 
     tried: tuple[Tried, ...]
     chosen: Tried
@@ -342,7 +342,7 @@ class Division:
 
 
 def divide(recordings: Sequence[Array]) -> Division:
-    """Return how to divide recordings, of which T (K_r,) are the blocks in the order of time."""
+    """Return the division of recordings, of which T (K_r,) are the blocks in the order of time."""
     T = np.concatenate(recordings)
     sizes = np.array([len(own) for own in recordings])
     recording = np.repeat(np.arange(len(sizes)), sizes)

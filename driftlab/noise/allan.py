@@ -208,7 +208,7 @@ def spans(lengths: Index, missing: Index) -> Index:
 
 
 def places(lengths: Index, missing: Index, parts: Index) -> Index:
-    """Return how many places of the time grid each span has (P,), lost samples included."""
+    """Return the places of the time grid in each span (P,), lost samples included."""
     if not len(parts):
         return np.empty(0, dtype=np.int64)
     behind = np.append(missing, 0)
@@ -310,7 +310,7 @@ def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, wh
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _number(runs: Index, a: int, b: int) -> int:
-    """Return how many runs of samples the window from a to b has; one that began before it, too."""
+    """Return the number of runs of samples in the window from a to b; one that began before it, too."""
     return int((runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1))
 
 
@@ -377,7 +377,7 @@ def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _pairs(counts: Flags, reach: int) -> int:
-    """Return how many pairs of differences that count are at most `reach` apart, each in both orders."""
+    """Return the number of pairs of differences that count at most `reach` apart, each in both orders."""
     n, near, found = len(counts), 0, 0
     for k in range(min(reach, n)):
         near += counts[k]

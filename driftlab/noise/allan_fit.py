@@ -284,7 +284,7 @@ def _widened(trial: ProfileTrial, low: float, high: float) -> tuple[float, float
 
 
 def _bisect(above: Callable[[float], bool], low: float, high: float) -> float:
-    """Return where `above` turns from false to true between two positive numbers, to 2 % or so."""
+    """Return the place at which `above` turns true between two positive numbers, to 2 % or so."""
     while high > 1.02 * low:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if above(middle) else (middle, high)

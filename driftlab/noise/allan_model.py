@@ -271,7 +271,7 @@ def _classes(curve: AllanCurve, A: Array, order: int) -> Iterator[Class]:
 
 
 def _differences(N: Index, n: Index, m: int, order: int) -> tuple[float, float]:
-    """Return how many differences n stretches of N samples have, and the sum of their squares, each by what it tells.
+    """Return the number of differences of n stretches of N samples, and the sum of their squares, by information.
 
     The mean over one stretch has a relative variance of c / (N - ENDS m): for differences at all places, fewer than
     c / (N - order m) would have it, since those at the ends overlap less.

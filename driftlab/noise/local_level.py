@@ -93,7 +93,7 @@ def innovation_sums(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, par
 
 
 def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:
-    """Return where a cost is least, found between the neighbours of the best place of a grid."""
+    """Return the minimum of a cost, between the neighbours of the best place of a grid."""
     k = int(np.argmin([cost(float(x)) for x in grid]))
     bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
     return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
@@ -152,7 +152,7 @@ def fit_local_level(parts: Sequence[Array]) -> LocalLevel:
 
 
 def effective(e: Array, s: Array, *, walking: bool) -> float:
-    """Return how many independent rows residual e (n,) has for a signal s (n,).
+    """Return the number of independent rows that residual e (n,) has for a signal s (n,).
 
     n |s|^2 var(e) / (s' Omega s), Omega the covariance by the periodogram of e, smooth and falling; where the
     signal runs with time alone (`walking`), white and flicker noise and a walk, and not the rest of the signal.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from driftlab.config import Config
-    from fusion_core.contracts import MeasurementModel, Sensor
+    from fusion_core.contracts import Sensor
     from fusion_core.faults import Faults
 
 IMU = ("gyro", "accel")

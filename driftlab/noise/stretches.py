@@ -62,7 +62,7 @@ class RestWindows:
         return self.t_0 + self.length * float(first), self.t_0 + self.length * float(last + 1)
 
     def rows(self, t: Array) -> Flags:
-        """Return which samples at times t (N,) lie in windows at rest; others go with a window beside them."""
+        """Return the samples at times t (N,) in windows at rest; those between windows go with one beside them."""
         window = np.searchsorted(self.numbers, np.floor((t - self.t_0) / self.length), side="right") - 1
         return np.asarray(self.still[np.maximum(window, 0)], dtype=np.bool_)
 

@@ -45,13 +45,13 @@ class ScaleChange:
 
     Attributes
     ----------
-    told : bool
-        Whether the placements tell it from the change of the bias.
+    determined : bool
+        Whether the placements separate it from the change of the bias.
     value, sigma : float
-        Where told.
+        Where determined.
     """
 
-    told: bool
+    determined: bool
     value: float = 0.0
     sigma: float = 0.0
 
@@ -115,9 +115,9 @@ def placed(T: Array, reading: Array, placement: Index, length: float, unsure: fl
     bias = np.empty_like(reading)
     for k, axis in enumerate(axes):
         bias[:, k] = reading[:, k] - (level[:, k] - levels.bias[k])[placement]
-        if axis.change.told:
+        if axis.change.determined:
             bias[:, k] -= up[placement, k] * (design.bends(T) @ axis.scale)
-    changes = tuple(ScaleChange(a.change.told, a.change.value / length, a.change.sigma / length) for a in axes)
+    changes = tuple(ScaleChange(a.change.determined, a.change.value / length, a.change.sigma / length) for a in axes)
     return bias, Placements(up, levels, changes, blocks, tuple(axis.error for axis in axes))
 
 
@@ -169,7 +169,7 @@ def _solved(design: _Design, up: Array) -> list[_Solved]:
 
 
 def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
-    """Return the estimates of an axis by the curve and `columns` (K, P), or (K, P + 2) where its scale is told."""
+    """Return the estimates of an axis by the curve and `columns` (K, P), (K, P + 2) where its scale is determined."""
     q, P = design.B.shape[1], design.Z.shape[1]
     X = np.hstack([design.B, columns])
     penalty = np.zeros((X.shape[1], X.shape[1]))
@@ -178,7 +178,7 @@ def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
     mean = design.blocks.n @ design.B / np.sum(design.blocks.n)
     levels = operator[q : q + P] + mean @ operator[:q]
     scale = operator[q + P :]
-    taken, change = design.Z @ (design.means + levels) + columns[:, P:] @ scale, ScaleChange(told=False)
+    taken, change = design.Z @ (design.means + levels) + columns[:, P:] @ scale, ScaleChange(determined=False)
     if len(scale):
         ends = np.diff(design.bends(np.array([design.low, design.high])), axis=0)[0]
         change = ScaleChange(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
@@ -199,7 +199,7 @@ def _determined(design: _Design, H: Array) -> bool:
 
 
 BIAS, SCALE = 0.05, 0.01  # of g, and of 1: deviations of units of which nothing is known
-TOLD = 0.1  # of that deviation: what is known better has been told
+DETERMINED = 0.1  # of that deviation: a parameter that is known better is determined
 FREE = 0.5  # of it: a scale factor that is known no better stays zero
 STEPS = 20
 
@@ -211,9 +211,9 @@ class Levels:
     Attributes
     ----------
     bias, sigma : (d,) arrays
-        In the mean over the samples, and its deviation; scale factors that are not told are part of that.
+        In the mean over the samples, and its deviation; scale factors that are not determined are part of that.
     given_scale : (d,) array
-        The deviation where scale factors that are not told are what they should be.
+        The deviation where scale factors that are not determined are what they should be.
     scale, scale_sigma : (d,) arrays
         Scale factor less 1.
     lengths : (P,) array
@@ -234,15 +234,15 @@ class Levels:
     prior: float
 
     @property
-    def scale_told(self) -> Array:
-        """Whether each scale factor is told (d,)."""
-        return np.asarray(self.scale_sigma < TOLD * SCALE)
+    def scale_determined(self) -> Array:
+        """Whether each scale factor is determined (d,)."""
+        return np.asarray(self.scale_sigma < DETERMINED * SCALE)
 
     def level(self, axis: int) -> str:
         """Return how far the level of an axis is known: `told`, `scale` (but for its scale factor), or `tilt`."""
-        if self.sigma[axis] < TOLD * self.prior:
+        if self.sigma[axis] < DETERMINED * self.prior:
             return "told"
-        return "scale" if self.given_scale[axis] < TOLD * self.prior else "tilt"
+        return "scale" if self.given_scale[axis] < DETERMINED * self.prior else "tilt"
 
 
 def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -> Levels:
@@ -266,9 +266,9 @@ def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -
     theta, given = _solution(level, covariances, length, unsure, deviation, free)
     left, _, spread = _equations(theta, level, covariances, length, unsure)
     # lengths that differ by more than noise explains: axes that are not square, say
-    most = max(len(level) - int(np.sum(np.sqrt(np.diag(given)) < TOLD * deviation)), 1)
+    most = max(len(level) - int(np.sum(np.sqrt(np.diag(given)) < DETERMINED * deviation)), 1)
     worse = np.sqrt(max(1.0, float(left @ np.linalg.solve(spread, left)) / most))
-    sigma = np.where(sigma < TOLD * deviation, worse * sigma, sigma)
+    sigma = np.where(sigma < DETERMINED * deviation, worse * sigma, sigma)
     sigma_given, expected = worse * np.sqrt(np.diag(given))[:d], np.sqrt(np.diag(spread))
     return Levels(theta[:d], sigma[:d], sigma_given, theta[d:], sigma[d:], left, expected, BIAS * length)
 

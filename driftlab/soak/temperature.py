@@ -177,7 +177,7 @@ class _Levels:
 
 
 class _Smoothness:
-    """What a walk of the rate makes of a path: second differences over times `at` (K,), as a banded matrix (3, K)."""
+    """Prior of a path whose rate walks: second differences over times `at` (K,), as a banded matrix (3, K)."""
 
     def __init__(self, at: Array, walk: float) -> None:
         h = np.diff(at)

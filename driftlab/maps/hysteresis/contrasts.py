@@ -311,7 +311,7 @@ class SoakContrasts:
         return slots, self.of(slots), np.stack([followed, part]), following
 
     def form_variances(self, inputs: Array, curves: FollowingCurves, noises: Index, s2: Array, between: Array) -> Array:
-        """Return how uncertain the curves that follow inputs are in form (J, d), between two of their temperatures.
+        """Return the variances of the form (J, d) of curves that follow inputs, between two of their temperatures.
 
         `between` (J, d, p): the splines at one less those at the other. Curve and size are fitted together, by
         generalised least squares under the noise (d,) of each axis, whose white part has the variance s2 (d,); a

@@ -34,7 +34,7 @@ from fusion_core.chunk import Array
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
-MOST = 12.0  # t up to which the evidence is worked out
+MAX_T = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is
 TINY = 1e-300
 TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
@@ -46,7 +46,7 @@ LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: les
 
 @dataclass(frozen=True, eq=False)
 class ShapeEvidence:
-    """What the contrasts of a soak say of shapes.
+    """Evidence for shapes in the contrasts of a soak.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ class ShapeEvidence:
         return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
 
     def would_show(self, alike: Array) -> Array:
-        """Return which coefficients (J, d) would have been seen with 95 %, on one axis alone.
+        """Return the coefficients (J, d) that would have been seen with 95 %, on one axis alone.
 
         `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
         taken to speak against one as much as it does at t = 1.
@@ -226,7 +226,7 @@ class ShapeEvidence:
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.A.shape[1:])
         for axis in range(d):
-            low, high = np.zeros(len(prior)), np.full(len(prior), MOST)
+            low, high = np.zeros(len(prior)), np.full(len(prior), MAX_T)
             for _ in range(HALVINGS):
                 t = (low + high) / 2
                 each = []
@@ -236,14 +236,14 @@ class ShapeEvidence:
                     each.append(log_mean(factor + prior) + (d - 1) * other)
                 reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
-            needed[:, axis] = np.where(low > 0.99 * MOST, np.inf, high)
+            needed[:, axis] = np.where(low > 0.99 * MAX_T, np.inf, high)
         spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """What the likeliest pairs of shapes say: which (P, 2), log-likelihood of each (P,), coefficients and covariances.
+    """Estimates of the likeliest pairs of shapes, `which` (P, 2), with the log-likelihood of each (P,).
 
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """

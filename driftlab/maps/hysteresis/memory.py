@@ -150,7 +150,7 @@ def _threads() -> Any:
 
 
 def _unseen(soak: SoakSummary) -> str:
-    """Return why no soak like this shows a memory, a key of WHY; empty where it may."""
+    """Return the reason why no soak like this shows a memory, a key of WHY; empty where it may."""
     warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
     if not (warms and cools):
         return "warms" if warms else "cools" if cools else "no way"
@@ -279,7 +279,7 @@ class _MemoryTest:
         return size * scale, sigma * scale, where, self._sweeps.T, difference * scale, spread * scale
 
     def _forms(self, evidence: ShapeEvidence) -> Array:
-        """Return how far off the form of each shape may be, of its size (J, d): that of a curve is an estimate."""
+        """Return the relative error of the form of each shape (J, d): that of a curve is an estimate."""
         forms = np.full(self.z.shape[1:], FORM)
         if self.curves is None:
             return forms

@@ -38,7 +38,7 @@ SAME = 1e-6  # of a signature: a difference that is rounding
 
 @dataclass(frozen=True, eq=False)
 class MemoryShapes:
-    """What memories may add to the bias of the slots, in order of their kinds.
+    """Shapes of the bias of the slots that memories may add, in order of their kinds.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ def shapes_of(soak: SoakSummary) -> MemoryShapes:
 def _offered(
     cls: type[Effect], forward: Sequence[Chunk], backward: Sequence[Chunk], way: Array
 ) -> tuple[list[Array], bool, list[float]]:
-    """Return what the proposals of a class show on the slots, whether the curve sees that, and their spans in s."""
+    """Return the proposals of a class on the slots, whether they act on the curve's input, and their spans in s."""
     grid = [e for e in cls(axes=("x",)).proposals(forward) if tuple(e.requires) == (SUBJECT,)]  # type: ignore[call-arg]
     if not grid:
         return [], False, []
@@ -150,7 +150,7 @@ OTHER = 0.5  # of an opening: almost as far
 
 
 class Sweeps:
-    """What shapes show on the sweeps of a soak.
+    """Shapes over the sweeps of a soak.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class Sweeps:
         return size, self.T[at]
 
     def both_ways(self) -> NDArray[np.bool_]:
-        """Return which shapes (J, d) open almost as far the other way: of a curve that bends, neither is its sign."""
+        """Return the shapes (J, d) that open almost as far the other way: a curve that bends has no sign."""
         most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(self.shown, self.up))
         sides = np.stack([np.max(most, axis=0), -np.min(least, axis=0)])
         return np.asarray(np.min(sides, axis=0) > OTHER * np.max(sides, axis=0))
