@@ -101,7 +101,7 @@ def error(squares: LeastSquares, model: Model, axis: int, part: LeftOutPart, noi
     """
     columns = squares.columns
     fit = squares.fit(model, axis, part.rest)
-    known = given(squares, model, axis, fit, part.refit)
+    known = condition(squares, model, axis, fit, part.refit)
     cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, part.record]])
     W = columns.W[part.rows, cols] + columns.means[part.record, cols]
     stop = 1 + len(known.cols)
@@ -118,7 +118,7 @@ def error(squares: LeastSquares, model: Model, axis: int, part: LeftOutPart, noi
     return np.asarray(e[split:] - e[split:].mean())
 
 
-def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Conditioned:
+def condition(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Conditioned:
     """Fit map, levels and starts on some segments, the effects' coefficients given as another fit has them."""
     columns, means = squares.columns, squares.columns.means
     fixed, y = squares.fixed(model, axis), columns.y[axis : axis + 1]

@@ -20,7 +20,8 @@ from driftlab.identification.acceptance import CHANCE, GAIN
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, span, with_residual
 from driftlab.identification.experiment_design import Experiment, Question, propose
 from driftlab.identification.least_squares import Term
-from driftlab.identification.state import Progress, Search, Trial, name_of
+from driftlab.identification.records import Progress
+from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import as_good, contains, tried
 from driftlab.noise.local_level import one_step
 from fusion_core.chunk import Array

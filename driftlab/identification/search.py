@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from driftlab.identification.acceptance import WORSE
 from driftlab.identification.candidates import candidates_of
 from driftlab.identification.columns import EffectRegressors
-from driftlab.identification.cross_validation import MIN_ROWS, given, parts
+from driftlab.identification.cross_validation import MIN_ROWS, condition, parts
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term
-from driftlab.identification.prediction_errors import left_out_errors
-from driftlab.identification.records import Evidence
-from driftlab.identification.state import Progress, Search, Trial, name_of
+from driftlab.identification.prediction_errors import Errors, left_out_errors
+from driftlab.identification.records import Evidence, Progress
+from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
 from fusion_core.contracts import Basis, Effect
 from fusion_core.errors import FusionError
@@ -148,7 +148,7 @@ def _drop(state: Search) -> None:
             state.fresh()
 
 
-def _left_out_errors(state: Search, model: Model) -> list[list[NDArray[np.float64]]]:
+def _left_out_errors(state: Search, model: Model) -> Errors:
     return left_out_errors(state, [model] * len(state.left_out), state.noises_of(model))
 
 
@@ -242,7 +242,7 @@ def _squares(squares: LeastSquares, model: Model, axis: int, rows: Rows) -> tupl
     """Return the sum of squares of the errors of rows that are left out, in the columns' scale, and the others' fit."""
     columns = squares.columns
     fit = squares.fit_rows(model, axis, ~rows)
-    known = given(squares, model, axis, fit, columns.everything)
+    known = condition(squares, model, axis, fit, columns.everything)
     total = 0.0
     for r, own in enumerate(columns.evidence.slices):
         at = np.flatnonzero(rows[own]) + own.start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,14 +10,12 @@ from driftlab.identification.acceptance import CandidateEvidence
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term, slow_density
-from driftlab.identification.records import Evidence
+from driftlab.identification.records import Evidence, Progress
 from driftlab.noise.local_level import LocalLevel, fit_local_level
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own weight
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
