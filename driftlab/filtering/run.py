@@ -105,9 +105,9 @@ class Run:
         low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
         high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
-            if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
+            if (shapes := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
-                known = found
+                known = shapes
             chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, coarse, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)

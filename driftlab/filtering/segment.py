@@ -63,16 +63,16 @@ class RunSegment:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
-        found, epochs = self.estimates, self.epochs
+        estimates, epochs = self.estimates, self.epochs
         temperature = {k: epochs[k] for k in TEMPERATURES if k in epochs.channels}
         return {
             "t": epochs.t,
-            "x": found.x,
-            "sigma": found.sigma,
-            "innovations": found.y,
-            "white": found.white,
-            "nis": found.nis,
-            "used": found.used,
+            "x": estimates.x,
+            "sigma": estimates.sigma,
+            "innovations": estimates.y,
+            "white": estimates.white,
+            "nis": estimates.nis,
+            "used": estimates.used,
             "still": self.still,
             "tau": epochs["tau"],
             "rate": self.rate,

@@ -69,7 +69,7 @@ def residual_of(
     row = np.minimum(np.arange(len(T)) // rows.size, len(joined) - 1)
     blocks, smoother = summed(T, left, row), settings.smoother(T, left + fitted.bias(T))
     chosen: list[list[WalkContrasts]] = []  # of a map that chooses, alike for all axes
-    found, taken, left_of = [], np.empty(0), [list[WalkContrasts]()] * 2
+    squares, taken, left_of = [], np.empty(0), [list[WalkContrasts]()] * 2
     for axis, r in enumerate(joined.T):
         answer = smoother(blocks, blocks.T, axis)
         if not np.array_equal(answer, taken):
@@ -80,8 +80,8 @@ def residual_of(
                 chosen = chosen or [contrasts(rows, _without(blocks.T, order)) for order in (FREE, STIFF)]
                 left_of = chosen
         wanted = [(one.white, one.wandering) for one in left_of[1]]
-        found.append(bounds(rows, left_of[0], r, float(rows.within[axis]), wanted))
-    low, high = np.sqrt(np.array(found)).T
+        squares.append(bounds(rows, left_of[0], r, float(rows.within[axis]), wanted))
+    low, high = np.sqrt(np.array(squares)).T
     return Residual(rms, np.minimum(low, rms), np.maximum(high, rms))
 
 

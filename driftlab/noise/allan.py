@@ -105,10 +105,10 @@ def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, 
     squares, bridge = bridged(rate, stretches, missing, parts, m, stride)
     second, third = bridge.differences
     # where m was rounded to the stride it may be a little longer than `factors` has it
-    kept = third > 0 if wanted else (second >= 0.8 * COVERED * m) & (third >= m / 2)
-    deviations = np.sqrt(squares[kept] / [2.0, 6.0])
-    tau: Array = np.asarray(m[kept] * dt, dtype=np.float64)
-    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[kept], whole, dt, bridge.of(kept))
+    enough = third > 0 if wanted else (second >= 0.8 * COVERED * m) & (third >= m / 2)
+    deviations = np.sqrt(squares[enough] / [2.0, 6.0])
+    tau: Array = np.asarray(m[enough] * dt, dtype=np.float64)
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[enough], whole, dt, bridge.of(enough))
 
 
 def _sizes(m: Index, N: int) -> tuple[Index, Index]:
@@ -256,7 +256,7 @@ def bridged(
     mean = sums / np.maximum(count, 1)[:, :, None]
     ratio = taken[:, :, ::2] / np.maximum(taken[:, :, 1::2], 1)
     inner = np.concatenate([missing[a : b - 1] for a, b in parts])
-    found = Bridge(
+    bridge = Bridge(
         stretches=np.concatenate([lengths[a:b] for a, b in parts]),
         gaps=inner[inner > 0],
         differences=(count * stride[:, None]).T,
@@ -267,7 +267,7 @@ def bridged(
         pieces=stands[:, 0].astype(np.int64),
         samples=stands[:, 1].astype(np.int64),
     )
-    return mean[:, :, 0], found
+    return mean[:, :, 0], bridge
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -378,7 +378,7 @@ def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _pairs(counts: Flags, reach: int) -> int:
     """Return the number of pairs of differences that count at most `reach` apart, each in both orders."""
-    n, near, found = len(counts), 0, 0
+    n, near, pairs = len(counts), 0, 0
     for k in range(min(reach, n)):
         near += counts[k]
     for k in range(n):
@@ -387,5 +387,5 @@ def _pairs(counts: Flags, reach: int) -> int:
         if k > reach:
             near -= counts[k - reach - 1]
         if counts[k]:
-            found += near
-    return found
+            pairs += near
+    return pairs

@@ -42,10 +42,10 @@ def noise_of(t: Array, values: Array) -> QuickNoise | None:
     dt = float(np.median(np.diff(t[rows])))
     white, walk = np.empty(values.shape[1]), np.empty(values.shape[1])
     for k in range(values.shape[1]):
-        found = curve(np.ascontiguousarray(quiet[:, k]), dt)
-        early = found.tau <= max(1.0, 4 * dt)
-        white[k] = float(np.median(found.allan[early] * np.sqrt(found.tau[early])))
-        walk[k] = np.sqrt(3) / 2 * float(np.min(found.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
+        allan = curve(np.ascontiguousarray(quiet[:, k]), dt)
+        early = allan.tau <= max(1.0, 4 * dt)
+        white[k] = float(np.median(allan.allan[early] * np.sqrt(allan.tau[early])))
+        walk[k] = np.sqrt(3) / 2 * float(np.min(allan.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
     if not np.all(white > 0):
         return None
     return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt)

@@ -157,10 +157,10 @@ def _rest(config: Config, whole: Chunk) -> RestWindows | None:
     return at_rest(settings.only(whole.channels.keys()), whole)
 
 
-def _gap_notes(shown: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
+def _gap_notes(first: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
     """Yield remarks on the samples behind each averaging time, and on steps that vary within a stretch."""
     dt, lengths = cut.dt, cut.places
-    if len(bridged := shown.bridged):
+    if len(bridged := first.bridged):
         short, long = np.min(bridged), np.max(bridged)
         many = f"{len(bridged)} gaps are" if len(bridged) > 1 else "1 gap is"
         since = f"{short:.3g} s" if short == long else f"{short:.3g} s (all of them from {long:.3g} s)"
@@ -174,21 +174,21 @@ def _gap_notes(shown: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> 
         yield (
             f"{len(lengths)} stretches without a {gap} or motion are used, {share:.3g} % of the samples, of "
             f"{lengths.min() * dt:.3g} to {lengths.max() * dt:.6g} s (the longest from "
-            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(shown)}"
+            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(first)}"
         )
     low, high = limits(whole.t, cut.rows)
     if max(high - dt, dt - low) > 0.01 * dt:
         yield f"steps vary from {low:.4g} to {high:.4g} s: taken as regular, with the mean interval {dt:.6g} s"
 
 
-def _stands(shown: AllanCurve) -> str:
-    used = shown.used
+def _stands(first: AllanCurve) -> str:
+    used = first.used
     if used[-1] >= used[0]:
         return "every averaging time stands on all of them"
-    most = shown.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
+    most = first.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
     return (
         f"averaging times up to {most:.3g} s stand on 90 % of their time or more, the longest, "
-        f"{shown.tau[-1]:.3g} s, on {shown.counts[-1]} of them, {used[-1]:.6g} s"
+        f"{first.tau[-1]:.3g} s, on {first.counts[-1]} of them, {used[-1]:.6g} s"
     )
 
 

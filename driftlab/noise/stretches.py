@@ -152,8 +152,8 @@ def _runs(t: Array, usable: Flags | None) -> Index:
     if usable is not None:
         cut |= usable[1:] != usable[:-1]
     edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
-    found = np.stack([edges[:-1], edges[1:]], axis=1)
-    return found if usable is None else found[usable[found[:, 0]]]
+    stretches = np.stack([edges[:-1], edges[1:]], axis=1)
+    return stretches if usable is None else stretches[usable[stretches[:, 0]]]
 
 
 def limits(t: Array, stretches: Index) -> tuple[float, float]:

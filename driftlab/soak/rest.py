@@ -86,8 +86,8 @@ class Used:
             return ""
         why = []
         if self.moved >= 0.005:
-            seen = ", ".join(name for name, count in self.axes.most_common() if 2 * count >= max(self.axes.values()))
-            why.append(f"{self.moved:.0%} was taken for motion (first {self.first}{seen and f', seen by {seen}'})")
+            by = ", ".join(name for name, count in self.axes.most_common() if 2 * count >= max(self.axes.values()))
+            why.append(f"{self.moved:.0%} was taken for motion (first {self.first}{by and f', seen by {by}'})")
         if self.unread >= 0.005:
             why.append(f"{self.unread:.0%} of the rows were left out{self.why and f' ({self.why})'}")
         return f"{self.share:.0%} of the soak is not used: {'; '.join(why)}"
@@ -168,10 +168,10 @@ class _Cutting:
         A thermometer of coarse steps does not show the rate all the time, and a bias may go on behind.
         """
         lately = concatenate(self._lately)
-        found = with_rate(lately, self.model.temperature_rate, None)[0].channels.get("temperature_rate")
-        if found is None:
+        rate = with_rate(lately, self.model.temperature_rate, None)[0].channels.get("temperature_rate")
+        if rate is None:
             return lately, 0.0
-        return lately.having(temperature_rate=found), float(np.max(np.abs(found)))
+        return lately.having(temperature_rate=rate), float(np.max(np.abs(rate)))
 
     def _cut(self, window: Chunk) -> list[Chunk]:
         lately, rate = self._rated()
@@ -188,14 +188,14 @@ class _Cutting:
         for (channel, axis), count in zip(detector.axes, np.sum(out, axis=0), strict=True):
             if count:
                 self.used.axes[axis_name(channel, axis)] += int(count)
-        found = [
+        parts = [
             window.part(a - start, b - start)
             for c, d in runs(still)
             for a, b in self._at_rest(fastest, start + c, start + d, rate)
         ]
-        if found:
-            self._before, self.still = found[-1], bool(found[-1].t[-1] == window.t[-1])
-        return found
+        if parts:
+            self._before, self.still = parts[-1], bool(parts[-1].t[-1] == window.t[-1])
+        return parts
 
     def _at_rest(self, epochs: Chunk, start: int, stop: int, rate: float) -> list[tuple[int, int]]:
         """Return the rest in epochs of which none stands out: in halves, where the temperature moves far."""

@@ -35,10 +35,10 @@ def turning_points(T: Array, turn: float) -> list[int]:
 
 def directions(T: Array, turn: float) -> Index:
     """Return +1 (up), -1 (down) or 0 (neither so far) for each of T (K,)."""
-    found = np.zeros(len(T), dtype=np.int64)
+    ways_of_T = np.zeros(len(T), dtype=np.int64)
     for start, stop in pairwise(turning_points(T, turn)):
-        found[start:] = np.sign(T[stop] - T[start])
-    return found
+        ways_of_T[start:] = np.sign(T[stop] - T[start])
+    return ways_of_T
 
 
 def sweeps_of(T: Array, turn: float) -> Index:

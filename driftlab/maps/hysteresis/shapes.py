@@ -127,12 +127,12 @@ def remembers(forward: Sequence[Array], backward: Sequence[Array]) -> bool:
 
 def _recordings(soak: SoakSummary, *, backward: bool = False) -> list[Chunk]:
     step = -1 if backward else 1
-    found = []
+    chunks = []
     for number in np.unique(soak.recording):
         own = soak.recording == number
         t, T = soak.t[own] * soak.interval, soak.T[own][::step]
-        found.append(Chunk(t, {SUBJECT: T, "residual": np.zeros((len(T), 1))}))
-    return found
+        chunks.append(Chunk(t, {SUBJECT: T, "residual": np.zeros((len(T), 1))}))
+    return chunks
 
 
 def _signatures(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
@@ -216,9 +216,9 @@ def _over(grid: Array, T: Array, values: Array) -> Array:
     place = np.clip(np.searchsorted(T, grid) - 1, 0, len(T) - 2)
     width = T[place + 1] - T[place]
     share = np.clip(np.divide(grid - T[place], width, out=np.zeros_like(grid), where=width > 0), 0.0, 1.0)[:, None]
-    found = flat[place] * (1 - share) + flat[place + 1] * share
-    found[(grid < T[0]) | (grid > T[-1])] = np.nan
-    return np.asarray(found.reshape(len(grid), *values.shape[1:]))
+    values_there = flat[place] * (1 - share) + flat[place + 1] * share
+    values_there[(grid < T[0]) | (grid > T[-1])] = np.nan
+    return np.asarray(values_there.reshape(len(grid), *values.shape[1:]))
 
 
 def _extremes(shown: Array, up: Mask) -> tuple[Array, Array]:
