@@ -35,14 +35,14 @@ CASES = (
 def _starts(always: bool) -> None:
     import driftlab.identification.search as search
 
-    whole = search.offered
+    whole = search.candidates_of
 
     def offered(found: Any) -> Any:
         families = whole(found)
         free = {key[:3] for key in families if key[3]}
         return {key: terms for key, terms in families.items() if key[3] == (always and key[:3] in free)}
 
-    search.offered = offered
+    search.candidates_of = offered
 
 
 def _no_level_prior() -> None:

@@ -29,7 +29,7 @@ from driftlab.identification.candidates import check_kinds
 from driftlab.identification.config_edit import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
-from driftlab.identification.result import Explanation, Identification, Outcome, closed, investigate
+from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
 from driftlab.recordings.identity import identity, sha256
 from driftlab.recordings.overlap import SMALL, Content, content_of
@@ -212,7 +212,7 @@ def _declared(
 
 def _explained(
     config: Config,
-    explanation: Explanation,
+    explanation: Identification,
     fitted: FittedMap | None,
     settings: ThermalMap | None,
     names: list[str],

@@ -15,8 +15,7 @@ from driftlab.evaluation.limits import Measured
 from driftlab.evaluation.measurements import normal, of_allan
 from driftlab.noise.allan import curve
 from driftlab.noise.allan_fit import fit
-from driftlab.noise.stretches import LEAST, Pieces, pieces
-from driftlab.noise.stretches import SHORTEST as SHORTEST_RUN
+from driftlab.noise.stretches import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,10 +59,10 @@ class Averages:
         lasted = cut.samples * self.step
         none = np.full(len(self.axes), np.nan)
         if not cut.enough:
-            longest, least = np.max(cut.places, initial=0) * self.step, SHORTEST_RUN * self.step
+            longest, least = np.max(cut.places, initial=0) * self.step, MIN_STRETCH * self.step
             text = (
-                f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {LEAST * self.step:.4g} s or more, "
-                f"{least:.4g} s of it without a gap"
+                f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {MIN_SAMPLES * self.step:.4g} s or "
+                f"more, {least:.4g} s of it without a gap"
             )
             return Measured(none, self.axes, missing=text)
         fits = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
@@ -80,8 +79,8 @@ class Averages:
         counts = rows[:, 1] >= self.step / 2
         pairs = counts[1:] & counts[:-1] & (np.diff(rows[:, 0]) == 1)
         n, time = int(np.sum(pairs)), np.maximum(rows[:, 1:2], self.step / 2)
-        if n < LEAST:
-            text = f"{n * self.step:.4g} s at rest in a row; record {LEAST * self.step:.4g} s or more"
+        if n < MIN_SAMPLES:
+            text = f"{n * self.step:.4g} s at rest in a row; record {MIN_SAMPLES * self.step:.4g} s or more"
             return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
         measured = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")

@@ -88,8 +88,8 @@ def _alive(value: Any, arrays: Any) -> Any:
         return value
     ((what, inside),) = value.items()
     if what == "array":
-        found = arrays[inside]
-        return found[()] if found.ndim == 0 else found
+        array = arrays[inside]
+        return array[()] if array.ndim == 0 else array
     if what == "set":
         return frozenset(_alive(item, arrays) for item in inside)
     if what == "tuple":

@@ -1,10 +1,10 @@
-"""The bias as it is predicted from the end of the alignment on, with no further measurement, and how sure that is.
+"""Coasting: the bias predicted from the end of the alignment on, with no further measurement, and its deviation.
 
 From the departure at t_0 the blocks of the bias model go on alone::
 
     x_k = F x_{k-1} + u,    P_k = F P_{k-1} F' + Q
 
-which is the departure's own deviation and the walk. What the model does not know of is added, an axis each::
+which is the departure's own deviation and the walk. Errors outside the model are added, an axis each::
 
     sigma^2 = P                                   departure and walk
             + Var(e(T) - e(T_0))                  the map's curve (`fusion_core.thermal.curve_error`)
@@ -18,8 +18,6 @@ them out again: of an error e the part l = l + g (e - l) is learnt::
 
 with the modes m_i of the map's error, and y and l of the thermometer (`driftlab.filtering.thermometer`).
 N epochs, d axes.
-
-The tracked bias as it is told after each epoch, and as it is predicted from the end of the alignment on.
 """
 
 from __future__ import annotations
@@ -98,7 +96,7 @@ def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
 
 
 class Uncertainty:
-    """What is added to the variances of a run because of its map, its thermometer and its vertical.
+    """Variances that a run's map, thermometer and vertical add to those of its states.
 
     Parameters
     ----------
@@ -130,23 +128,20 @@ class Uncertainty:
         self.learnt[-3] = np.nan
 
     def snapshot(self) -> tuple[Array, ...]:
-        """Return what was learned so far."""
+        """Return the state so far."""
         return self.following.copy(), self.departing.copy(), self.learnt.copy()
 
     def restore(self, snapshot: tuple[Array, ...]) -> None:
         """Go on from a snapshot."""
         self.following, self.departing, self.learnt = copied(snapshot, self.snapshot())
 
-    def departed(self, coast: Coast) -> None:
-        """Take note of the temperature that coasting begins at, and of what the filter has learnt by then."""
+    def depart(self, coast: Coast) -> None:
+        """Begin a coast with the filter's estimate of the errors so far."""
         self.departing = self.following.copy()
-        self._at_departure(coast)
+        self.resume(coast)
 
-    def resumed(self, coast: Coast) -> None:
+    def resume(self, coast: Coast) -> None:
         """Go on with a coast that departed earlier."""
-        self._at_departure(coast)
-
-    def _at_departure(self, coast: Coast) -> None:
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
 
@@ -286,11 +281,11 @@ class BiasOutput(NamedTuple):
 
 
 class Prediction:
-    """The bias of the tracked sensor with all that its deviation holds.
+    """The bias of the tracked sensor, estimated and coasting, with all parts of its deviation.
 
     Parameters
     ----------
-    plan : Plan
+    plan : RunSetup
     first : Alignment
         From which on it coasts.
     """
@@ -306,10 +301,10 @@ class Prediction:
         self.thermometer = ThermometerError(known, plan.model.temperature_rate.memory_s)
         self.uncertainty = Uncertainty(fitted, tracked.noise)
         self.extrapolation = Extrapolation(tracked.bias)
-        self.departed = np.zeros(len(tracked.axes))  # what was extrapolated then
+        self.departed = np.zeros(len(tracked.axes))  # the extrapolation then
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what was learned so far."""
+        """Return the state so far."""
         return {
             "coast": self.coast,
             "thermometer": self.thermometer.snapshot(),
@@ -325,7 +320,7 @@ class Prediction:
         memory, self.departed = snapshot["extrapolated"]
         self.extrapolation.memory = Extrapolated(*memory)
         if self.coast is not None:
-            self.uncertainty.resumed(self.coast)
+            self.uncertainty.resume(self.coast)
 
     def depart(self, state: State, after: Chunk) -> State:
         """End the alignment with the epochs that come after it; return the state that the filter goes on from."""
@@ -333,18 +328,18 @@ class Prediction:
         T_0 = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
         block = self.block
         self.coast = Coast(state.x[block], state.P[block, block], self.first.t, T_0)
-        self.uncertainty.departed(self.coast)
+        self.uncertainty.depart(self.coast)
         self.departed = self.extrapolation.memory.last
         error = np.zeros(len(state.x))
         error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
         return State(state.x + error, state.P)
 
-    def look(self, done: Chunk, found: Estimates, step: Transition, alignment: Alignment) -> BiasOutput:
-        """Return what is told of the bias over the next epochs, whose block went by `step`."""
+    def look(self, done: Chunk, estimates: Estimates, step: Transition, alignment: Alignment) -> BiasOutput:
+        """Return the bias over the next epochs, whose block went by `step`."""
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
-        bias, variance = _output(found, self.block, step.C)
-        sigma = self.uncertainty.of_estimate(variance, done["tau"] * found.used, T, error, alignment.unsure)
+        bias, variance = _output(estimates, self.block, step.C)
+        sigma = self.uncertainty.of_estimate(variance, done["tau"] * estimates.used, T, error, alignment.unsure)
         x = self.extrapolation.look(done)
         left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
         sigma = sigma if left is None else np.hypot(sigma, left)
@@ -358,7 +353,7 @@ class Prediction:
         return BiasOutput(bias + late, sigma, coast + late, coast_sigma)
 
     def _to_the_end(self, done: Chunk, step: Transition) -> Array:
-        """Return what the known drift adds (N, d) from the middle of an epoch, of which its channels are, to its end.
+        """Return the known drift (N, d) from the middle of an epoch, of which its channels are, to its end.
 
         None where there are effects: their channels are not smoothed, and half a step more of them is more noise.
         """
@@ -369,10 +364,10 @@ class Prediction:
         return np.asarray(share[:, None] * drift)
 
 
-def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
+def _output(estimates: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
     """Return the bias (N, d) and its variance from the states of its block."""
     if C is None:
-        return found.x[:, block], found.sigma[:, block] ** 2
-    assert found.P is not None, "the deviation of an output needs P"
-    variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
-    return np.einsum("...ij,...j->...i", C, found.x[:, block]), variance
+        return estimates.x[:, block], estimates.sigma[:, block] ** 2
+    assert estimates.P is not None, "the deviation of an output needs P"
+    variance = np.einsum("...ij,...jl,...il->...i", C, estimates.P[:, block, block], C)
+    return np.einsum("...ij,...j->...i", C, estimates.x[:, block]), variance

@@ -1,7 +1,7 @@
-"""What effects do not say beyond the inputs that they were fitted on: part of the bias's deviation.
+"""Extrapolation of effects beyond the inputs that they were fitted on: part of the bias's deviation.
 
-Beyond what it was fitted on an effect holds (`Effect.held`). How far off that may be is what it would say if it went on
-as fitted, less what it would say with channels and regressors held at the ends of what they were::
+Beyond its domain an effect holds (`Effect.held`). The error of that is bounded by its value if it went on as fitted,
+less its value with channels and regressors held at the ends of their ranges::
 
     x(t) = S(u) theta - [S(u held)] held theta
 
@@ -24,7 +24,7 @@ from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
 
 
 class Extrapolated(NamedTuple):
-    """What is carried from chunk to chunk: memories of both roads, x and its lag at the last epoch."""
+    """State between chunks: memories of both evaluations, x and its lag at the last epoch."""
 
     memories: tuple[tuple[Memory, Memory], ...]
     last: Array  # (d,)
@@ -32,7 +32,7 @@ class Extrapolated(NamedTuple):
 
 
 class Extrapolation:
-    """How far off a bias may be because its effects are beyond their domains.
+    """Error of a bias whose effects are beyond their domains.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Extrapolation:
         return x
 
     def of_estimate(self, x: Array | None, P: Array, dt: Array, noise: Array) -> Array | None:
-        """Return what of x (N, d) the filter has not followed yet; P (N, d) is its variance, noise (d,) the sensor's.
+        """Return the part of x (N, d) a filter of variance P (N, d) has not followed yet; noise (d,) is the sensor's.
 
         None where that is zero.
         """

@@ -50,7 +50,7 @@ class Run:
     journal : Journal
         Where what happens on the way is noted.
     initial_error : float
-        Added to every axis of the tracked bias at the end of the alignment, in SI; the filter is not told.
+        Added to every axis of the tracked bias at the end of the alignment, in SI; unknown to the filter.
     keep_model : bool
         Whether the stretches keep the arrays that the filter was run on.
     resume : dict, optional
@@ -105,9 +105,9 @@ class Run:
         low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
         high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
-            if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
+            if (shapes := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
-                known = found
+                known = shapes
             chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, coarse, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)
@@ -116,7 +116,7 @@ class Run:
     def _filtered(self, stream: Generator[Chunk]) -> Generator[RunSegment]:
         tracker, waiting = self._resumed(), FirstRest(self.plan)
         done = -np.inf if self.resume is None else self.resume["t"]
-        with closing(stream), self._telling_when():
+        with closing(stream), self._timed_errors():
             for chunk in stream:
                 chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
                 if len(chunk) and tracker is None:
@@ -132,8 +132,8 @@ class Run:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
 
     @contextmanager
-    def _telling_when(self) -> Generator[None]:
-        """Say of a map that refuses when that was, as all messages do."""
+    def _timed_errors(self) -> Generator[None]:
+        """Add the time to the error of a map that is evaluated outside its domain."""
         try:
             yield
         except OutsideDomain as error:
@@ -212,7 +212,7 @@ class Run:
 
 
 class FirstRest:
-    """What came so far, and the alignment once there is one."""
+    """The epochs so far, and the alignment once there is one."""
 
     def __init__(self, plan: RunSetup) -> None:
         self.plan = plan
@@ -242,7 +242,7 @@ class FirstRest:
         return self._parts[0]
 
     def _is_rest(self, window: Chunk) -> bool:
-        """Return whether the unit was at rest; then it is aligned."""
+        """Whether the unit was at rest; then it is aligned."""
         model = self.plan.model
         measured = np.sum(window["tau"]) >= model.align / 2  # a gap is no rest
         if not (measured and len(window) > 2 and model.still(window)):

@@ -1,4 +1,4 @@
-"""What a run yields, stretch by stretch, and what happened on its way."""
+"""Segments of a run with their estimates, and the log of motion and refused epochs."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class RunSegment:
     Attributes
     ----------
     epochs : Chunk
-        What the filter was given: each sensor as measured (N, d), and the other channels.
+        Input of the filter: each sensor as measured (N, d), and the other channels.
     rate : (N, d) array
-        Reading of the tracked sensor less its known input (a gyro's: Earth rate), uncorrected: what `bias` is an
-        estimate of. All of these are in the sensor's SI unit.
+        Reading of the tracked sensor less its known input (a gyro's: Earth rate), uncorrected: the measured
+        bias. All of these are in the sensor's SI unit.
     bias, sigma : (N, d) arrays
         Bias after each update and its standard deviation; with the calibration's part, where there is one.
     coast, coast_sigma : (N, d) arrays
         Bias as predicted from the end of the alignment, no measurement used since; NaN before it.
     calibration : (N, d) array
-        What was subtracted from the sensor before the filter; zero where nothing was.
+        The calibration that was subtracted from the sensor before the filter; zero where there is none.
     still : (N,) array of bool
         Whether the unit stood still, by its sensors alone (`fusion_core.contracts.Detector`).
     estimates : Estimates
@@ -41,7 +41,7 @@ class RunSegment:
     began : State or None
         The filter's prior where it starts from one: at the first alignment and after each further one.
     model : (Transition, Measurement) or None
-        What the filter was run on, where it was asked for; C leads from the states of the bias model to the bias.
+        Steps and measurements of the filter, where wanted; C leads from the states of the bias model to the bias.
     """
 
     epochs: Chunk
@@ -63,16 +63,16 @@ class RunSegment:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
-        found, epochs = self.estimates, self.epochs
+        estimates, epochs = self.estimates, self.epochs
         temperature = {k: epochs[k] for k in TEMPERATURES if k in epochs.channels}
         return {
             "t": epochs.t,
-            "x": found.x,
-            "sigma": found.sigma,
-            "innovations": found.y,
-            "white": found.white,
-            "nis": found.nis,
-            "used": found.used,
+            "x": estimates.x,
+            "sigma": estimates.sigma,
+            "innovations": estimates.y,
+            "white": estimates.white,
+            "nis": estimates.nis,
+            "used": estimates.used,
             "still": self.still,
             "tau": epochs["tau"],
             "rate": self.rate,
@@ -126,7 +126,7 @@ def runs(flags: Flags) -> list[tuple[int, int]]:
 
 @dataclass
 class RunLog:
-    """What happened on the way: where the unit moved, and where the filter refused one that stood still."""
+    """Log of a run: the stretches in which the unit moved, and in which the filter refused one that stood still."""
 
     faults: Faults = field(default_factory=Faults)
     alignments: list[Alignment] = field(default_factory=list)

@@ -1,8 +1,7 @@
-"""What a run does, the same from its first epoch to its last.
+"""Setup of a run: what stays the same from its first epoch to its last.
 
-What a measurement model needs of a recording and of its maps, checked before the filter runs.
-
-The bias blocks of a measurement model: what the bias models answer, put together; the host has checked it.
+Checks of a measurement model's recording and maps before the filter runs, and its bias blocks, put together from the
+bias models' own; the host has checked these.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What a run does.
+    """Settings and maps of a run.
 
     Attributes
     ----------
@@ -56,7 +55,7 @@ class RunSetup:
     gate : float
         The nis beyond which an epoch is not used.
     initial_error : float
-        Added to every axis of the tracked bias at the end of the alignment, in SI; the filter is not told.
+        Added to every axis of the tracked bias at the end of the alignment, in SI; unknown to the filter.
     keep_model : bool
         Whether the stretches keep the arrays that the filter was run on.
     """
@@ -80,10 +79,10 @@ class RunSetup:
 
         What such a sensor shows there is its bias that has moved, and no tilt.
         """
-        found, channel = self.aligned(window), self.model.tracked.channel
-        if self.model.length_of_input(self.site) is None or turned(before, found, channel):
-            return found
-        return replace(found, inputs={**found.inputs, channel: before.inputs[channel]})
+        alignment, channel = self.aligned(window), self.model.tracked.channel
+        if self.model.length_of_input(self.site) is None or turned(before, alignment, channel):
+            return alignment
+        return replace(alignment, inputs={**alignment.inputs, channel: before.inputs[channel]})
 
     def aligned(self, window: Chunk) -> Alignment:
         """Freeze the reference from a stretch at rest, as the filter sees it: calibrations subtracted."""
@@ -114,12 +113,12 @@ def loaded_map(settings: ThermalMap, sensor: Sensor) -> FittedMap:
 def check_map(fitted: FittedMap, sensor: Sensor) -> None:
     """Raise MapError where a map is of another channel, another unit or other axes than its sensor."""
     record, d = fitted.record, len(sensor.axes)
-    found = (record.channel, record.unit, record.d)
+    actual = (record.channel, record.unit, record.d)
     expected = (sensor.channel, sensor.unit, d)
-    if found != expected:
+    if actual != expected:
         raise MapError(
-            f"{sensor.section}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
-            f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
+            f"{sensor.section}: the map ({record.kind}) is of the channel {actual[0]} in {actual[1]} with "
+            f"{actual[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
             "name a map that was fitted on this channel"
         )
     if record.axes and record.axes != sensor.axes:
@@ -165,9 +164,9 @@ def check_channels(model: MeasurementModel, chunk: Chunk) -> None:
     for sensor in reversed(model.sensors):
         channel, d = sensor.channel, len(sensor.axes)
         if chunk[channel].ndim != 2 or chunk[channel].shape[1] != d:
-            found = 1 if chunk[channel].ndim == 1 else chunk[channel].shape[1]
+            axes = 1 if chunk[channel].ndim == 1 else chunk[channel].shape[1]
             raise ConfigError(
-                f"{channel}: the recording has {found} axes and the bias model {d}; name as many under bias.axes"
+                f"{channel}: the recording has {axes} axes and the bias model {d}; name as many under bias.axes"
             )
 
 

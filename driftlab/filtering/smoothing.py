@@ -1,6 +1,6 @@
-"""Estimates given all of the recording: the filter forwards, then the smoother backwards, stretch by stretch.
+"""Smoothing: estimates given all of the recording, the filter forwards, then the smoother backwards.
 
-What the filter was run on is kept in a file meanwhile and read from its end, so memory is that of one stretch. Where
+The filter's steps are in a file meanwhile, which is read from its end, so memory is that of one stretch. Where
 the filter began anew (the unit was aligned again, at another attitude or bias) the smoother does too: nothing is known
 across.
 """
@@ -23,7 +23,7 @@ from fusion_core.smoother import Smoother
 
 
 class FilterSteps(NamedTuple):
-    """What the filter was run on over N epochs, as arrays: n states, m measured components, d axes.
+    """Steps of the filter over N epochs, as arrays: n states, m measured components, d axes.
 
     `begin` and `end` are the state before the first epoch and after the last, x beside P: (n, 1 + n). `fresh` tells
     whether `begin` is a prior. C (d, n_b) or (N, d, n_b) leads from the bias model's states to the bias; it has no rows
@@ -52,12 +52,12 @@ class FilterSteps(NamedTuple):
 
     @property
     def measurement(self) -> Measurement:
-        """What was measured."""
+        """The measurement."""
         return Measurement(self.z, self.H, self.R, self.measured)
 
 
 class SmoothedRows(NamedTuple):
-    """Rows from `start` on of what is known given all of the recording; the bias with the calibration's part."""
+    """Rows from `start` on of the smoothed estimates; the bias with the calibration's part."""
 
     start: int
     x: Array  # (N, n)
@@ -66,7 +66,7 @@ class SmoothedRows(NamedTuple):
 
 
 class Spool:
-    """What the filter was run on, written forwards and read backwards.
+    """Steps of the filter in a file, written forwards and read backwards.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Spool:
         self.path.unlink()
 
     def smoothed(self, reset: Flags, block: slice) -> Iterator[SmoothedRows]:
-        """Yield what is known given all of the recording, from its end to its beginning.
+        """Yield the smoothed estimates, from the recording's end to its beginning.
 
         Parameters
         ----------

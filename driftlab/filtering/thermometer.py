@@ -1,4 +1,4 @@
-"""The error of the thermometer: what it leaves in the temperature that the map sees, and in a bias that follows it.
+"""Error of the thermometer: in the temperature that the map sees, and in a bias that follows it.
 
 Of steps q and noise before them, a mean reading has a sawtooth over temperature and the rest is white
 (`fusion_core.thermal.thermometer`). The smoothing of the temperature, over w s, passes of both::
@@ -58,7 +58,7 @@ class ReadingError(NamedTuple):
 
 
 class ThermometerError:
-    """What a thermometer's own readings tell of its error, epoch by epoch.
+    """Estimate of a thermometer's error from its own readings, epoch by epoch.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class ThermometerError:
         self.memory = np.array([np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
 
     def snapshot(self) -> tuple[Array, Array]:
-        """Return what was learned so far."""
+        """Return the state so far."""
         return self.rows.copy(), self.memory.copy()
 
     def restore(self, snapshot: tuple[Array, Array]) -> None:
@@ -91,12 +91,12 @@ class ThermometerError:
         step, variance = (chunk[name] for name in READINGS) if known else readings(raw, self.rows)
         steps = np.maximum(step, self.known.size)
         table, which = self._sawteeth(steps, variance)
-        found = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
+        error = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
         dt = np.broadcast_to(np.asarray(chunk.dt, dtype=np.float64), T.shape)
         windows = chunk.channels.get("temperature_window")
         windows = np.full(T.shape, self.window) if windows is None else windows
-        _look(T, raw, dt, steps, table, which, windows, self.memory, *found)
-        return found
+        _look(T, raw, dt, steps, table, which, windows, self.memory, *error)
+        return error
 
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Index]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
@@ -121,8 +121,8 @@ def copied(snapshot: tuple[Array, ...], own: tuple[Array, ...]) -> tuple[Array, 
 def _sawtooth(step: float, variance: float, known: Steps) -> Array:
     """Return the harmonics of steps of readings whose variance has the logarithm `variance`, in quarters to base 2."""
     # a soak has seen all temperatures between two levels: at one of them readings flicker more, or less
-    seen = known.noise > 0 and abs(step / known.size - 1) < SAME
-    return sawtooth(step, known.noise if seen else noise_before(step, 2 ** (variance / 4)), HARMONICS)
+    from_soak = known.noise > 0 and abs(step / known.size - 1) < SAME
+    return sawtooth(step, known.noise if from_soak else noise_before(step, 2 ** (variance / 4)), HARMONICS)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

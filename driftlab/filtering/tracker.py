@@ -1,8 +1,7 @@
-"""What the filter answers, checked before it is believed.
+"""Tracker: the filter after its alignment, its state and memories, and the run of epochs through it.
 
-The filter after its alignment: its state and memories, and the run of epochs through it.
-
-The look-out for motion, and for a rest at another place, where the filter begins anew.
+Its estimates are checked to be finite. Motion is monitored, and so is a rest at another bias or attitude, where the
+filter begins anew.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from fusion_core.kalman import estimate
 from fusion_core.model import Estimates, Flags
 
 
-def check_finite(found: Estimates, t: Array, when: Callable[[float], str]) -> None:
+def check_finite(estimates: Estimates, t: Array, when: Callable[[float], str]) -> None:
     """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
-    if np.isfinite(np.vdot(found.x, found.x) + np.vdot(found.sigma, found.sigma)):
+    if np.isfinite(np.vdot(estimates.x, estimates.x) + np.vdot(estimates.sigma, estimates.sigma)):
         return  # nearly always, and in one pass; what overflows is looked at below
-    good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
+    good = np.all(np.isfinite(estimates.x) & np.isfinite(estimates.sigma), axis=1)
     if not np.all(good):
         raise not_finite(t[int(np.argmin(good))], when)
 
@@ -57,7 +56,7 @@ class _Piece(NamedTuple):
     before: list[Memory]  # of the bias models
 
     def rows(self, start: int, stop: int) -> tuple[Chunk, list[Transition]]:
-        """Return what the filter is run on from start to stop."""
+        """Return the epochs and steps from start to stop."""
         return self.corrected.part(start, stop), [_rows(step, start, stop) for step in self.steps]
 
 
@@ -66,9 +65,9 @@ class Tracker:
 
     Parameters
     ----------
-    plan : Plan
-    journal : Journal
-        Which knows the alignments so far.
+    plan : RunSetup
+    journal : RunLog
+        With the alignments so far.
     alignment : Alignment
         The last of them.
     state : State
@@ -87,7 +86,7 @@ class Tracker:
         self.prediction = Prediction(plan, self.first)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the tracker has learned so far; between two calls of `advance`."""
+        """Return the tracker's state; between two calls of `advance`."""
         return {
             "alignment": self.alignment,
             "state": self.state,
@@ -115,18 +114,18 @@ class Tracker:
                 part, steps = piece.rows(start, start + SPAN)
                 transition, measurement = self.model.equations(part, steps, self.alignment)
                 began = self.state if self.fresh else None
-                found = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
-                N = len(found.x)
+                estimates = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
+                N = len(estimates.x)
                 own = _rows(steps[self.tracked], 0, N)
-                kept = None
+                equations = None
                 if self.plan.keep_model:
-                    kept = replace(_rows(transition, 0, N), C=own.C), _measured(measurement, 0, N)
+                    equations = replace(_rows(transition, 0, N), C=own.C), _measured(measurement, 0, N)
                 done = piece.epochs.part(start, start + N)
-                self.state, self.fresh = found.state, False
+                self.state, self.fresh = estimates.state, False
                 calibration = piece.calibration[start : start + N]
-                yield self._stretch(done, calibration, found, own, began, kept)
+                yield self._stretch(done, calibration, estimates, own, began, equations)
                 start += N
-                self._align_anew(done, found, piece, start)
+                self._align_anew(done, estimates, piece, start)
 
     def _pieces(self, chunk: Chunk) -> Iterator[_Piece]:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
@@ -152,20 +151,20 @@ class Tracker:
         while True:
             steps, measured = _rows(transition, 0, N), _measured(measurement, 0, N)
             try:
-                found = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
+                estimates = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
             except (NotFinite, TooWide) as lost:
                 raise not_finite(part.t[lost.sample], self.journal.faults.when) from None
             except np.linalg.LinAlgError:
                 raise not_finite(part.t[0], self.journal.faults.when) from None
-            check_finite(found, part.t, self.journal.faults.when)
-            due = self.realigning.due(part.part(0, N), found.used)
+            check_finite(estimates, part.t, self.journal.faults.when)
+            due = self.realigning.due(part.part(0, N), estimates.used)
             if due == N:
-                return found
+                return estimates
             N = due
 
-    def _align_anew(self, done: Chunk, found: Estimates, piece: _Piece, stop: int) -> None:
+    def _align_anew(self, done: Chunk, estimates: Estimates, piece: _Piece, stop: int) -> None:
         """Begin with another alignment and a prior where the unit has come to rest anew."""
-        alignment = self.realigning.look(done, found.used, self.alignment)
+        alignment = self.realigning.look(done, estimates.used, self.alignment)
         if alignment is None:
             return
         self.alignment = alignment
@@ -177,26 +176,26 @@ class Tracker:
         self,
         done: Chunk,
         calibration: Array,
-        found: Estimates,
+        estimates: Estimates,
         step: Transition,
         began: State | None,
-        kept: tuple[Transition, Measurement] | None,
+        equations: tuple[Transition, Measurement] | None,
     ) -> RunSegment:
         channel = self.model.tracked.channel
-        still = self.watch.look(done, found)
-        told = self.prediction.look(done, found, step, self.alignment)
+        still = self.watch.look(done, estimates)
+        output = self.prediction.look(done, estimates, step, self.alignment)
         return RunSegment(
             epochs=done,
             rate=done[channel] - self.model.known(done, self.alignment),
-            bias=told.bias + calibration,
-            sigma=told.sigma,
-            coast=told.coast + calibration,
-            coast_sigma=told.coast_sigma,
+            bias=output.bias + calibration,
+            sigma=output.sigma,
+            coast=output.coast + calibration,
+            coast_sigma=output.coast_sigma,
             calibration=calibration,
             still=still,
-            estimates=found,
+            estimates=estimates,
             began=began,
-            model=kept,
+            model=equations,
         )
 
 
@@ -240,13 +239,13 @@ class RestMonitor:
         self.memory: Any = self.detector.start()
         self.components = [axis_name(channel, axis) for channel, axis, _ in plan.model.components]
 
-    def look(self, done: Chunk, found: Estimates) -> Flags:
-        """Return where the unit stood still (N,)."""
+    def look(self, done: Chunk, estimates: Estimates) -> Flags:
+        """Return the epochs at which the unit stood still (N,)."""
         still, out, self.memory = self.detector.look(done, self.memory)
         self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
-        refused = still & ~found.used
-        causes = np.zeros(found.white.shape, dtype=np.bool_)
-        size = found.white[refused] ** 2
+        refused = still & ~estimates.used
+        causes = np.zeros(estimates.white.shape, dtype=np.bool_)
+        size = estimates.white[refused] ** 2
         causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
         self.journal.refused.note(done.t, refused, causes, self.components)
         return still

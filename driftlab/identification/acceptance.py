@@ -1,4 +1,4 @@
-"""What an effect must show before it is added: evidence that is fast, or slow and large.
+"""Acceptance of an effect: the evidence that it needs, at short time scales, or at long ones and large.
 
 Three figures of a candidate beside a base, M candidates having been tried:
 
@@ -25,7 +25,6 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from driftlab.identification.least_squares import LeastSquares, Model, Term
-from driftlab.identification.normal_equations import Indices
 from driftlab.noise.local_level import LocalLevel, one_step
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -69,7 +68,7 @@ class CandidateEvidence:
 
     @property
     def needed(self) -> float:
-        """What the ratio must be below; beside other effects more is asked, since what they misfit looks like one."""
+        """Upper limit of the ratio; lower beside other effects, since their misfit looks like one more."""
         return BESIDE if self.beside else FAST
 
     @property
@@ -82,9 +81,9 @@ class CandidateEvidence:
         """The same with a chance of 5 % that the parts show it by accident."""
         return self._better(0.95)
 
-    def _better(self, sure: float) -> bool:
-        most = -float(student.ppf(sure, max(self.parts - 1, 1)))
-        return self.ratio < self.needed and self.steady < most and self.poorest < WORSE and self.left_out > 0
+    def _better(self, probability: float) -> bool:
+        quantile = -float(student.ppf(probability, max(self.parts - 1, 1)))
+        return self.ratio < self.needed and self.steady < quantile and self.poorest < WORSE and self.left_out > 0
 
     @property
     def fast(self) -> bool:
@@ -99,51 +98,46 @@ class CandidateEvidence:
 
     def reason(self) -> str:
         """Return in words what is not enough."""
+        change, poorest = (100 * (float(np.sqrt(ratio)) - 1) for ratio in (self.ratio, self.poorest))
         if self.left_out <= 0 or self.ratio >= self.needed:
-            change = 100 * (float(np.sqrt(self.ratio)) - 1)
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
         if self.poorest >= WORSE:
-            change = 100 * (float(np.sqrt(self.poorest)) - 1)
-            return f"predicts a left-out recording {change:+.0f} %, that is, worse than without it"
+            return f"predicts a left-out recording {poorest:+.0f} %, that is, worse than without it"
         if not self.better:
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (
                 f"is seen at slow times alone ({self.chance:.0f} nats at fast ones, {self.price + CHANCE:.0f} needed), "
-                f"and predicts left-out parts {100 * (float(np.sqrt(self.ratio)) - 1):+.0f} % (-29 % needed)"
+                f"and predicts left-out parts {change:+.0f} % (-29 % needed)"
             )
         return "passes"
 
 
 def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) -> tuple[bool, str]:
-    """Return whether a candidate is enough beside channels that are named already, and what is not.
+    """Judge the evidence for a candidate beside channels that are named already; return the reason where it fails.
 
-    What is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time alone; a
-    further term of a channel, by the first one's misfit.
+    An effect that is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time
+    alone; a further term of a channel, by the first one's misfit.
     """
     own = set(effect.requires) - {"temperature", "temperature_rate"}
     if own & set(named):
-        enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
-        return enough, "" if enough else evidence.reason()
-    if effect.walks and (evidence.beside or effect.course == "trend"):
+        accepted = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
+    elif effect.walks and (evidence.beside or effect.course == "trend"):
         needed = SECOND if evidence.beside else DRIFTING
-        enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
-        return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
-    enough = evidence.fast or evidence.slow
-    return enough, "" if enough else evidence.reason()
+        accepted = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
+        return accepted, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
+    else:
+        accepted = evidence.fast or evidence.slow
+    return accepted, "" if accepted else evidence.reason()
 
 
 def whitened(
     squares: LeastSquares, base: Model, term: Term, axis: int, noise: LocalLevel
 ) -> tuple[Array, Array] | None:
     """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
-    columns = squares.columns
-    everything = columns.everything
-    fit = squares.fit(base, axis, everything)
-    W, y = columns.W, columns.y[axis]
-    starts = squares.starts(term, everything)
-    B: Indices = np.concatenate([fit.cols, starts])
-    k = len(fit.cols)
+    columns, everything = squares.columns, squares.columns.everything
+    fit, W = squares.fit(base, axis, everything), columns.W
+    B, k = np.concatenate([fit.cols, squares.starts(term, everything)]), len(fit.cols)
     equations = columns.equations(everything, B, columns.y[axis : axis + 1])
     equations = equations.raised(fit.equations.A - equations.A[:k, :k])
     Z = W[:, columns.of(term.effect).columns[axis]]
@@ -152,9 +146,9 @@ def whitened(
         Z = np.column_stack([Z, W[:, fit.cols] @ fit.beta - W[:, other.cols] @ other.beta])
     if not Z.shape[1]:
         return None
-    both = np.column_stack([W[:, y], Z])
+    both = np.column_stack([W[:, columns.y[axis]], Z])
     left = both - W[:, B] @ equations.solve(W[:, B].T @ both)
-    white = np.concatenate(one_step([left[rows] for rows in columns.evidence.slices], noise.gain))
+    white = np.concatenate(one_step(columns.evidence.split(left), noise.gain))
     return white[:, 0], white[:, 1:]
 
 
@@ -162,11 +156,11 @@ def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[L
     """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
     wald, gain, dof, rows = 0.0, 0.0, 0, 0
     for axis, noise in enumerate(noises):
-        found = whitened(squares, base, term, axis, noise)
-        if found is None:
+        both = whitened(squares, base, term, axis, noise)
+        if both is None:
             continue
-        one = matched(*found)
-        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(found[0]))
+        one = matched(*both)
+        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(both[0]))
     if dof == 0:
         return 0.0, -np.inf
     parameters = dof + len(term.effect.continuous) + int(term.free)
@@ -179,8 +173,8 @@ def matched(e: Array, Z: Array) -> tuple[float, float, int]:
     In nats the gain, before any parameter is paid for. Columns that show nothing do not count.
     """
     A = Z.T @ Z
-    seen = np.diag(A) > 1e-8 * len(e)
-    Z, A = Z[:, seen], A[np.ix_(seen, seen)]
+    some = np.diag(A) > 1e-8 * len(e)
+    Z, A = Z[:, some], A[np.ix_(some, some)]
     if not Z.shape[1]:
         return 0.0, 0.0, 0
     inverse = np.linalg.pinv(A, rcond=1e-9, hermitian=True)
@@ -195,8 +189,5 @@ def matched(e: Array, Z: Array) -> tuple[float, float, int]:
 
 def nats_of(wald: float, dof: int) -> float:
     """Return minus the log of the chance that a chi-square is this large, also where that underflows."""
-    found = -float(chi2.logsf(wald, dof))
-    half = 0.5 * dof
-    if np.isfinite(found):
-        return found
-    return 0.5 * wald - (half - 1) * float(np.log(0.5 * wald)) + float(gammaln(half))
+    nats, half = -float(chi2.logsf(wald, dof)), 0.5 * dof
+    return nats if np.isfinite(nats) else 0.5 * wald - (half - 1) * float(np.log(0.5 * wald)) + float(gammaln(half))

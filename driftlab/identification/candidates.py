@@ -1,6 +1,6 @@
-"""What may be missing: all that the installed effects propose for these recordings, by family.
+"""Candidates for missing effects: all that the installed effects propose for these recordings, by family.
 
-Probes: what no effect names, in forms general enough to catch most of it.
+Probes: effects without a name, in forms general enough to catch most of what no effect names.
 
 A probe takes part in the search like an effect, but is only a nuisance: it keeps what has no name from being given a
 wrong one, and is reported as unexplained, on its channel and at its time scale.
@@ -26,42 +26,42 @@ from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginE
 from fusion_core.host.registry import kind_of, registry
 from fusion_core.settings import nearest
 
-HIGHEST = 6  # power of temperature above which a map needs no further ones
-MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
+MAX_POWER = 6  # of temperature above which a map needs no further ones
+MAX_MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
 
 Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
 
-def candidates_of(found: Search) -> dict[Family, list[Term]]:
-    """Return what every installed effect offers on these recordings, by family, as far as the model has not got it.
+def candidates_of(search: Search) -> dict[Family, list[Term]]:
+    """Return the proposals of every installed effect for these recordings, by family, less those of the model.
 
-    An effect that is broken is left out, and so is one of a third party that shows what another shows already; both
-    are noted in the search.
+    An effect that is broken is left out, and so is one of a third party whose regressors are another's; both are noted
+    in the search.
     """
-    chunks = with_residual(found)
-    degree = _degree(found, chunks)
+    chunks = with_residual(search)
+    degree = _degree(search, chunks)
     families: dict[Family, list[Term]] = {}
     before: list[Effect] = []
     for cls in installed():
         kind = kind_of(cls)
-        if kind in found.without or kind in found.broken:
+        if kind in search.without or kind in search.broken:
             continue
         try:
-            own = _offers(found, cls, chunks, degree)
+            offers = _offers(search, cls, chunks, degree)
         except MissingChannel:
             continue
         except FusionError as error:
-            found.broken[kind] = str(error)
+            search.broken[kind] = str(error)
             continue
-        for effect in own:
-            other = None if built_in(cls) else same(found.columns, effect, before)
+        for effect in offers:
+            other = None if built_in(cls) else same(search.columns, effect, before)
             if other is not None:
-                found.same[name_of(effect)] = name_of(other)
+                search.same[name_of(effect)] = name_of(other)
                 continue
             before.append(effect)
-            for free in (False, True) if found.columns.of(effect).starts is not None else (False,):
+            for free in (False, True) if search.columns.of(effect).starts is not None else (False,):
                 term = Term(effect, free)
-                families.setdefault(family_of(found, term), []).append(term)
+                families.setdefault(family_of(search, term), []).append(term)
     return families
 
 
@@ -73,43 +73,43 @@ def installed() -> list[type[Effect]]:
 
 def check_kinds(kinds: Collection[str], option: str = "--without") -> None:
     """Raise ConfigError where one of the kinds, which `option` names, is no installed effect's."""
-    have = [kind_of(cls) for cls in installed()]
+    known = [kind_of(cls) for cls in installed()]
     for kind in kinds:
-        if kind not in have:
-            hint = nearest(kind, have)
+        if kind not in known:
+            hint = nearest(kind, known)
             raise ConfigError(
                 f"{option} {shown(kind)}: is no installed effect; "
-                + (f"did you mean {hint}?" if hint else f"known: {', '.join(have)}")
+                + (f"did you mean {hint}?" if hint else f"known: {', '.join(known)}")
             )
 
 
-def _offers(found: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
-    """Return what a class proposes and the model can take, its columns worked out; raises PluginError."""
-    columns, own = found.columns, []
-    have = {name_of(term.effect) for term in found.model if not term.effect.several}
-    memories = [term.effect.subject for term in found.model if term.effect.fades]
-    acting = columns.basis is None or any(term.effect.acts_on_input for term in found.model)
+def _offers(search: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
+    """Return the proposals of a class that the model can take, their columns worked out; raises PluginError."""
+    columns, offers = search.columns, []
+    have = {name_of(term.effect) for term in search.model if not term.effect.several}
+    memories = [term.effect.subject for term in search.model if term.effect.fades]
+    acting = columns.basis is None or any(term.effect.acts_on_input for term in search.model)
     try:
-        blank = cls(axes=columns.evidence.axes)  # type: ignore[call-arg]
+        blank = cls(axes=search.evidence.axes)  # type: ignore[call-arg]
     except ValidationError:
         raise PluginError(f"{kind_of(cls)}: has settings without a default, and cannot be proposed") from None
     for proposed in blank.proposals(chunks):
         effect = proposed.beside_map(degree) if set(proposed.requires) <= set(chunks[0].channels) else None
         if effect is None or name_of(effect) in have or (effect.acts_on_input and acting):
             continue
-        if effect.fades and memories.count(effect.subject) >= MEMORIES:
+        if effect.fades and memories.count(effect.subject) >= MAX_MEMORIES:
             continue
-        shown = columns.of(effect)
+        regressors = columns.of(effect)
         if effect.acts_on_input:
             columns.of_map([effect])
-        elif not any(map(len, shown.columns)):
+        elif not any(map(len, regressors.columns)):
             continue
-        own.append(effect)
-    return own
+        offers.append(effect)
+    return offers
 
 
 def same(columns: EffectRegressors, effect: Effect, others: Sequence[Effect]) -> Effect | None:
-    """Return the first of others that reads the same channels and shows exactly the same as an effect, if one does."""
+    """Return the first of others that reads the same channels and has the same regressors as an effect, if any."""
     reads = set(effect.requires)
     for other in others:
         also = set(other.requires)
@@ -128,23 +128,22 @@ def _same_span(columns: EffectRegressors, effect: Effect, other: Effect) -> bool
 
 def _spans(columns: EffectRegressors, effect: Effect, axis: int) -> tuple[Indices, Indices]:
     """Return the columns of an effect, through the map too where it acts there, and those of its starts."""
-    shown = columns.of(effect)
-    of_map = columns.of_map([effect] if effect.acts_on_input else [])[: None if effect.acts_on_input else 0]
-    none = np.zeros(0, dtype=np.intp)
-    return np.concatenate([of_map, shown.columns[axis]]), none if shown.starts is None else shown.starts
+    own, none = columns.of(effect), np.zeros(0, dtype=np.intp)
+    of_map = columns.of_map([effect]) if effect.acts_on_input else none
+    return np.concatenate([of_map, own.columns[axis]]), none if own.starts is None else own.starts
 
 
-def _degree(found: Search, chunks: Sequence[Chunk]) -> int | None:
+def _degree(search: Search, chunks: Sequence[Chunk]) -> int | None:
     """Return the highest power of temperature that the map has already; None where it has all that matter."""
-    q = found.columns.of_map([])
+    q = search.columns.of_map([])
     if not len(q):
         return 0
-    X = found.columns.W[:, q]
+    X = search.columns.W[:, q]
     T = np.concatenate([chunk["temperature"] for chunk in chunks])
     x = [(chunk["temperature"] - T.min()) / max(np.ptp(T), 1e-300) * 2 - 1 for chunk in chunks]
-    for k in range(1, HIGHEST + 1):
-        power = found.columns.evidence.rows([part**k for part in x])
-        for rows in found.columns.evidence.slices:
+    for k in range(1, MAX_POWER + 1):
+        power = search.evidence.rows([part**k for part in x])
+        for rows in search.evidence.slices:
             power[rows] -= power[rows].mean()
         left = power - X @ np.linalg.lstsq(X, power, rcond=1e-10)[0]
         if np.linalg.norm(left) > 1e-3 * np.linalg.norm(power):
@@ -152,34 +151,28 @@ def _degree(found: Search, chunks: Sequence[Chunk]) -> int | None:
     return None
 
 
-def family_of(found: Search, term: Term) -> Family:
-    """Return what a term has in common with those that differ from it by their hyper-parameters alone."""
+def family_of(search: Search, term: Term) -> Family:
+    """Return the properties that a term shares with those that differ from it by their hyper-parameters alone."""
     effect = term.effect
-    return name_of(effect), effect.variant, found.columns.of(effect).p, term.free
+    return name_of(effect), effect.variant, search.columns.of(effect).p, term.free
 
 
-def with_residual(found: Search) -> list[Chunk]:
-    """Return the recordings' means with what the model leaves as channel `residual`, in its own deviation.
+def with_residual(search: Search) -> list[Chunk]:
+    """Return the recordings' means with the model's residual as channel `residual`, in its own deviation.
 
-    What the model says is taken to run straight between rows: lines faster than rows are seen where they are.
+    The model's prediction is taken to run straight between rows: lines faster than rows stay where they are.
     """
-    evidence, columns = found.columns.evidence, found.columns
+    evidence, columns = search.evidence, search.columns
+    left = np.stack(search.residuals(search.model), axis=1) * columns.scale[columns.y]
     chunks = []
-    said = np.empty_like(evidence.rate)
-    for axis in range(len(evidence.axes)):
-        fit = found.squares.fit(found.model, axis, found.everything)
-        left = found.squares.residual(axis, fit) * columns.scale[columns.y[axis]]
-        said[:, axis] = evidence.rate[:, axis] - left
-    for record, rows in zip(evidence.records, evidence.slices, strict=True):
-        t, model = record.chunk.t, said[rows]
-        of_model = np.stack([np.interp(t, record.t, model[:, axis]) for axis in range(model.shape[1])], axis=1)
-        residual = record.chunk[evidence.channel] - of_model
-        chunks.append(record.chunk.having(residual=residual))
+    for record, predicted in zip(evidence.records, evidence.split(evidence.rate - left), strict=True):
+        of_model = np.stack([np.interp(record.chunk.t, record.t, column) for column in predicted.T], axis=1)
+        chunks.append(record.chunk.having(residual=record.chunk[evidence.channel] - of_model))
     spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
     return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]
 
 
-_SPLINES = 12
+PROBE_INTERVALS = 12  # of a probe's smooth function
 
 
 class Probe(Effect):
@@ -224,7 +217,7 @@ class Probe(Effect):
 
     @property
     def description(self) -> str:
-        """What was found, in words."""
+        """The form in words."""
         return {
             "function": f"a smooth function of {self.channel}",
             "with temperature": f"{self.channel}, with an influence that changes with temperature",
@@ -251,15 +244,11 @@ def probes(chunks: Sequence[Chunk], axes: tuple[str, ...]) -> Iterator[Probe]:
 def _knots(parts: list[Array]) -> tuple[float, ...] | None:
     values = np.concatenate(parts)
     low, high = (float(v) for v in np.quantile(values, [0.005, 0.995]))
-    return tuple(float(v) for v in np.linspace(low, high, _SPLINES + 1)) if low < high else None
+    return tuple(float(v) for v in np.linspace(low, high, PROBE_INTERVALS + 1)) if low < high else None
 
 
 def span(seconds: float) -> str:
     """Return a time span as one says it."""
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 600
-        else f"{seconds / 60:.0f} min"
-        if seconds < 7200
-        else f"{seconds / 3600:.1f} h"
-    )
+    if seconds < 600:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

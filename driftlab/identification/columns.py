@@ -1,6 +1,6 @@
-"""Everything that a search may put into a model, as columns over the rows, and their inner products.
+"""Regressors of a search: everything that may be in a model as columns over the rows, and their inner products.
 
-A column is what a curve of the map, one coefficient of an effect, or the unknown start of a memory shows in the
+A column is what a curve of the map, one coefficient of an effect, or the unknown start of a memory adds to the
 bias. Each is centred in each recording (its mean is the recording's level) and scaled to a mean square of 1, so any
 model is a choice of columns, and its least squares a choice of rows and columns of Gram matrices that are made once.
 n rows, R recordings, S segments, d axes, K columns.
@@ -33,8 +33,8 @@ class RowSegment:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What an effect shows: on each axis its columns and which coefficients they belong to, and of its start.
+class EffectColumns:
+    """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Shown:
     columns, places : tuples of (k,) arrays of int, one an axis
         Columns, and the coefficients they belong to.
     starts : (R,) array of int, or None
-        Columns of what a start of 1 in each recording leaves; None where the effect has no unknown start.
+        Columns of the response to a start of 1 in each recording; None where the effect has no unknown start.
     """
 
     p: int
@@ -60,9 +60,9 @@ class EffectRegressors:
     W : (n, K) array
         The columns.
     means : (R, K) array
-        What was taken off in each recording, in the columns' scaled unit.
+        Means that were subtracted in each recording, in the columns' scaled unit.
     scale : (K,) array
-        What each column was divided by.
+        Divisor of each column.
     y : (d,) array of int
         Columns of the measured bias.
     levels : (R,) array of int
@@ -80,8 +80,8 @@ class EffectRegressors:
         self.segments = _segments(evidence)
         self._gram = np.zeros((len(self.segments), 0, 0))
         self._sums: dict[tuple[int, ...], Array] = {}
-        self._shown: dict[str, Shown] = {}
-        self._same: dict[int, tuple[Effect, Shown]] = {}  # an object is found sooner than what it says
+        self._effects: dict[str, EffectColumns] = {}
+        self._same: dict[int, tuple[Effect, EffectColumns]] = {}  # an object is found sooner than what it says
         self._maps: dict[str, Indices] = {}
         levels = np.zeros((n, R))
         for r, rows in enumerate(evidence.slices):
@@ -99,12 +99,12 @@ class EffectRegressors:
 
     @property
     def means(self) -> Array:
-        """What was taken off each column in each recording (R, K)."""
+        """Mean of each column in each recording (R, K), which was subtracted."""
         return self._means[: self._size].T
 
     @property
     def scale(self) -> Array:
-        """What each column was divided by (K,)."""
+        """Divisor of each column (K,)."""
         return self._scale[: self._size]
 
     @property
@@ -129,8 +129,19 @@ class EffectRegressors:
         """Return the normal equations of columns (k,) over some segments, y (1,) the signal's column."""
         return NormalEquations.of(self.gram(segments, np.concatenate([cols, y])))
 
+    def all_but(self, k: int) -> tuple[int, ...]:
+        """Return all segments but one."""
+        return tuple(j for j in self.everything if j != k)
+
+    def raw(self, cols: Indices) -> Array:
+        """Return columns (n, k) as they were before they were centred and scaled."""
+        values = self.W[:, cols].copy()
+        for r, rows in enumerate(self.evidence.slices):
+            values[rows] += self.means[r, cols]
+        return np.asarray(values * self.scale[cols])
+
     def within(self, inner: Indices, outer: Indices) -> bool:
-        """Return whether columns are combinations of others."""
+        """Whether columns are combinations of others."""
         if not len(inner):
             return True
         A, b = self.W[:, outer], self.W[:, inner]
@@ -143,46 +154,38 @@ class EffectRegressors:
         acting = [effect for effect in effects if effect.acts_on_input]
         key = repr(acting)
         if key not in self._maps:
-            parts = []
-            for chunk in self.evidence.chunks:
-                for effect in acting:
-                    chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-                parts.append(self.basis.values(chunk["temperature"]))
-            self._maps[key] = self._add(self.evidence.rows(parts))
+            curves = [self.basis.values(T) for T in self.evidence.map_inputs(acting)]
+            self._maps[key] = self._add(self.evidence.rows(curves))
         return self._maps[key]
 
-    def of(self, effect: Effect) -> Shown:
+    def of(self, effect: Effect) -> EffectColumns:
         """Return the columns of an effect."""
         if id(effect) in self._same:
             return self._same[id(effect)][1]
         key = repr(effect)
-        if key not in self._shown:
-            parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
-            whole = self.evidence.rows(parts)
+        if key not in self._effects:
+            whole = self.evidence.rows([effect.signature(chunk, None)[0] for chunk in self.evidence.chunks])
             columns: list[Indices] = []
             places: list[Indices] = []
-            for axis in range(whole.shape[1]):
-                own = whole[:, axis]
+            for own in whole.swapaxes(0, 1):
                 place = np.flatnonzero(np.any(own != 0, axis=0))
-                alike = axis > 0 and len(place) == len(places[0])
-                if alike and np.array_equal(own[:, place], whole[:, 0][:, places[0]]):
+                if places and len(place) == len(places[0]) and np.array_equal(own[:, place], whole[:, 0][:, places[0]]):
                     columns.append(columns[0])
                 else:
                     columns.append(self._add(own[:, place]))
                 places.append(place)
-            self._shown[key] = Shown(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
-        self._same[id(effect)] = effect, self._shown[key]
-        return self._shown[key]
+            self._effects[key] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
+        self._same[id(effect)] = effect, self._effects[key]
+        return self._effects[key]
 
     def _starts(self, effect: Effect) -> Indices | None:
-        """Return a column for each recording: what is left of a start of 1, row by row."""
-        n, slices = len(self.evidence), self.evidence.slices
-        left = np.zeros((n, len(slices)))
-        for r, record in enumerate(self.evidence.records):
+        """Return a column for each recording: the response to a start of 1, row by row."""
+        left = np.zeros((len(self.evidence), len(self.levels)))
+        for r, (record, rows) in enumerate(zip(self.evidence.records, self.evidence.slices, strict=True)):
             factor, _ = effect.fading(record.chunk, None)
             if factor is None:
                 return None
-            left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))
+            left[rows, r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))
         return self._add(left, unit=False)
 
     def _add(self, values: Array, *, centred: bool = True, unit: bool = True) -> Indices:
@@ -230,8 +233,8 @@ class EffectRegressors:
 
 def _segments(evidence: Evidence) -> tuple[RowSegment, ...]:
     count = PARTS if len(evidence.records) == 1 else HALVES
-    found = []
+    segments = []
     for r, rows in enumerate(evidence.slices):
         cuts = np.linspace(rows.start, rows.stop, count + 1).round().astype(int)
-        found += [RowSegment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
-    return tuple(found)
+        segments += [RowSegment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
+    return tuple(segments)

@@ -50,7 +50,7 @@ def host_of(declared: BiasModel) -> ThermalBias:
 
 
 def built_in(cls: type[Any]) -> bool:
-    """Return whether a plugin came with driftlab."""
+    """Whether a plugin came with driftlab."""
     return cls.__module__.startswith("fusion_plugins.")
 
 

@@ -1,4 +1,4 @@
-"""What a model predicts of recordings that were left out: open loop, as a user coasts.
+"""Cross-validation: predictions of recordings that were left out, open loop, as a user coasts.
 
 Each recording, and each half of each, is left out in turn. Coefficients and hyper-parameters are those of the rest
 (transfer); given these, map and levels are fitted to all (refitting the map without the part would measure its
@@ -24,7 +24,7 @@ from driftlab.identification.normal_equations import Indices
 from driftlab.noise.local_level import LocalLevel
 from fusion_core.chunk import Array
 
-FEWEST = 8  # rows of a part that is judged
+MIN_ROWS = 8  # of a part that is predicted
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class LeftOutPart:
     Attributes
     ----------
     record, rows, whole : int, slice, bool
-        What is left out, and whether it is all of the recording.
+        The rows that are left out, and whether they are all of the recording.
     rest, refit : tuples of int
         Segments that effects are fitted on, and map and levels, the effects given.
     window : slice
@@ -76,37 +76,32 @@ class Conditioned:
 
 
 def parts(columns: EffectRegressors) -> tuple[LeftOutPart, ...]:
-    """Return what is left out in turn."""
-    segments = columns.segments
-    found = []
-    alone = len(columns.evidence.records) == 1
-    whole = [] if alone else list(range(len(columns.evidence.records)))
-    for r in whole:
-        own = [k for k, s in enumerate(segments) if s.record == r]
-        rows = slice(segments[own[0]].rows.start, segments[own[-1]].rows.stop)
-        found.append((r, rows, tuple(k for k in range(len(segments)) if k not in own)))
-    found += [(s.record, s.rows, tuple(j for j in range(len(segments)) if j != k)) for k, s in enumerate(segments)]
-    kept = []
-    for r, rows, rest in found:
-        t = columns.evidence.records[r].t
-        first = columns.evidence.slices[r].start
-        at = t[rows.start - first] + columns.evidence.align
+    """Return the parts that are left out in turn: whole recordings where there are several, then segments."""
+    segments, evidence = columns.segments, columns.evidence
+    alone = len(evidence.records) == 1
+    whole = [] if alone else list(enumerate(evidence.slices))
+    each = [(r, rows, tuple(k for k, s in enumerate(segments) if s.record != r)) for r, rows in whole]
+    each += [(s.record, s.rows, columns.all_but(k)) for k, s in enumerate(segments)]
+    long_enough = []
+    for r, rows, rest in each:
+        t, first = evidence.records[r].t, evidence.slices[r].start
+        at = t[rows.start - first] + evidence.align
         stop = first + int(np.searchsorted(t, at, side="right"))
         window = slice(rows.start, max(stop, rows.start + 2))
-        if rows.stop - window.stop >= FEWEST:
-            is_whole = rows.stop - rows.start == len(columns.evidence.records[r])
-            kept.append(LeftOutPart(r, rows, is_whole, rest, rest if alone else columns.everything, window))
-    return tuple(kept)
+        if rows.stop - window.stop >= MIN_ROWS:
+            is_whole = rows.stop - rows.start == len(t)
+            long_enough.append(LeftOutPart(r, rows, is_whole, rest, rest if alone else columns.everything, window))
+    return tuple(long_enough)
 
 
 def error(squares: LeastSquares, model: Model, axis: int, part: LeftOutPart, noise: LocalLevel) -> Array:
     """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean.
 
-    `noise` is what the model leaves.
+    `noise` is that of the model's residual.
     """
     columns = squares.columns
     fit = squares.fit(model, axis, part.rest)
-    known = given(squares, model, axis, fit, part.refit)
+    known = condition(squares, model, axis, fit, part.refit)
     cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, part.record]])
     W = columns.W[part.rows, cols] + columns.means[part.record, cols]
     stop = 1 + len(known.cols)
@@ -123,36 +118,32 @@ def error(squares: LeastSquares, model: Model, axis: int, part: LeftOutPart, noi
     return np.asarray(e[split:] - e[split:].mean())
 
 
-def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Conditioned:
+def condition(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Conditioned:
     """Fit map, levels and starts on some segments, the effects' coefficients given as another fit has them."""
-    columns = squares.columns
-    fixed = squares.fixed(model, axis)
+    columns, means = squares.columns, squares.columns.means
+    fixed, y = squares.fixed(model, axis), columns.y[axis : axis + 1]
     q, R = len(columns.penalty), len(columns.levels)
     theta = fit.beta[q + R : len(fixed)]
     free = [k for k, sd in enumerate(fit.sd) if sd > 0]
-    starts = [columns.of(model[k].effect).starts for k in free]
-    y = columns.y[axis : axis + 1]
-    own = np.concatenate([fixed[: q + R], *(s for s in starts if s is not None)])
+    starts = np.array([columns.of(model[k].effect).starts for k in free], dtype=np.intp).reshape(len(free), R)
+    own = np.concatenate([fixed[: q + R], starts.ravel()])
     equations = columns.equations(refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
     equations = equations.raised(squares.ridge(axis, fixed[: q + R], equations.A))
     weights = np.repeat([fit.slow / fit.sd[k] ** 2 for k in free], R)
     beta = equations.raised(np.concatenate([np.zeros(q + R), weights])).solution
-    shown = np.concatenate([fixed[:q], fixed[q + R :]])
-    coefficients = np.concatenate([beta[:q], theta])
+    cols, coefficients = np.concatenate([fixed[:q], fixed[q + R :]]), np.concatenate([beta[:q], theta])
     a = beta[q + R :].reshape(len(free), R)
-    places = np.array(starts, dtype=np.intp).reshape(len(free), R)
-    means = columns.means
-    levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ coefficients
-    for j in range(len(free)):
-        levels = levels - means[:, places[j]] @ a[j]
-    return Conditioned(shown, coefficients, places, fit.sd[free], a, levels)
+    levels = beta[q : q + R] + means[:, y[0]] - means[:, cols] @ coefficients
+    for place, start in zip(starts, a, strict=True):
+        levels = levels - means[:, place] @ start
+    return Conditioned(cols, coefficients, starts, fit.sd[free], a, levels)
 
 
 def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float]:
     """Return mean and deviation of the level of one more recording, from those of others and how all of them spread.
 
-    The deviation is that which holds 68 % of a Student's t (two recordings tell little of a spread), and what the model
-    leaves of the bias, `left` (rms).
+    The deviation is that which holds 68 % of a Student's t (two recordings tell little of a spread), and the model's
+    residual, `left` (rms).
     """
     if len(levels) < 2:
         return 0.0, np.inf
@@ -163,12 +154,11 @@ def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float
 def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: LocalLevel) -> Array:
     """Return the best linear estimate of the starts a (terms,) from the rows e (n,) in which a unit is aligned.
 
-    f (n, terms) is what a start of 1 leaves, mean and spread the level's prior, sd (terms,) that of the starts.
+    f (n, terms) is the response to a start of 1, mean and spread the level's prior, sd (terms,) that of the starts.
     """
     H = np.concatenate([np.ones((len(e), 1)), f], axis=1)
     # a level of which nothing is known: wide beside anything that is seen
     wide = spread if np.isfinite(spread) else 1e3 * float(np.max(np.abs(e)) + np.max(sd) + 1e-300)
     P = np.diag(np.concatenate([[wide], sd]) ** 2)
     S = H @ P @ H.T + noise.covariance(len(e))
-    found = P @ H.T @ np.linalg.solve(S, e - mean)
-    return np.asarray(found[1:])
+    return np.asarray((P @ H.T @ np.linalg.solve(S, e - mean))[1:])

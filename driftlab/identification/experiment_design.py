@@ -1,6 +1,6 @@
-"""Which further recording would tell two explanations apart, and by how much.
+"""Design of a further recording that would tell two explanations apart, and its expected gain.
 
-A recording is designed from what the channels did so far, one model says what the unit would show on it, and the
+A recording is designed from the ranges of the channels so far, one model predicts the unit's readings on it, and the
 other is fitted to the old recordings and the new one together, all whitened by the noise that is left. By how much its
 misfit grows, in nats, is the expected gain: the log of how much less likely it would become.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import Model
 from driftlab.identification.normal_equations import Indices, NormalEquations
-from driftlab.identification.records import Evidence, Record
+from driftlab.identification.records import Evidence, Record, row_starts
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
 from driftlab.noise.local_level import LocalLevel, one_step
@@ -38,22 +38,22 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Question:
-    """Two models to tell apart, and what they are called; the first is what the unit is taken to be."""
+    """Two models to tell apart, and their names; the first is what the unit is taken to be."""
 
     model: Model
     other: Model
     names: tuple[str, str]
 
 
-def propose(found: Search, questions: Sequence[Question]) -> tuple[Experiment, ...]:
+def propose(search: Search, questions: Sequence[Question]) -> tuple[Experiment, ...]:
     """Return the recording that tells best the two models of each question apart, where one would tell them at all."""
     if not questions:
         return ()
-    evidence, basis = found.columns.evidence, found.columns.basis
+    evidence, basis = search.evidence, search.columns.basis
     designs = [(text, EffectRegressors(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
     proposed = []
     for question in questions:
-        gains = [_separated(found, new, question) for _, new in designs]
+        gains = [_separation(search, new, question) for _, new in designs]
         k = int(np.argmax(gains))
         if gains[k] > AS_GOOD:
             proposed.append(Experiment(designs[k][0], question.names, gains[k]))
@@ -81,8 +81,7 @@ def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
     for name, values in still.items():
         if name not in others:
             continue
-        seen = np.concatenate([chunk[name] for chunk in evidence.chunks])
-        low_v, high_v = np.quantile(seen, [0.02, 0.98], axis=0)
+        low_v, high_v = np.quantile(np.concatenate([chunk[name] for chunk in evidence.chunks]), [0.02, 0.98], axis=0)
         up = (t // 900 % 2 == 1).reshape(-1, *[1] * (values.ndim - 1))
         text = f"{HOURS:g} h at constant temperature with {name} alone moved over its range every 15 min"
         moved_alone = np.asarray(np.where(up, high_v, low_v), dtype=np.float64)
@@ -111,58 +110,50 @@ def _chunk(t: Array, channels: dict[str, Array]) -> Chunk:
 
 def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     """Return a designed recording in rows as long as those of the present ones."""
-    number = np.floor((chunk.t - chunk.t[0] + 1e-6) / evidence.interval)
-    starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-    return replace(evidence, records=(Record("designed", False, True, chunk, starts),))
+    return replace(evidence, records=(Record("designed", False, True, chunk, row_starts(chunk.t, evidence.interval)),))
 
 
-def _separated(found: Search, new: EffectRegressors, question: Question) -> float:
-    """Return `_separation`; 0 where an effect has no answer to what the recording would be like."""
-    try:
-        return _separation(found, new, question)
-    except FusionError:
-        return 0.0
+def _separation(search: Search, new: EffectRegressors, question: Question) -> float:
+    """Return by how many nats the second model would fall behind on a designed recording.
 
-
-def _separation(found: Search, new: EffectRegressors, question: Question) -> float:
-    """Return by how many nats the second model would fall behind on a designed recording."""
+    0 where an effect cannot predict the readings on such a recording.
+    """
     gain = 0.0
-    columns, slices = found.columns, found.columns.evidence.slices
-    for axis, noise in enumerate(found.noises):
-        truth, other = (found.squares.fit(model, axis, found.everything) for model in (question.model, question.other))
-        shown = _shown(columns, new, question.model, axis, truth.cols) @ truth.beta
-        own = _shown(columns, new, question.other, axis, other.cols)
+    columns = search.columns
+    for axis, noise in enumerate(search.noises):
+        truth, other = (search.fit(model, axis) for model in (question.model, question.other))
+        try:
+            reading = _predicted(columns, new, question.model, axis, truth.cols) @ truth.beta
+            fitted = _predicted(columns, new, question.other, axis, other.cols)
+        except FusionError:
+            return 0.0
         old = columns.W[:, np.append(other.cols, columns.y[axis])]
-        left = max(float(np.mean(found.squares.residual(axis, other) ** 2)), 1e-300)
-        ridge = (other.equations.A - columns.gram(found.everything, other.cols)) / left
-        before = _white([old[rows] for rows in slices], noise).raised(ridge)
-        after = before + _white([np.column_stack([own, shown])], noise)
+        left = max(float(np.mean(search.squares.residual(axis, other) ** 2)), 1e-300)
+        ridge = (other.equations.A - columns.gram(search.everything, other.cols)) / left
+        before = _white(search.evidence.split(old), noise).raised(ridge)
+        after = before + _white([np.column_stack([fitted, reading])], noise)
         gain += 0.5 * max(after.left - before.left, 0.0)
     return float(gain)
 
 
-def _shown(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Indices) -> Array:
+def _predicted(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Indices) -> Array:
     """Return the columns of a fit (n, k) over a designed recording, in the scale of those over the old ones.
 
     Levels and starts of the old recordings are nothing there, and a memory begins in equilibrium.
     """
     effects = [term.effect for term in model]
-    found = np.zeros((len(new.evidence), len(cols)))
+    predicted = np.zeros((len(new.evidence), len(cols)))
     at = len(columns.of_map(effects))
-    found[:, :at] = _raw(new, new.of_map(effects))
+    predicted[:, :at] = new.raw(new.of_map(effects))
     at += len(columns.levels)
     for effect in effects:
         old, now = columns.of(effect), new.of(effect)
         for place in old.places[axis]:
-            seen = np.flatnonzero(now.places[axis] == place)
-            if len(seen):
-                found[:, at] = _raw(new, now.columns[axis][seen])[:, 0]
+            same = np.flatnonzero(now.places[axis] == place)
+            if len(same):
+                predicted[:, at] = new.raw(now.columns[axis][same])[:, 0]
             at += 1
-    return np.asarray(found / columns.scale[cols])
-
-
-def _raw(new: EffectRegressors, cols: Indices) -> Array:
-    return np.asarray((new.W[:, cols] + new.means[0, cols]) * new.scale[cols])
+    return np.asarray(predicted / columns.scale[cols])
 
 
 def _white(parts: Sequence[Array], noise: LocalLevel) -> NormalEquations:

@@ -4,7 +4,7 @@ On each axis, for a recording r::
 
     y = X c + l_r + sum Z theta + sum a_r f + e
 
-X the map's curves, l_r the recording's level, Z an effect's signature, f what a start of 1 leaves of a memory. c has
+X the map's curves, l_r the recording's level, Z an effect's signature, f a memory's response to a start of 1. c has
 the map's own penalty and theta none. a_r ~ N(0, sd^2): sd^2 is the mean of a^2 - S V over the recordings that are
 fitted, V the variance of a for noise of density 1 and S the density of the residual at low frequencies (method of
 moments); it acts as a ridge S / sd^2, and where sd^2 is 0 the memory is taken to start at equilibrium. S is the mean
@@ -80,21 +80,21 @@ class LeastSquares:
     columns: EffectRegressors
     smoothing: Array
     colour: Array
-    _kept: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)
+    _fits: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)
 
     def fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:
         """Fit a model on one axis over some segments."""
         key = (model, axis, segments)
-        if key not in self._kept:
+        if key not in self._fits:
             fixed, starts = self._columns(model, axis, segments)
             cols = np.concatenate([fixed, *starts])
             equations = self.columns.equations(segments, cols, self.columns.y[axis : axis + 1])
-            self._kept[key] = self._fit(axis, fixed, starts, equations, self.rows(segments))
-        return self._kept[key]
+            self._fits[key] = self._fit(axis, fixed, starts, equations, self.rows(segments))
+        return self._fits[key]
 
     def forget(self) -> None:
         """Let go of fits: smoothing or noise are others."""
-        self._kept.clear()
+        self._fits.clear()
 
     def fit_rows(self, model: Model, axis: int, rows: NDArray[np.bool_]) -> AxisFit:
         """Fit a model on one axis over some rows (n,) of all recordings."""
@@ -120,9 +120,9 @@ class LeastSquares:
         if any(map(len, starts)):
             sd, slow = free_starts(equations, k, starts, rows, float(self.colour[axis]))
         weights = [np.full(len(s), slow / one**2 if one > 0 else 0.0) for s, one in zip(starts, sd, strict=True)]
-        kept = np.concatenate([np.ones(k, dtype=bool), *(w > 0 for w in weights)])
-        equations = equations.raised(np.concatenate([np.zeros(k), *weights])).restricted(kept)
-        return AxisFit(all_cols[kept], equations.solution, equations, sd, slow, equations.left)
+        some = np.concatenate([np.ones(k, dtype=bool), *(w > 0 for w in weights)])
+        equations = equations.raised(np.concatenate([np.zeros(k), *weights])).restricted(some)
+        return AxisFit(all_cols[some], equations.solution, equations, sd, slow, equations.left)
 
     def fixed(self, model: Model, axis: int) -> Indices:
         """Return the columns of map, levels and effects: all but the starts."""
@@ -131,29 +131,27 @@ class LeastSquares:
         return np.concatenate([self.columns.of_map(effects), self.columns.levels, *own])
 
     def ridge(self, axis: int, fixed: Indices, G: Array) -> Array:
-        """Return what the map's penalty adds to the inner products G of the fixed columns, the first of all."""
-        found = np.zeros((len(fixed), len(fixed)))
-        q = len(self.columns.penalty)
+        """Return the map's penalty (k, k) on the fixed columns, G the inner products of these, the first of all."""
+        ridge, q = np.zeros((len(fixed), len(fixed))), len(self.columns.penalty)
         if q and np.any(self.columns.penalty):
-            own = fixed[:q]
-            P = self.columns.penalty / np.outer(self.columns.scale[own], self.columns.scale[own])
-            weight = float(np.trace(G[:q, :q]))
-            found[:q, :q] = self.smoothing[axis] * weight / np.trace(P) * P
-        return found
+            scale = self.columns.scale[fixed[:q]]
+            P = self.columns.penalty / np.outer(scale, scale)
+            ridge[:q, :q] = self.smoothing[axis] * float(np.trace(G[:q, :q])) / np.trace(P) * P
+        return ridge
 
     def starts(self, term: Term, segments: Sequence[int]) -> Indices:
         """Return the columns of a term's unknown starts in the recordings of the segments."""
-        shown = self.columns.of(term.effect)
-        if not term.free or shown.starts is None:
+        starts = self.columns.of(term.effect).starts
+        if not term.free or starts is None:
             return np.zeros(0, dtype=np.intp)
-        return shown.starts[sorted({self.columns.segments[s].record for s in segments})]
+        return starts[sorted({self.columns.segments[s].record for s in segments})]
 
     def rows(self, segments: Sequence[int]) -> int:
         """Return the number of rows of some segments."""
         return sum(self.columns.segments[s].rows.stop - self.columns.segments[s].rows.start for s in segments)
 
     def residual(self, axis: int, fit: AxisFit) -> Array:
-        """Return what a fit leaves of all rows (n,)."""
+        """Return the residual of a fit over all rows (n,)."""
         W = self.columns.W
         return np.asarray(W[:, self.columns.y[axis]] - W[:, fit.cols] @ fit.beta)
 

@@ -1,4 +1,4 @@
-"""From a fitted model to files that `driftlab run` takes: the map, and the config with the effects in it.
+"""The identified model as files that `driftlab run` takes: the map, and the config with the effects in it.
 
 All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what effects and
 starts leave of the rows. n rows, R recordings, d axes; everything is in SI here.
@@ -15,7 +15,6 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.identification.config_edit import the_map, with_host
 from driftlab.identification.cross_validation import level_prior
-from driftlab.identification.normal_equations import Indices
 from driftlab.identification.records import Evidence
 from driftlab.identification.state import Search
 from driftlab.maps.fit import provenance
@@ -39,7 +38,7 @@ class Joint:
     sizes, sizes_sigma : (effects, d) arrays
         Half of what each effect moves the bias by over all rows, and its standard deviation, SI.
     curve, left : (n, d) arrays
-        What the map says, and what nothing says, SI.
+        The map's curve, and the residual, SI.
     levels : (R, d) array
         Of the recordings: rate less map, effects and starts, SI.
     common : (d,) array
@@ -49,7 +48,7 @@ class Joint:
     repeatability : (d,) array, or None
         Deviation of the level of one more recording, SI; None for a single one.
     starts : bool
-        Whether an effect begins at what is not known.
+        Whether an effect begins at an unknown start.
     """
 
     effects: tuple[Effect, ...]
@@ -64,122 +63,104 @@ class Joint:
     starts: bool
 
 
-def joint(found: Search) -> Joint:
-    """Fit the model that was found to all rows."""
-    columns, squares, slices = found.columns, found.squares, found.columns.evidence.slices
-    n, d = len(columns.evidence), len(columns.y)
-    curve, left, levels = np.zeros((n, d)), np.zeros((n, d)), np.zeros((len(slices), d))
-    sums = [_Sum(columns.of(term.effect).p, d) for term in found.model]
-    sizes = np.zeros((2, len(found.model), d))
-    q, R = len(columns.of_map([term.effect for term in found.model])), len(columns.levels)
-    for axis in range(d):
-        fit = squares.fit(found.model, axis, found.everything)
-        y = columns.scale[columns.y[axis]]
+def joint(search: Search) -> Joint:
+    """Fit the model of a search to all rows."""
+    columns, evidence, model = search.columns, search.evidence, search.model
+    n, d, scale = len(evidence), len(columns.y), columns.scale[columns.y]
+    curve, left, levels = np.zeros((n, d)), np.zeros((n, d)), np.zeros((len(evidence.slices), d))
+    # coefficients of each effect: of several axes their mean, weighted by the variances
+    weights = [np.zeros((2, columns.of(term.effect).p)) for term in model]  # sums of 1 / variance and value / variance
+    initial, sizes = np.zeros((len(model), d)), np.zeros((2, len(model), d))
+    q, R = len(columns.of_map([term.effect for term in model])), len(columns.levels)
+    for axis, y in enumerate(scale):
+        fit = search.fit(model, axis)
         beta = fit.beta * y / columns.scale[fit.cols]
-        residual = squares.residual(axis, fit)
-        noise = float(squares.colour[axis] * np.mean(residual**2))
+        noise = float(search.squares.colour[axis] * np.mean(search.squares.residual(axis, fit) ** 2))
         variance = noise * fit.equations.variances * (y / columns.scale[fit.cols]) ** 2
         of_map, others = np.arange(q), np.r_[np.arange(q), np.arange(q + R, len(fit.cols))]
-        curve[:, axis] = _raw(found, fit.cols[of_map]) @ beta[of_map]
-        rest = columns.evidence.rate[:, axis] - _raw(found, fit.cols[others]) @ beta[others]
-        for r, rows in enumerate(slices):
+        curve[:, axis] = columns.raw(fit.cols[of_map]) @ beta[of_map]
+        rest = evidence.rate[:, axis] - columns.raw(fit.cols[others]) @ beta[others]
+        for r, rows in enumerate(evidence.slices):
             levels[r, axis] = rest[rows].mean()
             left[rows, axis] = rest[rows] - levels[r, axis]
         at = q + R
-        for k, (term, one) in enumerate(zip(found.model, sums, strict=True)):
+        for k, term in enumerate(model):
             places = columns.of(term.effect).places[axis]
             part = slice(at, at + len(places))
             at += len(places)
-            one.add(places, beta[part], variance[part])
-            one.initial[axis] = fit.sd[k] * y
-            sizes[:, k, axis] = _size(found, k, axis, part, noise)
-    pairs = zip(found.model, sums, strict=True)
-    effects = tuple(one.into(term.effect, columns.evidence, free=term.free) for term, one in pairs)
-    scale = columns.scale[columns.y]
-    walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
+            weights[k][:, places] += [1 / variance[part], beta[part] / variance[part]]
+            initial[k, axis] = fit.sd[k] * y
+            sizes[:, k, axis] = _size(search, k, axis, part, noise)
+    effects = tuple(
+        _with_coefficients(term.effect, evidence, weights[k], initial[k] if term.free else np.zeros(d))
+        for k, term in enumerate(model)
+    )
+    walk = np.array([np.sqrt(noise.walk / evidence.interval) for noise in search.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
-    common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
+    common = levels[[record.calibration for record in evidence.records]].mean(axis=0)
     return Joint(effects, sizes[0], sizes[1], curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
-class _Sum:
-    """Coefficients of an effect; one that acts on several axes is the mean, weighted by the variances."""
+def _with_coefficients(effect: Effect, evidence: Evidence, weights: Array, initial: Array) -> Effect:
+    """Return an effect with its coefficients and the domain that they hold on.
 
-    def __init__(self, p: int, d: int) -> None:
-        self.weight, self.weighted, self.initial = np.zeros(p), np.zeros(p), np.zeros(d)
-
-    def add(self, places: Indices, values: Array, variance: Array) -> None:
-        self.weight[places] += 1 / variance
-        self.weighted[places] += values / variance
-
-    def into(self, effect: Effect, evidence: Evidence, *, free: bool) -> Effect:
-        known = self.weight > 0
-        weight = np.where(known, self.weight, 1.0)
-        sigma = np.where(known, 1 / np.sqrt(weight), 0.0)
-        update: dict[str, Any] = {
-            "coefficients": tuple(map(float, self.weighted / weight)),
-            "sigma": tuple(map(float, sigma)),
-            "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
-            "domain": _domain(effect, evidence) or None,
-            "regressors": _regressors(effect, evidence) if effect.requires else None,
-        }
-        return effect.model_copy(update=update)
+    `weights` (2, p) are sums of 1 / variance and value / variance, `initial` (d,) the deviation of an unknown start.
+    """
+    known = weights[0] > 0
+    weight = np.where(known, weights[0], 1.0)
+    update: dict[str, Any] = {
+        "coefficients": tuple(map(float, weights[1] / weight)),
+        "sigma": tuple(map(float, np.where(known, 1 / np.sqrt(weight), 0.0))),
+        "initial": tuple(map(float, initial)) if np.any(initial) else None,
+        "domain": _domain(effect, evidence) or None,
+        "regressors": _regressors(effect, evidence) if effect.requires else None,
+    }
+    return effect.model_copy(update=update)
 
 
 def _domain(effect: Effect, evidence: Evidence) -> Domain:
     """Return the range of each channel that an effect reads: a pair, or of several columns a pair each."""
-    found = Domain()
+    domain = Domain()
     for name in effect.requires:
         pairs = tuple((float(low), float(high)) for low, high in evidence.ends(name))
-        found[name] = pairs[0] if len(pairs) == 1 else pairs
-    return found
+        domain[name] = pairs[0] if len(pairs) == 1 else pairs
+    return domain
 
 
 def _regressors(effect: Effect, evidence: Evidence) -> tuple[tuple[float, float], ...] | None:
     """Return the range of each regressor of an effect with a memory, on the axes on which it acts; else None."""
-    shown = [effect.signature(chunk, None) for chunk in evidence.chunks]
-    if shown[0][1] is None:
+    signatures = [effect.signature(chunk, None) for chunk in evidence.chunks]
+    if signatures[0][1] is None:
         return None
-    values = np.concatenate([signature for signature, _ in shown])
+    values = np.concatenate([signature for signature, _ in signatures])
     there = np.any(values != 0, axis=0)
     low = np.min(np.where(there, values.min(axis=0), np.inf), axis=0)
     high = np.max(np.where(there, values.max(axis=0), -np.inf), axis=0)
     return tuple((float(a), float(b)) if a <= b else (0.0, 0.0) for a, b in zip(low, high, strict=True))
 
 
-def _size(found: Search, k: int, axis: int, own: slice, noise: float) -> tuple[float, float]:
+def _size(search: Search, k: int, axis: int, own: slice, noise: float) -> tuple[float, float]:
     """Return half of what the k-th effect moves the bias of an axis by, and its deviation, SI.
 
-    `own` are its columns of the fit, `noise` the residual's density. One that acts on the map's input moves what the
-    map says. The deviation is the larger of that of the noise and of how the size varies where one part after the
-    other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): what the model misses is in it.
+    `own` are its columns of the fit, `noise` the residual's density. One that acts on the map's input moves the map's
+    curve. The deviation is the larger of that of the noise and of how the size varies where one part after the
+    other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): the model's misfit is in it.
     """
-    squares, everything = found.squares, found.everything
-    fit, y = squares.fit(found.model, axis, everything), found.columns.scale[found.columns.y[axis]]
-    effects = [term.effect for term in found.model]
-    of_map = found.columns.of_map(effects)
-    shown = np.zeros((len(found.columns.evidence), len(fit.cols)))
-    shown[:, own] = _raw(found, fit.cols[own])
+    squares, columns, model = search.squares, search.columns, search.model
+    fit, effects = search.fit(model, axis), [term.effect for term in model]
+    of_map = columns.of_map(effects)
+    regressors = np.zeros((len(search.evidence), len(fit.cols)))
+    regressors[:, own] = columns.raw(fit.cols[own])
     if effects[k].acts_on_input:
-        without = found.columns.of_map([effect for effect in effects if effect is not effects[k]])
-        shown[:, : len(of_map)] = _raw(found, of_map) - _raw(found, without)
-    shown *= y / found.columns.scale[fit.cols]
-    said = shown @ fit.beta
-    between = shown[int(np.argmax(said))] - shown[int(np.argmin(said))]
-    rests = [tuple(j for j in everything if j != part) for part in everything]
-    k, g = len(squares.fixed(found.model, axis)), len(rests)
-    others = [between[:k] @ squares.fit(found.model, axis, rest).beta[:k] for rest in rests]
+        without = columns.of_map([effect for effect in effects if effect is not effects[k]])
+        regressors[:, : len(of_map)] = columns.raw(of_map) - columns.raw(without)
+    regressors *= columns.scale[columns.y[axis]] / columns.scale[fit.cols]
+    moved = regressors @ fit.beta
+    between = regressors[int(np.argmax(moved))] - regressors[int(np.argmin(moved))]
+    p, g = len(squares.fixed(model, axis)), len(search.everything)
+    others = [between[:p] @ squares.fit(model, axis, columns.all_but(part)).beta[:p] for part in search.everything]
     variance = max((g - 1) * float(np.var(others)), noise * float(between @ fit.equations.solve(between)), 0.0)
-    return float(np.ptp(said)) / 2, float(np.sqrt(variance)) / 2
-
-
-def _raw(found: Search, cols: Indices) -> Array:
-    """Return columns (n, k) as they were before they were centred and scaled."""
-    columns = found.columns
-    values = columns.W[:, cols].copy()
-    for r, rows in enumerate(columns.evidence.slices):
-        values[rows] += columns.means[r, cols]
-    return np.asarray(values * columns.scale[cols])
+    return float(np.ptp(moved)) / 2, float(np.sqrt(variance)) / 2
 
 
 def _repeatability(levels: Array, left: Array) -> Array | None:
@@ -189,20 +170,15 @@ def _repeatability(levels: Array, left: Array) -> Array | None:
     return np.array([level_prior(own, own, float(more))[1] for own, more in zip(levels.T, rms, strict=True)])
 
 
-def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:
+def explained_map(search: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:
     """Return the map of the declared kind, fitted as the declared one was, to what the effects leave.
 
     So it is the declared one where there are no effects: recordings of the calibration keep their levels, as they did
     then. Those of the training alone are shifted to the level of the calibration.
     """
-    evidence = found.columns.evidence
-    acting = [effect for effect in fit.effects if effect.acts_on_input]
-    seen = []
-    for chunk in evidence.chunks:
-        for effect in acting:
-            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-        seen.append(chunk["temperature"])
-    T, bias = evidence.rows(seen), fit.curve + fit.left
+    evidence = search.evidence
+    T = evidence.rows(evidence.map_inputs([effect for effect in fit.effects if effect.acts_on_input]))
+    bias = fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
         bias[rows] += level if record.calibration else fit.common
     T, bias = _to_the_ends(T, bias, declared.domain)
@@ -227,7 +203,7 @@ def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Ar
 def explained_config(config: Config, unit: BiasUnit, fit: Joint, map_path: Path | None, *, estimate: bool) -> Config:
     """Return the config with the map of the joint fit, the effects, and the walk that is left with them.
 
-    Where an effect begins at what is not known, also what earlier switch-ons say of the bias: it is estimated as a
+    Where an effect begins at an unknown start, also the level of earlier switch-ons: the start is estimated as a
     unit is aligned, and is told from the bias by that alone.
     """
     values: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""How well recordings that were left out are predicted, by the declared model and by the one that was found."""
+"""Prediction errors of recordings that were left out, by the declared model and by the identified one."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import numpy as np
 
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import LeftOutPart, error, parts
+from driftlab.identification.least_squares import Model
 from driftlab.identification.records import Evidence
-from driftlab.identification.state import Search, noises_of
+from driftlab.identification.state import Search
+from driftlab.noise.local_level import LocalLevel
 from fusion_core.chunk import Array
 from fusion_core.errors import EmptyRecording
+
+Errors = list[list[Array]]  # of each part, of each axis
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,8 @@ class LeftOut:
         The recording.
     train : bool
         Whether it is for training.
-    part : Part
-        What was left out of it.
+    part : LeftOutPart
+        The rows that were left out of it.
     t : (n,) array
         Times, s.
     before, after : (n, d) arrays
@@ -52,23 +56,27 @@ def check_length(evidence: Evidence) -> None:
         )
 
 
-def left_out(found: Search) -> tuple[LeftOut, ...]:
-    """Return what both models predict of each part; coefficients are those of the rest, hyper-parameters of all."""
-    columns, evidence = found.columns, found.columns.evidence
-    axes = range(len(columns.y))
-    scale = columns.scale[columns.y]
-    models = found.declared, found.model
-    noises = [noises_of(found, model) for model in models]
+def left_out_errors(search: Search, models: Sequence[Model], noises: Sequence[LocalLevel]) -> Errors:
+    """Return the errors of the predictions of all parts, by a model for each of them."""
+    return [
+        [error(search.squares, model, axis, part, noises[axis]) for axis in search.all_axes]
+        for model, part in zip(models, search.left_out, strict=True)
+    ]
+
+
+def left_out(search: Search) -> tuple[LeftOut, ...]:
+    """Return the errors of both models on each part; coefficients are those of the rest, hyper-parameters of all."""
+    evidence, scale = search.evidence, search.columns.scale[search.columns.y]
+    both = [
+        left_out_errors(search, [model] * len(search.left_out), search.noises_of(model))
+        for model in (search.declared, search.model)
+    ]
     whole = []
-    for part in found.left_out:
-        record = evidence.records[part.record]
-        first = evidence.slices[part.record].start
-        errors = [
-            np.stack([error(found.squares, model, axis, part, own[axis]) for axis in axes], axis=1) * scale
-            for model, own in zip(models, noises, strict=True)
-        ]
+    for part, *errors in zip(search.left_out, *both, strict=True):
+        record, first = evidence.records[part.record], evidence.slices[part.record].start
         t = record.t[part.window.stop - first : part.rows.stop - first]
-        whole.append(LeftOut(record.name, record.train, part, t, *errors))
+        before, after = (np.stack(each, axis=1) * scale for each in errors)
+        whole.append(LeftOut(record.name, record.train, part, t, before, after))
     return tuple(whole)
 
 
@@ -80,10 +88,8 @@ def rms(whole: Sequence[LeftOut]) -> tuple[Array, Array]:
 
 def to_show(whole: Sequence[LeftOut]) -> dict[str, list[LeftOut]]:
     """Return the parts of each training recording, whole recordings where they were left out whole."""
-    found: dict[str, list[LeftOut]] = {}
+    shown: dict[str, list[LeftOut]] = {}
     for one in whole:
         if one.train:
-            found.setdefault(one.name, []).append(one)
-    for name, own in found.items():
-        found[name] = [one for one in own if one.part.whole] or own
-    return found
+            shown.setdefault(one.name, []).append(one)
+    return {name: [one for one in parts if one.part.whole] or parts for name, parts in shown.items()}

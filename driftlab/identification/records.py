@@ -1,9 +1,10 @@
-"""Recordings as evidence: what was measured at rest, in means of some seconds, and in rows of them for regression.
+"""Recordings as evidence: the readings at rest, in means of some seconds, and in rows of them for regression.
 
 A bias that moves over minutes is as well seen in means of seconds as in the updates themselves. Effects are computed
 on means of at most 10 s, so that their memories are as they run; regressions are made on rows of one or more of these.
 
-What keeps recordings from telling explanations apart, in sentences that one understands at the bench.
+Missing excitation, in sentences that one understands at the bench: a temperature that only goes one way, and a channel
+that moves with it, keep recordings from telling explanations apart.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
-from driftlab.soak.sweeps import rise_and_fall
+from driftlab.soak.sweeps import one_way, ways
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import Effect
 from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
 
@@ -43,15 +45,15 @@ class Record:
     Attributes
     ----------
     name : str
-        What the recording is called.
+        Name of the recording.
     calibration, train : bool
-        What it is for; it may be for both.
+        Its roles; it may have both.
     chunk : Chunk
         The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is without the
         thermometer's steps; and the other channels.
     starts : (n,) array of int
         The first mean of each row.
-    seen : mapping of str to (columns, 2) array
+    ranges : mapping of str to (columns, 2) array
         Smallest and largest value of each channel, update by update.
     """
 
@@ -60,7 +62,7 @@ class Record:
     train: bool
     chunk: Chunk
     starts: NDArray[np.int64]
-    seen: Mapping[str, Array] = field(default_factory=dict)
+    ranges: Mapping[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -77,8 +79,8 @@ class Record:
         return self.rows(self.chunk.t)
 
     def ends(self, channel: str) -> Array:
-        """Return the ends (columns, 2) of what was seen of a channel."""
-        return self.seen[channel] if channel in self.seen else _ends(self.chunk[channel])
+        """Return the range (columns, 2) of a channel."""
+        return self.ranges[channel] if channel in self.ranges else _ends(self.chunk[channel])
 
 
 @dataclass(frozen=True)
@@ -125,9 +127,8 @@ class Evidence:
         return [record.chunk for record in self.records]
 
     def ends(self, channel: str) -> Array:
-        """Return the ends (columns, 2) of what all recordings show of a channel, SI."""
-        each = np.stack([record.ends(channel) for record in self.records])
-        return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=1)
+        """Return the range (columns, 2) of a channel in all recordings, SI."""
+        return _union([record.ends(channel) for record in self.records])
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -139,9 +140,22 @@ class Evidence:
         """Return the rows (n, ...) of values over each recording's means."""
         return np.concatenate([record.rows(part) for record, part in zip(self.records, values, strict=True)])
 
+    def split(self, values: Array) -> list[Array]:
+        """Return the part of rows (n, ...) that is each recording's."""
+        return [values[rows] for rows in self.slices]
+
+    def map_inputs(self, acting: Sequence[Effect]) -> list[Array]:
+        """Return the temperature that the map sees behind effects that act on its input, of each recording's means."""
+        inputs = []
+        for chunk in self.chunks:
+            for effect in acting:
+                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+            inputs.append(chunk["temperature"])
+        return inputs
+
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:
-    """Run the declared model over the recordings, and return what was measured at rest.
+    """Run the declared model over the recordings, and return the readings at rest.
 
     Raises
     ------
@@ -152,46 +166,46 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     settings = config.filter
     assert settings is not None
     least = max(1.0, float(settings.update_interval))
-    found: list[tuple[str, bool, Chunk]] = []
-    seen = []
-    # one that serves as both is evidence once
-    for name, training in {name: name in train for name in (*calibration, *train)}.items():
+    tracked = settings.tracked
+    names = list(dict.fromkeys((*calibration, *train)))  # a recording that serves as both is evidence once
+    chunks: list[Chunk] = []
+    ranges: list[dict[str, Array]] = []
+    for name in names:
         progress(f"reading {name}")
-        journal = RunLog()
+        journal, ends = RunLog(), dict[str, Array]()
         run = Run(with_recording(config, name), journal)
-        passing = _Seen(run)
-        found.append((name, training, _joined(epochs(_at_rest(passing, settings.tracked.channel), least), name)))
-        seen.append(passing.ends)
+        chunks.append(_joined(epochs(_at_rest(run, tracked.channel, ends), least), name))
+        ranges.append(ends)
         first, *later = journal.alignments
         unknown = settings.length_of_input(config.site) is not None
-        if unknown and any(turned(first, other, settings.tracked.channel) for other in later):
+        if unknown and any(turned(first, other, tracked.channel) for other in later):
             raise ConfigError(
-                f"{name}: the unit was turned over in it, and what its {settings.tracked.channel} shows has another "
+                f"{name}: the unit was turned over in it, and what its {tracked.channel} shows has another "
                 "level since; give each placement as PATH::START:STOP"
             )
-    _same_channels([(name, chunk) for name, _, chunk in found])
-    if "temperature" in found[0][2].channels:
-        smooth, _ = soak_temperatures([(chunk.t, chunk["temperature"]) for *_, chunk in found])
-        found = [
-            (name, training, chunk.having(temperature=T))
-            for (name, training, chunk), T in zip(found, smooth, strict=True)
-        ]
-    fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
+    _check_same_channels(names, chunks)
+    if "temperature" in chunks[0].channels:
+        smooth, _ = soak_temperatures([(chunk.t, chunk["temperature"]) for chunk in chunks])
+        chunks = [chunk.having(temperature=T) for chunk, T in zip(chunks, smooth, strict=True)]
+    fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for chunk in chunks), least)
     records = []
-    for (name, training, chunk), own in zip(found, seen, strict=True):
+    for name, chunk, ends in zip(names, chunks, ranges, strict=True):
         whole = _joined(epochs([_without(chunk, "tau")], fine), name)
         # means lie in the middle of what they are over, as far as the updates of a run do
         whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous, whole.sensors)
-        number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
-        starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts, own))
-    tracked = settings.tracked
+        starts = row_starts(whole.t, interval)
+        records.append(Record(name, name in calibration, name in train, _without(whole, "tau"), starts, ends))
     align, noise = float(settings.align), np.asarray(tracked.noise, dtype=np.float64)
     return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, align, noise)
 
 
+def row_starts(t: Array, interval: float) -> NDArray[np.int64]:
+    """Return the first mean of each row of `interval` s, the means at t (N,)."""
+    return np.flatnonzero(np.diff(np.floor((t - t[0] + 1e-6) / interval), prepend=-1.0))
+
+
 def lengths(longest: float, least: float) -> tuple[float, float]:
-    """Return how long means and rows are, in s, where the longest recording lasts `longest` and epochs `least`.
+    """Return the lengths of means and rows, in s, where the longest recording lasts `longest` and epochs `least`.
 
     They are whole multiples, so that all means are alike.
     """
@@ -199,40 +213,25 @@ def lengths(longest: float, least: float) -> tuple[float, float]:
     return float(fine), float(fine * max(1.0, np.ceil(longest / fine / ROWS)))
 
 
-def _at_rest(stretches: Iterable[RunSegment], channel: str) -> Iterator[Chunk]:
-    """Yield the epochs at which the unit stood still."""
-    previous: Chunk | None = None
-    for stretch in stretches:
-        rows = stretch.epochs
-        channels = {k: v for k, v in rows.channels.items() if k not in ("dt", "tau", "temperature_raw")}
-        channels[channel] = stretch.rate
-        if "temperature_raw" in rows.channels:
-            channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
-        kept = Chunk(rows.t, channels, previous, rows.sensors).where(stretch.still)
-        if len(kept):
-            yield kept
-            previous = kept.last()
+def _at_rest(segments: Iterable[RunSegment], channel: str, ends: dict[str, Array]) -> Iterator[Chunk]:
+    """Yield the epochs at which the unit stood still; `ends` takes the range (columns, 2) of each channel in all.
 
-
-class _Seen:
-    """Stretches as they pass, and the ends (columns, 2) of each channel in all of them.
-
-    Means draw these in. What the declared model refuses is often what the effect does: its inputs were seen.
+    Means draw these in. The model may refuse just what the effect does: its inputs were measured all the same.
     """
-
-    def __init__(self, stretches: Iterable[RunSegment]) -> None:
-        self.stretches = stretches
-        self.ends: dict[str, Array] = {}
-
-    def __iter__(self) -> Iterator[RunSegment]:
-        for stretch in self.stretches:
-            channels = dict(stretch.epochs.channels)
-            channels["temperature"] = channels.get("temperature_raw", channels.get("temperature", np.zeros(1)))
-            for name, values in channels.items():
-                own = _ends(values)
-                both = np.stack([self.ends.get(name, own), own])
-                self.ends[name] = np.stack([both[..., 0].min(axis=0), both[..., 1].max(axis=0)], axis=1)
-            yield stretch
+    previous: Chunk | None = None
+    for segment in segments:
+        rows = segment.epochs
+        channels = dict(rows.channels)
+        if "temperature_raw" in channels:
+            channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
+        for name, values in {"temperature": np.zeros(1), **channels}.items():
+            ends[name] = _union([ends.get(name, _ends(values)), _ends(values)])
+        channels = {k: v for k, v in channels.items() if k not in ("dt", "tau", "temperature_raw")}
+        channels[channel] = segment.rate
+        still = Chunk(rows.t, channels, previous, rows.sensors).where(segment.still)
+        if len(still):
+            yield still
+            previous = still.last()
 
 
 def _ends(values: Array) -> Array:
@@ -241,41 +240,44 @@ def _ends(values: Array) -> Array:
     return np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
 
 
+def _union(ranges: Sequence[Array]) -> Array:
+    """Return the range (columns, 2) that holds all of some."""
+    each = np.stack(ranges)
+    return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=1)
+
+
 def _without(chunk: Chunk, name: str) -> Chunk:
-    kept = {k: v for k, v in chunk.channels.items() if k != name}
-    return Chunk(chunk.t, kept, chunk.previous, chunk.sensors)
+    others = {k: v for k, v in chunk.channels.items() if k != name}
+    return Chunk(chunk.t, others, chunk.previous, chunk.sensors)
 
 
 def _joined(chunks: Iterable[Chunk], name: str) -> Chunk:
-    found = list(chunks)
-    if sum(map(len, found)) < 2:
+    parts = list(chunks)
+    if sum(map(len, parts)) < 2:
         raise EmptyRecording(f"{name}: is nowhere at rest for long enough; check the declared noise and the units")
-    return concatenate(found)
+    return concatenate(parts)
 
 
-def _same_channels(found: Sequence[tuple[str, Chunk]]) -> None:
-    first, reference = found[0]
-    for name, chunk in found[1:]:
-        missing = sorted(set(reference.channels) ^ set(chunk.channels))
+def _check_same_channels(names: Sequence[str], chunks: Sequence[Chunk]) -> None:
+    for name, chunk in zip(names, chunks, strict=True):
+        missing = sorted(set(chunks[0].channels) ^ set(chunk.channels))
         if missing:
             raise ConfigError(
-                f"channel '{missing[0]}' is in only one of {first} and {name}; "
+                f"channel '{missing[0]}' is in only one of {names[0]} and {name}; "
                 "name under source.channels what all recordings have"
             )
 
 
-TURN = 0.1  # of the whole swing: a smaller way back is no turning point
-ONE_WAY = 0.1  # of the way up (or down) that the other way must have at least
 STILL = 2.0  # K; a smaller swing shows nothing of temperature
 TOGETHER = 0.97  # correlation beyond which two channels are one
 
 
 def missing_excitation(evidence: Evidence) -> Iterator[str]:
-    """Yield what the recordings do not show: a temperature that goes one way, a channel that moves with it."""
+    """Yield the excitation that the recordings lack: a temperature that goes one way, a channel that moves with it."""
     chunks = [chunk for chunk in evidence.chunks if "temperature" in chunk.channels]
     if not chunks:
         return
-    T = [np.asarray(chunk["temperature"], dtype=np.float64) for chunk in chunks]
+    T = [chunk["temperature"] for chunk in chunks]
     up, down = ways(T)
     swing = float(max(map(np.max, T)) - min(map(np.min, T)))
     if swing < STILL:
@@ -287,9 +289,8 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
             f"lag, a hysteresis, a drift and the map itself look alike on them; record {other} too"
         )
     names = set.intersection(*(set(chunk.channels) for chunk in chunks)) - DERIVED - {"temperature", evidence.channel}
-    level: Array = np.concatenate(T)
     for name in sorted(name for name in names if all(chunk[name].ndim == 1 for chunk in chunks)):
-        r = _correlation(level, np.concatenate([chunk[name] for chunk in chunks]))
+        r = _correlation(np.concatenate(T), np.concatenate([chunk[name] for chunk in chunks]))
         if abs(r) > TOGETHER:
             yield (
                 f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): what one does cannot "
@@ -301,18 +302,3 @@ def _correlation(one: Array, other: Array) -> float:
     one, other = one - np.mean(one), other - np.mean(other)
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(one @ other) / size if size > 0 else 0.0
-
-
-def ways(recordings: Sequence[Array]) -> tuple[float, float]:
-    """Return by how much temperatures (N,) rise in all, and by how much they fall, between their turning points."""
-    least = TURN * (max(map(np.max, recordings)) - min(map(np.min, recordings)))
-    each = [rise_and_fall(T, least) for T in recordings]
-    return sum(up for up, _ in each), sum(down for _, down in each)
-
-
-def one_way(recordings: Sequence[Array]) -> str:
-    """Return what temperatures (N,) do where they hardly ever come back: `warms up` or `cools down`; else nothing."""
-    up, down = ways(recordings)
-    if min(up, down) >= ONE_WAY * max(up, down):
-        return ""
-    return "warms up" if up > down else "cools down"

@@ -1,6 +1,6 @@
-"""What a loop amounts to: an explanation found in recordings, and how it does on a holdout.
+"""Result of an identification: the effects that the declared model lacks, and their errors on test recordings.
 
-What the declared and the explained config predict of a holdout recording, which nothing was fitted to.
+Predictions of a holdout recording, to which nothing was fitted, by the declared and the explained config.
 
 `loop.json`: the verdict for programs.
 
@@ -10,7 +10,7 @@ The verdict in sentences that one understands at the bench.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.identification.acceptance import CHANCE, GAIN
-from driftlab.identification.diagnosis import BEYOND, Diagnosis, Finding, judge
+from driftlab.identification.diagnosis import MAX_NATS, Diagnosis, Finding, judge
 from driftlab.identification.model import Joint, joint
 from driftlab.identification.prediction_errors import LeftOut, check_length, left_out, rms
 from driftlab.identification.records import Evidence, Progress, missing_excitation
@@ -31,20 +31,24 @@ from fusion_core.contracts import Effect, ThermalMap
 
 
 @dataclass(frozen=True)
-class Explanation:
-    """What recordings say that the declared model lacks.
+class Identification:
+    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout.
 
     Attributes
     ----------
     search : Search
-        The model that was found, and what was tried.
-    verdict : Verdict
+        The identified model, and the trials.
+    verdict : Diagnosis
     left_out : tuple of LeftOut
-        How parts that were left out are predicted without it and with it.
+        Prediction errors of left-out parts without the effects and with them.
     fit : Joint
         The model fitted to all rows.
     lines : tuple of str
         The verdict in sentences.
+    outcomes : tuple of Outcome
+        Each holdout recording through both configs.
+    content : dict
+        That of `loop.json`.
     """
 
     search: Search
@@ -52,33 +56,22 @@ class Explanation:
     left_out: tuple[LeftOut, ...]
     fit: Joint
     lines: tuple[str, ...]
+    outcomes: tuple[Outcome, ...] = ()
+    content: dict[str, Any] = field(default_factory=dict)
 
     @property
     def anything(self) -> bool:
         """Whether anything was added to the declared model."""
         return self.search.model != self.search.declared
 
-
-@dataclass(frozen=True)
-class Identification:
-    """An explanation and how it does on the holdout; `content` is that of `loop.json`, `lines` say all in sentences."""
-
-    search: Search
-    verdict: Diagnosis
-    left_out: tuple[LeftOut, ...]
-    fit: Joint
-    outcomes: tuple[Outcome, ...]
-    lines: tuple[str, ...]
-    content: dict[str, Any]
-
     @property
     def refuted(self) -> bool:
-        """Whether it is predicted worse beyond chance: then the declared config stays."""
+        """Whether the holdout is predicted worse beyond chance: then the declared config stays."""
         return self.verdict.word == "refuted"
 
     @property
     def worse(self) -> bool:
-        """Whether the holdout is predicted worse with what was found, by chance or beyond it."""
+        """Whether the holdout is predicted worse with the effects, by chance or beyond it."""
         return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
 
 
@@ -88,8 +81,8 @@ def investigate(
     declared: Sequence[Effect],
     progress: Progress,
     without: Collection[str] = (),
-) -> Explanation:
-    """Find what recordings say that a model with this map (or none) and these effects lacks.
+) -> Identification:
+    """Find the effects that a model with this map (or none) and declared effects lacks on recordings.
 
     Effects of the kinds `without` are not tried.
 
@@ -103,35 +96,32 @@ def investigate(
     if settings is not None:
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
         basis = settings.basis((float(T.min()), float(T.max())))
-    found = search(evidence, basis, progress, declared, without)
-    parts = left_out(found)
-    verdict = judge(found, rms(parts)[1], progress)
-    fit = joint(found)
-    lines = summary(found, verdict, fit)
+    state = search(evidence, basis, progress, declared, without)
+    parts = left_out(state)
+    verdict = judge(state, rms(parts)[1], progress)
+    fit = joint(state)
+    lines = summary(state, verdict, fit)
     if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
         lines += missing_excitation(evidence)
-    return Explanation(found, verdict, parts, fit, tuple(lines))
+    return Identification(state, verdict, parts, fit, tuple(lines))
 
 
 def closed(
-    found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
+    identified: Identification, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Identification:
-    """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
+    """Return the identification with its errors on the holdout; `recordings` are the identities of each role's."""
     change = change_of(outcomes)
-    verdict = replace(found.verdict, word="refuted") if change.worse else found.verdict
+    verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
     first = sentence(change, outcomes)
-    lines = (
-        *([first] if first else []),
-        *found.lines,
-        *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks),
-    )
-    summaries = [outcome.summaries for outcome in outcomes]
-    content = as_json(found.search, verdict, found.fit, found.left_out, recordings, summaries)
-    content["holdout_change"] = {"before": change.before, "after": change.after, "sigma": change.sigma}
-    return Identification(found.search, verdict, found.left_out, found.fit, tuple(outcomes), lines, content)
+    remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
+    lines = (*([first] if first else []), *identified.lines, *remarks)
+    whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), lines=lines)
+    content = {**as_json(whole, recordings), "holdout_change": asdict(change)}
+    return replace(whole, content=content)
 
 
-ROWS = 4096  # means of a prediction that are compared, at most
+NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
+MAX_MEANS = 4096  # of a prediction that are compared
 SURE = 1.645  # deviations: one-sided, 95 %
 
 
@@ -173,7 +163,7 @@ class ErrorChange:
 
 
 def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
-    """Return how the error changes.
+    """Return the change of the error.
 
     With e the error before and s the change of the prediction, the sum of squares grows by s's + 2 s'e. Its deviation
     is 2 sqrt(s' Omega s), Omega what the periodogram of e says, smooth and falling: slow noise that happens to run
@@ -194,7 +184,7 @@ def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
 
 
 def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
-    """Return what is to be said first of a prediction that gets worse; nothing where it does not by half a percent."""
+    """Return the first sentence about a prediction that gets worse; nothing where it does not by half a percent."""
     if not change.after > 1.005 * change.before:
         return ""
     unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
@@ -208,15 +198,15 @@ def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
 
 
 def _means(values: Array) -> Array:
-    """Return values (N, d) as at most `ROWS` means."""
-    length = max(1, -(-len(values) // ROWS))
+    """Return values (N, d) as at most `MAX_MEANS` means."""
+    length = max(1, -(-len(values) // MAX_MEANS))
     starts = np.arange(0, len(values), length)
     sizes = np.diff(np.append(starts, len(values)))
     return np.asarray(np.add.reduceat(values, starts, axis=0) / sizes[:, None]) if len(values) else values
 
 
 def _variance(e: Array, s: Array) -> float:
-    """Return s' Omega s of signals (n,), Omega as the periodogram of e, its mean among it, says."""
+    """Return s' Omega s of signals (n,), Omega by the periodogram of e, its mean among it."""
     n = len(e)
     counted = np.full(n // 2 + 1, 2.0)
     counted[0] = 1.0
@@ -224,31 +214,28 @@ def _variance(e: Array, s: Array) -> float:
     return float(np.sum(counted * omega * np.abs(np.fft.rfft(s)) ** 2) / n)
 
 
-def as_json(
-    found: Search,
-    verdict: Diagnosis,
-    fit: Joint,
-    left_out: Sequence[LeftOut],
-    recordings: Mapping[str, Sequence[Mapping[str, Any]]],
-    summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]],
-) -> dict[str, Any]:
+def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Return the content of `loop.json`."""
-    before, after = rms(left_out)
-    unit = found.columns.evidence.unit.si
+    state, verdict = whole.search, whole.verdict
+    before, after = rms(whole.left_out)
+    unit = state.evidence.unit.si
     return {
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
         "unit": unit,
         "recordings": recordings,
-        "effects": [_effect(fit, finding, found.columns.evidence) for finding in verdict.findings],
+        "effects": [_effect(whole.fit, finding, state.evidence) for finding in verdict.findings],
         "rejected": [
             {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
              "parameters": parameters(trial.term.effect), **_evidence(trial)}
             for trial in verdict.rejected
         ],
-        "same": [{"name": name, "same_as": other} for name, other in found.same.items()],
-        "left_out_plugins": _left_out(found),
+        "same": [{"name": name, "same_as": other} for name, other in state.same.items()],
+        "left_out_plugins": [
+            *({"kind": kind, "reason": f"broken: {reason}"} for kind, reason in state.broken.items()),
+            *({"kind": kind, "reason": "not wanted"} for kind in sorted(state.without)),
+        ],
         "unexplained": [
             {"channel": s.channel, "time_scale_s": s.time_scale, "description": s.description,
              "log_likelihood_gain": s.gain, "threshold": s.threshold}
@@ -259,17 +246,11 @@ def as_json(
             {"description": e.description, "separates": list(e.separates), "expected_gain_nats": e.gain}
             for e in verdict.experiments
         ],
-        "candidates_tried": found.tried,
+        "candidates_tried": state.tried,
         "left_out": {"before": before, "after": after},
-        "before": _errors([before for before, _ in summaries], unit),
-        "after": _errors([after for _, after in summaries], unit),
+        "before": _errors([outcome.summaries[0] for outcome in whole.outcomes], unit),
+        "after": _errors([outcome.summaries[1] for outcome in whole.outcomes], unit),
     }  # fmt: skip
-
-
-def _left_out(found: Search) -> list[dict[str, str]]:
-    """Return which kinds of effects were not tried, and why."""
-    broken = [{"kind": kind, "reason": f"broken: {reason}"} for kind, reason in found.broken.items()]
-    return [*broken, *({"kind": kind, "reason": "not wanted"} for kind in sorted(found.without))]
 
 
 def _evidence(trial: Trial) -> dict[str, float]:
@@ -280,27 +261,15 @@ def _evidence(trial: Trial) -> dict[str, float]:
         "heldout_gain": e.left_out,
         "log_likelihood_gain": e.gain + e.price,
         "threshold": GAIN + e.price,
-        "fast_gain": min(e.chance, BEYOND),
+        "fast_gain": min(e.chance, MAX_NATS),
         "fast_threshold": CHANCE + e.price,
     }
 
 
 def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
-    content = effect.model_dump(mode="json", exclude_none=True)
-    skip = {
-        "kind",
-        "axes",
-        "coefficients",
-        "sigma",
-        "estimate",
-        "channel",
-        "channels",
-        "initial",
-        "domain",
-        "regressors",
-    }
-    return {name: _short(value) for name, value in content.items() if name not in skip}
+    content = effect.model_dump(mode="json", exclude_none=True, exclude={*Effect.model_fields, *NO_PARAMETERS})
+    return {name: _short(value) for name, value in content.items()}
 
 
 def _short(value: Any) -> str:
@@ -315,7 +284,7 @@ def _short(value: Any) -> str:
 
 
 def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
-    """Return what is known of an effect; its size is half of what it moves the bias by on each axis, SI."""
+    """Return an effect for programs; its size is half of what it moves the bias by on each axis, SI."""
     effect, bias = fit.effects[finding.place], evidence.unit.si
     sizes = {"size": fit.sizes[finding.place], "size_sigma": fit.sizes_sigma[finding.place]}
     labels = effect.labels
@@ -361,20 +330,20 @@ def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
 
 def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
-    found: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
-    return found
+    errors: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
+    return errors
 
 
-def summary(found: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
+def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     """Return the verdict in sentences."""
     lines = []
     for finding in verdict.findings:
-        lines += _found(found, finding, fit)
+        lines += _of_finding(search, finding, fit)
     for structure in verdict.left:
         lines.append(f"unexplained: {structure.description}")
     for trial in verdict.promising:
         lines.append(
-            f"{described(trial.term.effect)}: not added, it {predicts(found, trial)}, with "
+            f"{described(trial.term.effect)}: not added, it {predicts(search, trial)}, with "
             f"{nats(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
             "another recording would tell"
         )
@@ -383,17 +352,17 @@ def summary(found: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
         lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
     named = {name_of(finding.effect) for finding in verdict.findings}
-    lines += [f"{name}: the same here as {other}" for name, other in found.same.items() if other not in named]
-    lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in found.broken.items()]
+    lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
+    lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
     if verdict.word == "nothing_missing":
-        lines.append(f"no effect of {found.tried} candidates has enough evidence, and what is left looks like noise")
+        lines.append(f"no effect of {search.tried} candidates has enough evidence, and what is left looks like noise")
     return lines
 
 
-def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
+def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
     evidence, name = finding.trial.evidence, name_of(finding.effect)
     lines = [
-        f"{described(finding.effect)}: {size(found, finding, fit)}; {predicts(found, finding.trial)}; "
+        f"{described(finding.effect)}: {size(search, finding, fit)}; {predicts(search, finding.trial)}; "
         f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
     ]
     if not evidence.fast:
@@ -405,36 +374,28 @@ def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
     return lines
 
 
-def size(found: Search, finding: Finding, fit: Joint) -> str:
+def size(search: Search, finding: Finding, fit: Joint) -> str:
     """Return half of what an effect moves the bias by on each axis, as `x ±12.1 (sigma 0.2) deg/h`."""
-    evidence = found.columns.evidence
-    own = (values[finding.place] * evidence.unit.factor for values in (fit.sizes, fit.sizes_sigma))
-    axes = zip(evidence.axes, *own, strict=True)
-    return ", ".join(f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in axes) + (
-        f" {evidence.unit.shown}"
-    )
+    axes, unit = search.evidence.axes, search.evidence.unit
+    own = (values[finding.place] * unit.factor for values in (fit.sizes, fit.sizes_sigma))
+    each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
+    return f"{', '.join(each)} {unit.shown}"
 
 
-def predicts(found: Search, trial: Trial) -> str:
-    """Return how much better left-out parts are predicted, geometric mean over the axes."""
-    ratio = float(np.sqrt(trial.evidence.ratio))
-    unit = found.columns.evidence.unit
-    after = left_out_error(found, trial) * unit.factor
-    part = "recordings" if len(found.columns.evidence.records) > 1 else "parts"
+def predicts(search: Search, trial: Trial) -> str:
+    """Return the gain in the prediction of left-out parts, geometric mean over the axes."""
+    ratio, unit, columns = float(np.sqrt(trial.evidence.ratio)), search.evidence.unit, search.columns
+    rows = sum(part.rows.stop - part.window.stop for part in search.left_out)
+    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * columns.scale[columns.y[search.axes]]
+    after = float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300))))) * unit.factor
+    part = "recordings" if len(search.evidence.records) > 1 else "parts"
     better = f"{100 * abs(1 - ratio):.0f} % {'better' if ratio < 1 else 'worse'}"
     return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} {unit.shown})"
 
 
 def nats(gain: float) -> str:
-    """Return evidence in words; what is less likely than the least number of a computer is said to be so."""
-    return f"{gain:.0f} nats" if gain < BEYOND else f"more than {BEYOND:.0f} nats"
-
-
-def left_out_error(found: Search, trial: Trial) -> float:
-    """Return the rms error of a candidate on left-out parts, geometric mean over the axes, SI."""
-    rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
-    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y[found.axes]]
-    return float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300)))))
+    """Return evidence in words, up to the largest that a computer's numbers can tell."""
+    return f"{gain:.0f} nats" if gain < MAX_NATS else f"more than {MAX_NATS:.0f} nats"
 
 
 def described(effect: Effect) -> str:

@@ -1,8 +1,7 @@
-"""A search in progress: the model so far with its noise, and what was tried beside it."""
+"""A search in progress: the model so far with its noise, and the trials beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,14 +9,13 @@ import numpy as np
 from driftlab.identification.acceptance import CandidateEvidence
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import LeftOutPart
-from driftlab.identification.least_squares import LeastSquares, Model, Term, slow_density
-from driftlab.noise.local_level import LocalLevel, fitted
+from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term, slow_density
+from driftlab.identification.records import Evidence, Progress
+from driftlab.noise.local_level import LocalLevel, fit_local_level
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own weight
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -28,16 +26,16 @@ class Trial:
     ----------
     model : tuple of Term
         The base, its memories as they were chosen with the candidate, and the candidate last.
-    evidence : Evidence
+    evidence : CandidateEvidence
         Its figures.
     blocks : (d, blocks) array
         Sums of squares of the left-out errors, in the columns' scale.
     likelihood : float
-        What it gains in likelihood, each side at its best noise and parameters paid for, in nats.
+        Gain in log-likelihood, each side at its best noise and parameters paid for, in nats.
     passes : bool
-        Whether it is enough.
+        Whether the evidence is enough.
     reason : str
-        What it is that is not.
+        The figure that is not enough.
     """
 
     model: Model
@@ -53,6 +51,16 @@ class Trial:
         return self.model[-1]
 
     @property
+    def name(self) -> str:
+        """Name of the candidate in messages."""
+        return name_of(self.term.effect)
+
+    @property
+    def base(self) -> Model:
+        """The model without the candidate."""
+        return self.model[:-1]
+
+    @property
     def size(self) -> int:
         """Coefficients an axis, hyper-parameters, and one more for an unknown start."""
         effect = self.term.effect
@@ -61,7 +69,7 @@ class Trial:
 
 @dataclass
 class Search:
-    """A search: the model so far, what it stands on, and what was tried.
+    """A search: the model so far, the fits that it stands on, and the trials.
 
     Attributes
     ----------
@@ -69,8 +77,8 @@ class Search:
         Fits, on all columns.
     model : tuple of Term
         The model.
-    noises : list of Noise, one an axis
-        Of what the model leaves.
+    noises : list of LocalLevel, one an axis
+        Of the model's residuals.
     added : list of (Trial, tuple of Trial)
         Each addition with its rivals, in the order of the model's terms after those that were declared.
     trials : list of Trial
@@ -82,7 +90,7 @@ class Search:
     broken : dict of str to str
         Kinds that were left out because they do not keep their contract, and how.
     same : dict of str to str
-        Names that show exactly what another shows, and that one's name: they are not tried.
+        Names whose regressors are exactly another's, and that one's name: they are not tried.
     """
 
     squares: LeastSquares
@@ -104,62 +112,68 @@ class Search:
         return self.squares.columns
 
     @property
+    def evidence(self) -> Evidence:
+        """The recordings."""
+        return self.columns.evidence
+
+    @property
     def everything(self) -> tuple[int, ...]:
         """All segments."""
         return self.columns.everything
 
     @property
+    def all_axes(self) -> range:
+        """The axes of the sensor."""
+        return range(len(self.columns.y))
+
+    @property
     def axes(self) -> list[int]:
-        """The axes on which anything was measured: one that shows a constant says nothing of any model."""
+        """The axes on which anything was measured: a constant is no evidence for any model."""
         columns = self.columns
         return [axis for axis, y in enumerate(columns.y) if np.any(columns.W[:, y])] or [0]
 
+    def fit(self, model: Model, axis: int) -> AxisFit:
+        """Fit a model on one axis over all recordings."""
+        return self.squares.fit(model, axis, self.everything)
+
+    def residuals(self, model: Model) -> list[Array]:
+        """Return the residual (n,) of a model on each axis, in the columns' scale."""
+        return [self.squares.residual(axis, self.fit(model, axis)) for axis in self.all_axes]
+
     def fresh(self) -> None:
         """Work out smoothing and noise for the present model."""
+        for axis in self.all_axes:
+            self.squares.smoothing[axis] = self._smoothing(axis)
         self.squares.forget()
-        slices = self.columns.evidence.slices
-        self.noises = []
-        for axis in range(len(self.columns.y)):
-            self.squares.smoothing[axis] = smoothing_of(self, axis)
-            fit = self.squares.fit(self.model, axis, self.everything)
-            residual = self.squares.residual(axis, fit)
-            split = [residual[rows] for rows in slices]
-            self.squares.colour[axis] = slow_density(split) / max(float(np.mean(residual**2)), 1e-300)
+        for axis, residual in enumerate(self.residuals(self.model)):
+            slow = slow_density(self.evidence.split(residual))
+            self.squares.colour[axis] = slow / max(float(np.mean(residual**2)), 1e-300)
         self.squares.forget()
-        self.noises = noises_of(self, self.model)
+        self.noises = self.noises_of(self.model)
 
+    def noises_of(self, model: Model) -> list[LocalLevel]:
+        """Return the noise of a model's residual on each axis."""
+        return [fit_local_level(self.evidence.split(residual)) for residual in self.residuals(model)]
 
-def noises_of(found: Search, model: Model) -> list[LocalLevel]:
-    """Return the noise of what a model leaves on each axis."""
-    squares, slices = found.squares, found.columns.evidence.slices
-    found_noises = []
-    for axis in range(len(found.columns.y)):
-        residual = squares.residual(axis, squares.fit(model, axis, found.everything))
-        found_noises.append(fitted([residual[rows] for rows in slices]))
-    return found_noises
-
-
-def smoothing_of(found: Search, axis: int) -> float:
-    """Return the weight of the map's penalty that predicts left-out segments best, the map fitted without them."""
-    squares, columns = found.squares, found.columns
-    if not np.any(columns.penalty):
-        return 0.0
-    costs = []
-    for weight in SMOOTHING:
-        squares.smoothing[axis] = weight
-        squares.forget()
-        total = 0.0
-        for k, segment in enumerate(columns.segments):
-            rest = tuple(j for j in found.everything if j != k)
-            fit = squares.fit(found.model, axis, rest)
-            e = columns.W[segment.rows, columns.y[axis]] - columns.W[segment.rows][:, fit.cols] @ fit.beta
-            total += float(np.sum((e - e.mean()) ** 2))
-        costs.append(total)
-    squares.forget()
-    return float(SMOOTHING[int(np.argmin(costs))])
+    def _smoothing(self, axis: int) -> float:
+        """Return the weight of the map's penalty that predicts left-out segments best, the map fitted without them."""
+        squares, columns = self.squares, self.columns
+        if not np.any(columns.penalty):
+            return 0.0
+        costs = []
+        for weight in SMOOTHING:
+            squares.smoothing[axis] = weight
+            squares.forget()
+            total = 0.0
+            for k, segment in enumerate(columns.segments):
+                fit = squares.fit(self.model, axis, columns.all_but(k))
+                e = columns.W[segment.rows, columns.y[axis]] - columns.W[segment.rows][:, fit.cols] @ fit.beta
+                total += float(np.sum((e - e.mean()) ** 2))
+            costs.append(total)
+        return float(SMOOTHING[int(np.argmin(costs))])
 
 
 def name_of(effect: Effect) -> str:
-    """Return what tells an effect from others in messages: its kind, and what it is about."""
+    """Return the name of an effect in messages: its kind, and its channel."""
     subject = effect.subject
     return effect.kind if subject in ("time", "temperature") else f"{effect.kind} of {subject}"

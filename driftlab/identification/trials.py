@@ -24,18 +24,16 @@ import numpy as np
 from driftlab.identification.acceptance import CandidateEvidence, accept, fast_evidence
 from driftlab.identification.candidates import Family, family_of
 from driftlab.identification.columns import EffectRegressors
-from driftlab.identification.cross_validation import error
 from driftlab.identification.least_squares import LeastSquares, Model, Term
-from driftlab.identification.normal_equations import Indices, left_with_starts
-from driftlab.identification.state import Search, Trial, noises_of
+from driftlab.identification.normal_equations import left_with_starts
+from driftlab.identification.prediction_errors import Errors, left_out_errors
+from driftlab.identification.state import Search, Trial
 from driftlab.noise.local_level import LocalLevel, effective
 from fusion_core.chunk import Array
 
-WORTH = 0.97  # of the sum of squares in the fit itself: what gains less is not left out
+WORTH = 0.97  # of the sum of squares in the fit itself: a candidate that gains less is not cross-validated
 AS_GOOD = 3.0  # nats: less likely by less than 20 times
 BLOCKS = 6  # of each part, for the uncertainty of a left-out error
-
-Errors = list[list[Array]]  # of each part, of each axis
 
 
 def difference(trial: Trial, other: Trial) -> float:
@@ -50,93 +48,84 @@ def uncertainty(trial: Trial, other: Trial) -> float:
 
 
 def as_good(trial: Trial, chosen: Trial) -> bool:
-    """Return whether neither left-out errors nor likelihood tell a trial from the one that was chosen."""
+    """Whether neither left-out errors nor likelihood tell a trial from the chosen one."""
     close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
     return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def contains(columns: EffectRegressors, wide: Term, term: Term) -> bool:
-    """Return whether a term's columns are combinations of another's, on every axis."""
+    """Whether a term's columns are combinations of another's, on every axis."""
     if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
         return False
     pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
     return all(columns.within(inner, outer) for inner, outer in pairs)
 
 
-def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
+def tried(search: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
     """Return the trial of each family beside a base."""
     for terms in families.values():  # columns are made by one thread
         for term in terms:
-            found.columns.of(term.effect)
-            found.columns.of_map([term.effect])
-    for segments in {found.everything, *(part.rest for part in found.left_out)}:
-        found.columns.gram(segments)
+            search.columns.of(term.effect)
+            search.columns.of_map([term.effect])
+    for segments in {search.everything, *(part.rest for part in search.left_out)}:
+        search.columns.gram(segments)
     tunings: dict[tuple[Model, tuple[int, ...]], Tuning] = {}
-    without = left_out_errors(found, [base] * len(found.left_out), found.noises)
+    without = left_out_errors(search, [base] * len(search.left_out), search.noises)
 
     def work(terms: list[Term]) -> Trial:
-        slots = [k for k, term in enumerate(base) if _retuned(found, term, terms[0])]
-        kept = tuple(term for k, term in enumerate(base) if k not in slots)
-        choices = [[*families.get(family_of(found, base[k]), []), base[k]] for k in slots] + [terms]
+        slots = [k for k, term in enumerate(base) if _retuned(search, term, terms[0])]
+        fixed = tuple(term for k, term in enumerate(base) if k not in slots)
+        choices = [[*families.get(family_of(search, base[k]), []), base[k]] for k in slots] + [terms]
 
         def chosen(segments: tuple[int, ...]) -> Model:
-            key = kept, segments
+            key = fixed, segments
             if key not in tunings:
-                tunings[key] = Tuning(found.squares, kept, segments)
+                tunings[key] = Tuning(search.squares, fixed, segments)
             anew = best(tunings[key], choices)
             place = dict(zip(slots, anew, strict=False))
             return (*(place.get(k, term) for k, term in enumerate(base)), anew[-1])
 
-        model = chosen(found.everything)
-        noises = noises_of(found, model)
-        gained = _in_sample(found, base, model)
-        if gained > WORTH:
-            return _not_worth_it(found, base, model, noises, gained)
-        errors = left_out_errors(found, [chosen(part.rest) for part in found.left_out], noises)
-        return _trial(found, base, model, noises, without, errors)
+        model = chosen(search.everything)
+        noises, ratio = search.noises_of(model), _in_sample(search, base, model)
+        if ratio > WORTH:
+            return _not_worth_it(search, base, model, noises, ratio)
+        errors = left_out_errors(search, [chosen(part.rest) for part in search.left_out], noises)
+        return _trial(search, base, model, noises, without, errors)
 
     with ThreadPoolExecutor(cpu_count() or 1) as pool:
         return list(pool.map(work, families.values()))
 
 
-def _in_sample(found: Search, base: Model, model: Model) -> float:
-    """Return the ratio of what two models leave of the recordings that they are fitted to, mean over the axes."""
-    fits = [[found.squares.fit(one, axis, found.everything).cost for axis in found.axes] for one in (model, base)]
+def _in_sample(search: Search, base: Model, model: Model) -> float:
+    """Return the ratio of the costs of two fits on all recordings, mean over the axes."""
+    fits = [[search.fit(one, axis).cost for axis in search.axes] for one in (model, base)]
     costs = np.log(np.maximum(fits, 1e-300))
     return float(np.exp(np.mean(costs[0] - costs[1])))
 
 
-def _not_worth_it(found: Search, base: Model, model: Model, noises: list[LocalLevel], ratio: float) -> Trial:
-    """Return the trial of a candidate that hardly fits what it is fitted to: nothing is left out to judge it."""
-    price = float(np.log(max(found.tried, 1)))
-    evidence = CandidateEvidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
+def _not_worth_it(search: Search, base: Model, model: Model, noises: list[LocalLevel], ratio: float) -> Trial:
+    """Return the trial of a candidate that hardly fits the recordings themselves: it is not cross-validated."""
+    price = float(np.log(max(search.tried, 1)))
+    evidence = CandidateEvidence(ratio, 0.0, len(search.left_out), 1.0, bool(base), -price, 0.0, -price, price)
     reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
-    blocks = np.ones((len(found.axes), BLOCKS * len(found.left_out)))
-    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
+    blocks = np.ones((len(search.axes), BLOCKS * len(search.left_out)))
+    return Trial(model, evidence, blocks, _likelihood(search, model, noises), passes=False, reason=reason)
 
 
-def _retuned(found: Search, term: Term, candidate: Term) -> bool:
-    """Return whether a term of the base is to be chosen anew with a candidate: both have a memory."""
-    both = [found.columns.of(t.effect).starts is not None for t in (term, candidate)]
-    return all(both) and term not in found.declared and not term.effect.acts_on_input
-
-
-def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[LocalLevel]) -> Errors:
-    """Return the errors of the predictions of all parts, by a model for each of them."""
-    return [
-        [error(found.squares, model, axis, part, noises[axis]) for axis in range(len(found.columns.y))]
-        for model, part in zip(models, found.left_out, strict=True)
-    ]
+def _retuned(search: Search, term: Term, candidate: Term) -> bool:
+    """Whether a term of the base is to be chosen anew with a candidate: both have a memory."""
+    both = [search.columns.of(t.effect).starts is not None for t in (term, candidate)]
+    return all(both) and term not in search.declared and not term.effect.acts_on_input
 
 
 def _trial(
-    found: Search, base: Model, model: Model, noises: list[LocalLevel], without: Errors, errors: Errors
+    search: Search, base: Model, model: Model, noises: list[LocalLevel], without: Errors, errors: Errors
 ) -> Trial:
     """Judge a candidate by its left-out errors and its matched filter."""
-    price = float(np.log(max(found.tried, 1)))
+    price = float(np.log(max(search.tried, 1)))
     effect = model[-1].effect
     left_out, logs, by_part = 0.0, [], []
-    for axis in found.axes:
+    for axis in search.axes:
         squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
         squares = np.maximum(squares, 1e-300)
         total = squares.sum(axis=1)
@@ -148,16 +137,16 @@ def _trial(
         )
         left_out -= n / 4 * logs[-1]
     ratio = float(np.exp(np.mean(logs)))
-    chance, gain = fast_evidence(found.squares, model[:-1], model[-1], noises)
+    chance, gain = fast_evidence(search.squares, model[:-1], model[-1], noises)
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
-    poorest = max((float(np.exp(s)) for s, part in zip(steps, found.left_out, strict=True) if part.whole), default=0.0)
+    whole = [float(np.exp(step)) for step, part in zip(steps, search.left_out, strict=True) if part.whole]
     evidence = CandidateEvidence(
-        ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price
+        ratio, steady, len(steps), max(whole, default=0.0), bool(base), left_out - price, chance, gain - price, price
     )
-    named = {name for term in found.model for name in term.effect.requires}
+    named = {name for term in search.model for name in term.effect.requires}
     passes, reason = accept(effect, evidence, named)
-    return Trial(model, evidence, blocks_of(errors, found.axes), _likelihood(found, model, noises), passes, reason)
+    return Trial(model, evidence, blocks_of(errors, search.axes), _likelihood(search, model, noises), passes, reason)
 
 
 def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:
@@ -168,13 +157,13 @@ def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:
     ])  # fmt: skip
 
 
-def _likelihood(found: Search, model: Model, noises: Sequence[LocalLevel]) -> float:
+def _likelihood(search: Search, model: Model, noises: Sequence[LocalLevel]) -> float:
     """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
-    n, axes = len(found.columns.evidence), found.axes
-    gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
+    n, axes = len(search.evidence), search.axes
+    gain = sum(0.5 * n * float(np.log(search.noises[axis].variance / noises[axis].variance)) for axis in axes)
     term = model[-1]
-    starts = len(found.columns.levels) if term.free else 0
-    number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
+    starts = len(search.columns.levels) if term.free else 0
+    number = sum(len(search.columns.of(term.effect).columns[axis]) + starts for axis in axes)
     return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
 
 
@@ -183,13 +172,11 @@ class Tuning:
 
     def __init__(self, squares: LeastSquares, base: Model, segments: tuple[int, ...]) -> None:
         self.squares, self.base, self.segments = squares, base, segments
-        columns = squares.columns
-        G = columns.gram(segments)
-        self.size = G.shape[0]
-        self.rows = squares.rows(segments)
+        self.axes, self.rows = range(len(squares.columns.y)), squares.rows(segments)
+        G = squares.columns.gram(segments)
         self._reduced: list[Array] = []
         known: dict[bytes, Array] = {}
-        for axis in range(len(columns.y)):
+        for axis in self.axes:
             fit = squares.fit(base, axis, segments)
             key = fit.cols.tobytes() + fit.equations.A.tobytes()
             if key not in known:  # axes whose columns are alike share it
@@ -198,21 +185,16 @@ class Tuning:
 
     def cost(self, terms: Sequence[Term]) -> float:
         """Return n/2 log of the sum of squares that the terms leave beside the base, summed over the axes (nats)."""
-        return (
-            0.5
-            * self.rows
-            * sum(float(np.log(max(self._left(terms, axis), 1e-300))) for axis in range(len(self.squares.columns.y)))
-        )
+        logs = (float(np.log(max(self._left(terms, axis), 1e-300))) for axis in self.axes)
+        return 0.5 * self.rows * sum(logs)
 
     def _left(self, terms: Sequence[Term], axis: int) -> float:
         columns, squares = self.squares.columns, self.squares
         if any(term.effect.acts_on_input for term in terms):
             return squares.fit((*self.base, *terms), axis, self.segments).cost
-        own: list[Indices] = [columns.of(term.effect).columns[axis] for term in terms]
         starts = [squares.starts(term, self.segments) for term in terms]
-        sizes = np.array([len(s) for s in starts])
-        cols = np.concatenate([*own, *starts])
-        colour = float(squares.colour[axis])
+        cols = np.concatenate([*(columns.of(term.effect).columns[axis] for term in terms), *starts])
+        sizes, colour = np.array([len(s) for s in starts]), float(squares.colour[axis])
         return float(left_with_starts(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
 
 
@@ -220,7 +202,7 @@ def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
     """Return one term of each family, those of least cost together, by coordinate descent from several starts."""
     if len(choices) == 1:
         return (min(choices[0], key=lambda term: tuning.cost((term,))),)
-    found: list[tuple[float, tuple[Term, ...]]] = []
+    ends: list[tuple[float, tuple[Term, ...]]] = []
     for share in (0.15, 0.5, 0.85):
         chosen = [family[int(share * (len(family) - 1))] for family in choices[:-1]]
         chosen.append(min(choices[-1], key=lambda term: tuning.cost((*chosen, term))))
@@ -232,5 +214,5 @@ def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
             if lower >= cost - 1e-9:
                 break
             cost = lower
-        found.append((cost, tuple(chosen)))
-    return min(found, key=lambda pair: pair[0])[1]
+        ends.append((cost, tuple(chosen)))
+    return min(ends, key=lambda pair: pair[0])[1]

@@ -217,7 +217,7 @@ class GrowingMap:
         if blocks.samples:
             # readings with steps show no temperature between two levels; the last fit knows of those
             T = blocks.blocks().T if soak is None or soak.steps.size == 0.0 else soak.T
-            self.status = with_coverage(self.status, T, blocks.seen, blocks.samples)
+            self.status = with_coverage(self.status, T, blocks.ends, blocks.samples)
         return self.status
 
 

@@ -1,16 +1,16 @@
-"""How good a fitted map is, in numbers and in words.
+"""Assessment of a fitted map, in numbers and in words.
 
-The deviation that is said is that of the curve over its domain, all temperatures alike, a misfit included. Where up and
+Its deviation is that of the curve over its domain, all temperatures alike, a misfit included. Where up and
 down differ by D(T), half of it is either branch's distance from the curve between them; p is how probable a memory is,
 one that is seen and one that is not excluded alike::
 
     good^2 = mean over T of  sigma(T)^2 + p E[(D(T) / 2)^2]
 
-The level is not in it: what the bias has in the mean over the fit is learnt anew at every alignment. d axes.
+The level is not in it: the mean of the bias over the fit is learnt anew at every alignment. d axes.
 
-What a soak has seen of the temperatures: where there are few samples or none, and how long each way took.
+Coverage of the temperatures by a soak: where there are few samples or none, and how long each way took.
 
-What placements told, and what one more would tell, in words and in numbers.
+Placements of a unit: the levels and scale factors that they determine, and the placement that would determine more.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.filtering.segment import runs
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
@@ -36,21 +38,21 @@ GRID = 400
 
 @dataclass(frozen=True, eq=False)
 class MapVerdict:
-    """What can be said of a map and of the soak it was fitted on.
+    """Quality of a map and of the soak it was fitted on.
 
     Attributes
     ----------
     fitted : FittedMap
     settings : ThermalMap
         It was fitted with.
-    soak : Soak
+    soak : SoakSummary
     axes : tuple of str
-    memory : Memory
+    memory : MemoryVerdict
         Whether the bias remembers which temperatures came before.
     placements : Placements or None
-        What the placements of a unit told, where its input is known by its length alone.
+        Of the unit, where its input is known by its length alone.
     used : Used or None
-        How much of the soak is used; None where that is not known.
+        Share of the soak that is used; None where that is not known.
     """
 
     fitted: FittedMap
@@ -63,7 +65,7 @@ class MapVerdict:
 
     @cached_property
     def map(self) -> FittedMap:
-        """The map with what the soak said of memories in its record, for those who judge by its file."""
+        """The map with the soak's evidence for memories in its record, for those who judge by its file."""
         record = self.fitted.record.model_copy(update={"memory": self.memory.as_json()})
         return replace(self.fitted, record=record)
 
@@ -97,26 +99,27 @@ class MapVerdict:
     def sentences(self, unit: BiasUnit) -> list[str]:
         """Return the verdict in words, the decisive one first: that much of the soak is not used, where it is so."""
         unused = "" if self.used is None else self.used.sentence()
-        bent, differ = self._misfits(unit), [memory_sentence(self.memory, self.axes, unit)]
-        told = [] if self.placements is None else sentences(self.placements, self.axes, unit)
-        good, *more = self._good(unit)
-        return [*([unused] if unused else []), good, *differ, *more, *told, *bent, *self._coverage(unit)]
+        placements = [] if self.placements is None else sentences(self.placements, self.axes, unit)
+        good, *level = self._good(unit)
+        lines = [unused] if unused else []
+        lines += [good, memory_sentence(self.memory, self.axes, unit), *level, *placements]
+        return [*lines, *self._misfits(unit), *self._coverage(unit)]
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers, in SI."""
-        record = self.fitted.record
-        found: dict[str, Any] = {"white_noise": self.soak.white.tolist(), "coverage": self.coverage.as_json()}
+        numbers: dict[str, Any] = {"white_noise": self.soak.white.tolist(), "coverage": self.coverage.as_json()}
         if self.used is not None:
-            found["unused"] = self.used.as_json()
+            numbers["unused"] = self.used.as_json()
         if self.placements is not None:
-            found["placements"] = as_json(self.placements, self.axes)
+            numbers["placements"] = as_json(self.placements, self.axes)
         if self.good is not None and self.sigma is not None:
-            k = np.argmax(self.sigma, axis=0)
-            found["sigma"] = {"rms": self.good.tolist(), "worst": self.sigma.max(axis=0).tolist()}
-            found["sigma"]["worst_at_degC"] = self.T[k].tolist()
-        if record.error is not None:
-            found["misfits"] = [dict(m.model_dump(), axis=self.axes[m.axis]) for m in record.error.misfits]
-        return found | {"memory": self.memory.as_json()}
+            worst = self.T[np.argmax(self.sigma, axis=0)].tolist()
+            largest = self.sigma.max(axis=0).tolist()
+            numbers["sigma"] = {"rms": self.good.tolist(), "worst": largest, "worst_at_degC": worst}
+        if self.fitted.record.error is not None:
+            misfits = self.fitted.record.error.misfits
+            numbers["misfits"] = [dict(m.model_dump(), axis=self.axes[m.axis]) for m in misfits]
+        return numbers | {"memory": self.memory.as_json()}
 
     def _good(self, unit: BiasUnit) -> list[str]:
         low, high = self.fitted.domain
@@ -145,35 +148,30 @@ class MapVerdict:
         return [good, f"its level is not in that: {level}"]
 
     def _misfits(self, unit: BiasUnit) -> list[str]:
-        error, advice = self.fitted.record.error, self.settings.advice
-        found = sorted(() if error is None else error.misfits, key=lambda misfit: -misfit.left)
-        if not found:
-            return []
-        each = [
-            f"{self.axes[m.axis]} bends at {m.T:.3g} °C more than {self.settings.description} can "
-            f"({text(m.left * unit.factor)} {unit.shown} left, {text(m.noise * unit.factor)} is noise)"
-            for m in found[:1]
-        ] + [
-            f"{self.axes[m.axis]} at {m.T:.3g} °C ({text(m.left * unit.factor)} left, "
-            f"{text(m.noise * unit.factor)} is noise)"
-            for m in found[1:]
-        ]
+        error = self.fitted.record.error
+        each: list[str] = []
+        for m in sorted(() if error is None else error.misfits, key=lambda misfit: -misfit.left):
+            axis, left, noise = self.axes[m.axis], text(m.left * unit.factor), text(m.noise * unit.factor)
+            if each:
+                each.append(f"{axis} at {m.T:.3g} °C ({left} left, {noise} is noise)")
+            else:
+                bends = f"{axis} bends at {m.T:.3g} °C more than {self.settings.description} can"
+                each.append(f"{bends} ({left} {unit.shown} left, {noise} is noise)")
         when = "once it is known why up and down differ, " if self.seen else ""
-        what = advice or "a kind that bends more"
+        what = self.settings.advice or "a kind that bends more"
         whether = "`driftlab fit-map --compare` tells whether it predicts better"
-        return [f"{', '.join(each)}: {when}take {what}; {whether}"]
+        return [f"{', '.join(each)}: {when}take {what}; {whether}"] if each else []
 
     def _coverage(self, unit: BiasUnit) -> list[str]:
-        found = self.coverage
         lines = [
             f"no sample between {start:.4g} and {stop:.4g} °C{self._inside(start, stop, unit)}; "
             "record these temperatures too"
-            for start, stop in found.holes
+            for start, stop in self.coverage.holes
         ]
         lines += [
             f"few samples between {part.start:.4g} and {part.stop:.4g} °C: {part.found:.0f} a kelvin, where "
             f"{part.needed:.0f} would bring white noise alone down to the curve's deviation; stay longer there"
-            for part in found.thin
+            for part in self.coverage.thin
         ]
         return lines
 
@@ -192,14 +190,14 @@ def judge(
     placements: Placements | None = None,
     used: Used | None = None,
 ) -> MapVerdict:
-    """Return the verdict on a map that was fitted with settings on a soak, with its placements and what is used."""
+    """Return the verdict on a map that was fitted with settings on a soak, with its placements and the share used."""
     return MapVerdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
 
 
 def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit) -> str:
     """Return the answer to whether a bias remembers which temperatures came before, in words."""
-    each = [text(float(v) * unit.factor, 2) for v in memory.none_larger_than]
-    larger = f"{', '.join(f'{name} {v}' for name, v in zip(axes, each, strict=True))} {unit.shown}"
+    named = zip(axes, memory.none_larger_than, strict=True)
+    larger = f"{', '.join(f'{name} {text(float(v) * unit.factor, 2)}' for name, v in named)} {unit.shown}"
     if memory.answer == "none":
         return (
             f"no hysteresis or lag is seen between up and down; one larger than {larger}, of any kind, would have been "
@@ -220,7 +218,7 @@ def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit
 
 
 def text(value: float, digits: int = 3) -> str:
-    """Return a number as one says it: 22.6, 0.0314, 1250."""
+    """Return a number in plain digits: 22.6, 0.0314, 1250."""
     if not np.isfinite(value) or (value and not 1e-4 <= abs(value) < 1e6):
         return f"{value:.{digits}g}"
     return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
@@ -228,7 +226,7 @@ def text(value: float, digits: int = 3) -> str:
 
 WIDTH = 1.0  # K, over which samples are counted
 SPARSE = 0.2  # of the median: what is as dense as the rest is not few, however many there are
-SHORT = 0.03  # of the range: fewer samples in less than that are not spoken of
+SHORT = 0.03  # of the range: fewer samples in less than that are not reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,18 +273,18 @@ class Coverage:
 
     def as_json(self) -> dict[str, Any]:
         """Return it for programs."""
-        seen = self.density[self.density > 0]
+        some = self.density[self.density > 0]
         return {
             "share": self.share,
             "holes_degC": [list(hole) for hole in self.holes],
-            "samples_per_K": {"least": float(seen.min()), "median": float(np.median(seen))},
+            "samples_per_K": {"least": float(some.min()), "median": float(np.median(some))},
             "thin": [vars(part) for part in self.thin],
             "hours": self.hours,
         }
 
 
 def coverage_of(soak: SoakSummary, fitted: FittedMap, good: Array | None) -> Coverage:
-    """Return the coverage; `good` (d,) is what the curve is known to, where it is known."""
+    """Return the coverage; `good` (d,) is the curve's deviation, where it is known."""
     count, edges = soak.count.sum(axis=0), soak.edges
     width = float(edges[1] - edges[0]) or 1.0
     reach = np.ones(max(1, 2 * round(WIDTH / width / 2) + 1))
@@ -303,51 +301,51 @@ def _thin(soak: SoakSummary, near: Array, count: Array, good: Array) -> tuple[Th
     if not np.any(known):
         return ()
     needed = float(np.max((soak.white[known] / good[known]) ** 2))
-    edges, found = soak.edges, []
+    edges, thin = soak.edges, []
     few = min(needed, SPARSE * float(np.median(near[count > 0])))
     for start, stop in _ranges((near < few) & (count > 0), edges, SHORT):
         inside = (edges[:-1] >= start) & (edges[1:] <= stop)
-        found.append(Thin(start, stop, float(np.min(near[inside])), needed))
-    return tuple(found)
+        thin.append(Thin(start, stop, float(np.min(near[inside])), needed))
+    return tuple(thin)
 
 
 def _ranges(where: NDArray[np.bool_], edges: Array, least: float) -> list[tuple[float, float]]:
     """Return the ranges in which cells are true, as far as they are wider than `least` of all."""
-    change = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
-    pairs = zip(edges[change[::2]].tolist(), edges[change[1::2]].tolist(), strict=True)
+    pairs = [(float(edges[start]), float(edges[stop])) for start, stop in runs(where)]
     return [(a, b) for a, b in pairs if b - a > least * (edges[-1] - edges[0])]
 
 
-SEES = 0.3  # of the input, on an axis: with less its scale factor hardly shows
+VISIBLE = 0.3  # of the input, on an axis: with less its scale factor hardly shows
 CLEAR = 3.0  # deviations
 
 
-def sentences(found: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]:
-    """Return what P placements told of level and scale factor of each axis, and what they did not."""
-    return [*_levels(found, axes, unit), *_scales(found, axes), *_changes(found, axes), *_lengths(found, unit)]
+def sentences(placements: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]:
+    """Return sentences on level and scale factor of each axis, as far as P placements determine them."""
+    each = _levels(placements, axes, unit), _scales(placements, axes), _changes(placements, axes)
+    return [*chain(*each), *_lengths(placements, unit)]
 
 
-def as_json(found: Placements, axes: Sequence[str]) -> dict[str, Any]:
+def as_json(placements: Placements, axes: Sequence[str]) -> dict[str, Any]:
     """Return the numbers, in SI."""
-    levels = found.levels
+    levels = placements.levels
     each = [
         {
             "axis": axis,
             "level": levels.bias[k],
             "level_sigma": levels.sigma[k],
             "level_told": levels.level(k),
-            "scale": levels.scale[k] if levels.scale_told[k] else None,
+            "scale": levels.scale[k] if levels.scale_determined[k] else None,
             "scale_sigma": levels.scale_sigma[k],
-            "scale_change": found.changes[k].value if found.changes[k].told else None,
-            "scale_change_sigma": found.changes[k].sigma if found.changes[k].told else None,
+            "scale_change": change.value if change.determined else None,
+            "scale_change_sigma": change.sigma if change.determined else None,
         }
-        for k, axis in enumerate(axes)
+        for k, (axis, change) in enumerate(zip(axes, placements.changes, strict=True))
     ]
-    return {"up": found.up.tolist(), "axes": each}
+    return {"up": placements.up.tolist(), "axes": each}
 
 
-def _levels(found: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]:
-    levels, P = found.levels, len(found.up)
+def _levels(placements: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]:
+    levels, P = placements.levels, len(placements.up)
     count = "one placement" if P == 1 else f"{P} placements"
     lines = []
     for kind in ("told", "scale", "tilt"):
@@ -356,13 +354,11 @@ def _levels(found: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]
             continue
         names = ", ".join(axes[k] for k in own)
         sigma = levels.sigma if kind == "told" else levels.given_scale
-        each = ", ".join(
-            f"{axes[k]} {_number(levels.bias[k] * unit.factor)} ± {sigma[k] * unit.factor:.2g}" for k in own
-        )
+        each = ", ".join(f"{axes[k]} {levels.bias[k] * unit.factor:.4g} ± {sigma[k] * unit.factor:.2g}" for k in own)
         if kind == "told":
             lines.append(f"{count}: level {each} {unit.shown}")
         elif kind == "scale":
-            more = " and ".join(f"{axes[k]} {_way(found, k)}" for k in own)
+            more = " and ".join(f"{axes[k]} {_way(placements, k)}" for k in own)
             lines.append(
                 f"{count}: level {each} {unit.shown} if the scale factor is true, which may be part of it; one more "
                 f"placement{' each' if len(own) > 1 else ''} with {more} tells them apart"
@@ -375,51 +371,49 @@ def _levels(found: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]
     return lines
 
 
-def _way(found: Placements, axis: int) -> str:
-    """Return which way an axis has not been."""
-    return "down" if np.sum(found.up[:, axis]) > 0 else "up"
+def _way(placements: Placements, axis: int) -> str:
+    """Return the way in which an axis has not been."""
+    return "down" if np.sum(placements.up[:, axis]) > 0 else "up"
 
 
-def _scales(found: Placements, axes: Sequence[str]) -> list[str]:
-    levels = found.levels
+def _scales(placements: Placements, axes: Sequence[str]) -> list[str]:
+    levels = placements.levels
     each = [
         f"{axis} {100 * levels.scale[k]:+.2g} ± {100 * levels.scale_sigma[k]:.1g} %"
         for k, axis in enumerate(axes)
-        if levels.scale_told[k] and abs(levels.scale[k]) > CLEAR * levels.scale_sigma[k]
+        if levels.scale_determined[k] and abs(levels.scale[k]) > CLEAR * levels.scale_sigma[k]
     ]
     return [f"scale factor off by {', '.join(each)}: the map is of the bias alone, and leaves that"] if each else []
 
 
-def _changes(found: Placements, axes: Sequence[str]) -> list[str]:
-    """Return what is known of the scale factors over temperature."""
+def _changes(placements: Placements, axes: Sequence[str]) -> list[str]:
+    """Return sentences on the scale factors over temperature."""
     lines = []
-    told = [k for k in range(len(axes)) if found.changes[k].told]
-    moving = [k for k in told if abs(found.changes[k].value) > CLEAR * found.changes[k].sigma]
+    determined = [k for k in range(len(axes)) if placements.changes[k].determined]
+    moving = [k for k in determined if abs(placements.changes[k].value) > CLEAR * placements.changes[k].sigma]
     if moving:
-        each = ", ".join(f"{axes[k]} by {_percent(found, k)}" for k in moving)
+        sizes = [
+            f"{100 * placements.changes[k].value:+.2g} ± {100 * placements.changes[k].sigma:.1g} %" for k in moving
+        ]
+        each = ", ".join(f"{axes[k]} by {size}" for k, size in zip(moving, sizes, strict=True))
         lines.append(f"the scale factor changes from the coldest to the warmest sample, {each}: the map is without it")
-    if still := [k for k in told if k not in moving]:
-        known = max(found.changes[k].sigma for k in still)
+    if still := [k for k in determined if k not in moving]:
+        known = max(placements.changes[k].sigma for k in still)
         names = ", ".join(axes[k] for k in still)
         lines.append(
             f"no change of the scale factor of {names} with temperature is seen (known to {100 * known:.1g} %)"
         )
     for k, axis in enumerate(axes):
-        if not found.changes[k].told and np.max(np.abs(found.up[:, k])) > SEES:
+        if not placements.changes[k].determined and np.max(np.abs(placements.up[:, k])) > VISIBLE:
             lines.append(
                 f"{axis}: the change with temperature may be of its scale factor; one more placement with {axis} "
-                f"{_way(found, k)}, warmed up too, tells them apart"
+                f"{_way(placements, k)}, warmed up too, tells them apart"
             )
     return lines
 
 
-def _percent(found: Placements, axis: int) -> str:
-    change = found.changes[axis]
-    return f"{100 * change.value:+.2g} ± {100 * change.sigma:.1g} %"
-
-
-def _lengths(found: Placements, unit: BiasUnit) -> list[str]:
-    levels = found.levels
+def _lengths(placements: Placements, unit: BiasUnit) -> list[str]:
+    levels = placements.levels
     worst = int(np.argmax(np.abs(levels.lengths) / levels.expected))
     if abs(levels.lengths[worst]) <= CLEAR * levels.expected[worst]:
         return []
@@ -428,7 +422,3 @@ def _lengths(found: Placements, unit: BiasUnit) -> list[str]:
         f"the force is {off} off its length in placement {worst + 1}, more than bias and scale explain; look for "
         "axes that are not square, or motion"
     ]
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"

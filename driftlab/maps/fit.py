@@ -78,43 +78,43 @@ def fit_map(
 
 
 def fit_gathered(
-    config: Config, settings: ThermalMap, found: GatheredSoak, more: Mapping[str, str] | None = None
+    config: Config, settings: ThermalMap, soak: GatheredSoak, more: Mapping[str, str] | None = None
 ) -> FittedMap:
-    """Fit a thermal map on samples; its provenance says `more` too."""
-    about = {**found.about, **provenance(settings, found.names), **(more or {})}
+    """Fit a thermal map on samples; its provenance has `more` too."""
+    about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
     try:
-        fitted = settings.fit(found.T, found.bias, about)
+        fitted = settings.fit(soak.T, soak.bias, about)
     except (SingularFit, SwingTooSmall) as error:
-        unused = found.used.sentence()
+        unused = soak.used.sentence()
         raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
-    if found.used.low < found.used.high:
-        fitted = settings.over(fitted, (found.used.low, found.used.high))
-    if found.placements is not None:
-        fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
-    residual = residual_of(fitted, settings, found.T, found.bias, found.starts, found.interval)
-    averaged = residual.as_record(found.interval * len(found.T))
+    if soak.used.low < soak.used.high:
+        fitted = settings.over(fitted, (soak.used.low, soak.used.high))
+    if soak.placements is not None:
+        fitted = soak.placements.widened(fitted, settings.smoother(soak.T, soak.bias))
+    residual = residual_of(fitted, settings, soak.T, soak.bias, soak.starts, soak.interval)
+    averaged = residual.as_record(soak.interval * len(soak.T))
     fitted = replace(fitted, record=fitted.record.model_copy(update=averaged))
-    return of_sensor(config, of_thermometer(fitted, found.steps))
+    return of_sensor(config, of_thermometer(fitted, soak.steps))
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
-    """Return the map with a record that says of which sensor it is."""
+    """Return the map with its sensor in the record."""
     if config.filter is None:
         return fitted
     sensor = config.filter.tracked
     update: dict[str, object] = {"channel": sensor.channel, "unit": sensor.unit}
-    if sensor.axes != tuple("xyz"[: len(sensor.axes)]):  # as they are called where nothing is said
+    if sensor.axes != tuple("xyz"[: len(sensor.axes)]):  # their names where the record has none
         update["axes"] = sensor.axes
     return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
 def axes_of(fitted: FittedMap) -> tuple[str, ...]:
-    """Return what the axes of a map are called."""
+    """Return the names of the axes of a map."""
     return fitted.record.axes or tuple("xyz"[: fitted.record.d].ljust(fitted.record.d, "?"))
 
 
 def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
-    """Return what a map's file says of it: where it is from, how sure it is, what it has never seen.
+    """Return a map's file in sentences: its sensor, its deviation, temperatures without a sample.
 
     In the unit in which sentences are about `sensor`, whose map it is; where it is not known, in that of the file.
     """
@@ -147,19 +147,19 @@ class GatheredSoak:
     T, bias : (N,) and (N, d) arrays
         Temperature in degC, without the thermometer's steps, and tracked bias in SI, in the order of time.
     names : list of str
-        What the recordings are called.
+        Names of the recordings.
     starts : list of int
         Where each of them begins.
     interval : float
         Between samples, s.
     about : mapping of str to str
-        What all recordings say alike of the device.
+        Facts on the device that all recordings have alike.
     placements : Placements or None
-        What they told, where the direction of the sensor's input is not known.
+        Where the direction of the sensor's input is not known.
     windows : tuple of Chunk
         The epochs of the samples, with all that was recorded; empty where they were not to be kept.
     used : Used
-        How much of the recordings they are.
+        Share of the recordings that they are.
     steps : Steps
         Of the thermometer.
     """
@@ -176,7 +176,7 @@ class GatheredSoak:
     steps: Steps = NO_STEPS
 
     def brief(self) -> SoakSummary:
-        """Return what a verdict needs to know of them."""
+        """Return the summary that an assessment needs."""
         return brief(self.T, self.bias, self.starts, self.interval)
 
 
@@ -199,26 +199,24 @@ def gather(
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
     names = [c.source.name for c in configs if c.source is not None]
-    about = _about(configs)
-    unknown = None if config.filter is None else config.filter.length_of_input(config.site)
-    if unknown is None or np.ptp(T) == 0:
-        return GatheredSoak(T, bias, names, starts, interval, about, None, windows, used, steps)
-    first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
-    placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
-    known = np.concatenate([part.known for part in parts])
-    bias, told = placed(T, bias + known[placement], placement, *unknown)
-    starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return GatheredSoak(T, bias, names, starts, interval, about, told, windows, used, steps)
+    placements, unknown = None, None if config.filter is None else config.filter.length_of_input(config.site)
+    if unknown is not None and np.ptp(T) > 0:
+        first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
+        placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
+        known = np.concatenate([part.known for part in parts])
+        bias, placements = placed(T, bias + known[placement], placement, *unknown)
+        starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
+    return GatheredSoak(T, bias, names, starts, interval, _about(configs), placements, windows, used, steps)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
-    """Return what the recordings of configs say of the device that is tracked, where none says otherwise."""
-    said = [c.source.about(c.filter.tracked.channel) for c in configs if c.source is not None and c.filter is not None]
-    return {name: value for name, value in (said or [{}])[0].items() if all(s.get(name) == value for s in said)}
+    """Return the facts on the tracked device that the recordings of configs have alike."""
+    facts = [c.source.about(c.filter.tracked.channel) for c in configs if c.source is not None and c.filter is not None]
+    return {name: value for name, value in (facts or [{}])[0].items() if all(f.get(name) == value for f in facts)}
 
 
 def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:
-    """Return what a map's record says of its fit."""
+    """Return the provenance of a fit, for a map's record."""
     return {
         "recordings": ", ".join(Path(name).name for name in recordings),
         "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -254,29 +252,26 @@ def _samples(
     config: Config, faults: Faults, used: Used, progress: Progress | None = None, *, keep: bool = False
 ) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
-    found: list[RestStretch] = []
-    windows: list[Chunk] = []
+    stretches: list[RestStretch] = []
     times: list[Array] = []
     count, before = 0, replace(faults)
     for rest in at_rest(config, epochs(read(config, faults), interval), faults, used):
-        found.append(rest._replace(window=NOTHING))
         times.append(rest.window.t)
-        if keep:
-            windows.append(rest.window)
+        stretches.append(rest if keep else rest._replace(window=NOTHING))
         count += len(rest.T)
         if progress is not None:
             progress(faults.since(rest.t), count)
     used.read(faults, before)
-    if not found:
+    if not stretches:
         name = config.source.name if config.source else "the recording"
         section = config.filter.tracked.section if config.filter else "filter.gyro"
         raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
     # the median over the windows knows of no gap
-    ends, sizes = np.array([rest.t for rest in found]), np.array([len(rest.T) for rest in found])
-    between = float(np.median(np.diff(ends) / sizes[1:])) if len(found) > 1 else interval
-    numbers, first = np.unique([rest.placement for rest in found], return_index=True)
-    known = np.stack([np.broadcast_to(found[k].known, found[k].bias.shape)[0] for k in first])
-    placement = np.repeat([rest.placement for rest in found], sizes)
+    ends, sizes = np.array([rest.t for rest in stretches]), np.array([len(rest.T) for rest in stretches])
+    between = float(np.median(np.diff(ends) / sizes[1:])) if len(stretches) > 1 else interval
+    numbers, first = np.unique([rest.placement for rest in stretches], return_index=True)
+    known = np.stack([np.broadcast_to(stretches[k].known, stretches[k].bias.shape)[0] for k in first])
+    placement = np.repeat([rest.placement for rest in stretches], sizes)
     assert len(numbers) == placement[-1] + 1, "placements are counted from 0"
-    T, bias, t = (np.concatenate(a) for a in ([rest.T for rest in found], [rest.bias for rest in found], times))
-    return _Samples(t, T, bias, placement, known, between, windows)
+    T, bias, t = (np.concatenate(a) for a in ([rest.T for rest in stretches], [rest.bias for rest in stretches], times))
+    return _Samples(t, T, bias, placement, known, between, [rest.window for rest in stretches] if keep else [])

@@ -1,8 +1,8 @@
-"""Which kind of map a soak asks for: all that are installed, each judged on what was left out of its fit.
+"""Choice of the kind of map for a soak: all that are installed, by cross-validation.
 
-A map is fitted on the blocks of a soak (`blocks.py`) without some of its parts (`division.py`), and its error there is
-what is left of the blocks. In each part the errors are averaged in ranges of temperature, so that a long stay at one
-counts no more than another temperature, and their mean is taken off where the division says so. With w_i blocks in
+A map is fitted on the blocks of a soak (`driftlab.soak.blocks`) without some of its parts, and its error there is
+the residual of the blocks. In each part the errors are averaged in ranges of temperature, so that a long stay at one
+counts no more than another temperature, and their mean is taken off where the division asks for it. With w_i blocks in
 range i of part p, at most as many as usual::
 
     S_p = sum_i w_i r_i^2,    error^2 = sum_p S_p / sum_p w_p
@@ -12,18 +12,16 @@ and their standard error is from their scatter over the parts. Of all whose squa
 of the smallest, the simplest is chosen (Breiman et al., Classification and Regression Trees, 1984): that is the price
 for having tried many. Simple is what follows the data least, by how far a curve gives way to a known change of the
 samples (generalised degrees of freedom; Ye, J. Am. Stat. Assoc. 93 (1998) 120), and networks come last: what is linear
-in its coefficients has one best fit. K blocks, P parts, d axes.
+in its coefficients has one best fit.
 
-Which parts of a soak are left out in turn, when kinds of maps are compared.
+Division of a soak into parts: samples that follow one another are not independent. A bias that wanders over hours is
+the same in a sample and in its neighbours, so a sample drawn at random is predicted by those that it is to judge. Left
+out are, of a soak that passes its temperatures more than once, contiguous parts of time: a map learns their
+temperatures from another time. The wandering of the bias meanwhile is taken off as one constant a part: it is no
+temperature's. Of several recordings each is left out as a whole. Of a soak that passes each temperature once, ranges of
+temperature are left out, and nothing is taken off: there the walk of the bias and the shape of the map are the same.
 
-Samples that follow one another are not independent: a bias that wanders over hours is the same in a sample and in its
-neighbours, so a sample drawn at random is predicted by what it is to judge. Left out are, of a soak that passes its
-temperatures more than once, contiguous parts of time: a map learns their temperatures from another time. What a bias
-has wandered meanwhile is taken off as one constant a part: it is no temperature's. Of several recordings each is left
-out as a whole. Of a soak that passes each temperature once, ranges of temperature are left out, and nothing is taken
-off: there the walk of the bias and the shape of the map are the same.
-
-K blocks (`blocks.py`).
+K blocks, P parts, d axes.
 """
 
 from __future__ import annotations
@@ -32,6 +30,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import cpu_count
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +57,7 @@ class Tried:
     settings : ThermalMap or None
         None: no map, a constant.
     rms : (d,) array
-        Left-out error of each axis, in SI.
+        Left-out error of each axis, in SI; NaN where it failed.
     error, sigma : float
         Over all axes, and its standard error.
     more, more_sigma : float
@@ -88,7 +87,7 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class KindComparison:
-    """What was tried on blocks T (K,), bias (K, d), the chosen one, the one with the smallest error, and no map."""
+    """Kinds tried on blocks T (K,), bias (K, d), the chosen one, the one with the smallest error, and no map."""
 
     tried: tuple[Tried, ...]
     chosen: Tried
@@ -120,23 +119,23 @@ class ErrorScale:
         return cls(cell, np.minimum(count, np.median(count)), keys // ERROR_RANGES, division)
 
     def means(self, left: Array) -> Array:
-        """Return the means (cells, d) of what is left of the blocks (K, d)."""
+        """Return the means (cells, d) of the residuals of the blocks (K, d)."""
         inside = self.cell >= 0
         count = np.bincount(self.cell[inside])
         return np.stack([np.bincount(self.cell[inside], column[inside]) / count for column in left.T], axis=1)
 
     def levelled(self, left: Array) -> Array:
-        """Return what is left (K, d) without the constants of the levels, NaN where it is not scored."""
-        found = np.where(self.division.scored[:, None], left, np.nan)
+        """Return residuals (K, d) without the constants of the levels, NaN where they are not scored."""
+        scored = np.where(self.division.scored[:, None], left, np.nan)
         if not self.division.levels:
-            return found
+            return scored
         cells = self.means(left)
         level_of_cell = np.zeros(len(cells), dtype=np.int64)
         level_of_cell[self.cell[self.cell >= 0]] = self.division.level[self.cell >= 0]
         for level in np.unique(level_of_cell):
             own = level_of_cell == level
-            found[self.division.level == level] -= np.average(cells[own], axis=0, weights=self.weight[own])
-        return found
+            scored[self.division.level == level] -= np.average(cells[own], axis=0, weights=self.weight[own])
+        return scored
 
     def squares(self, left: Array) -> tuple[Array, Array]:
         """Return S (P, d) of the parts and their weight (P,)."""
@@ -150,23 +149,41 @@ def candidates(named: Sequence[ThermalMap], classes: Iterable[type[Plugin]]) -> 
 
     A kind that the config names has the config's settings, any other its defaults.
     """
-    found: list[ThermalMap | str] = []
+    to_try: list[ThermalMap | str] = []
     for cls in classes:
         kind = str(cls.model_fields["kind"].default)
         try:
             own = next((settings for settings in named if settings.kind == kind), None)
             settings = own or cls.model_validate({"kind": kind})
             assert isinstance(settings, ThermalMap)
-            found += settings.variants()
+            to_try += settings.variants()
         except (FusionError, ValueError) as error:
-            found.append(f"{kind}: {' '.join(str(error).split())}")
-    return found
+            to_try.append(f"{kind}: {' '.join(str(error).split())}")
+    return to_try
+
+
+Job = TypeVar("Job")
+Fit = TypeVar("Fit")
+
+
+def side_by_side(fit: Callable[[Job], Fit], jobs: Sequence[Job], progress: Progress | None) -> list[Fit]:
+    """Return the fits of all jobs, several at once; `progress` is called with the fits done, and their number."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    fits = []
+    # the matrices are too small to be divided among cores: a fit a core is faster
+    with threadpool_limits(1), ThreadPoolExecutor(min(4, cpu_count() or 1)) as pool:
+        for done, fitted in enumerate(pool.map(fit, jobs), start=1):
+            fits.append(fitted)
+            if progress is not None:
+                progress(done, len(jobs))
+    return fits
 
 
 def compare(
     tried: Sequence[ThermalMap | str], T: Array, bias: Array, division: Division, progress: Progress | None = None
 ) -> KindComparison:
-    """Judge every kind on what is left out of blocks T (K,), bias (K, d), and choose one.
+    """Cross-validate every kind on blocks T (K,), bias (K, d), and choose one.
 
     `progress`, where given, is called with the fits done, and their number.
 
@@ -175,12 +192,15 @@ def compare(
     ConfigError
         If no kind can be fitted.
     """
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     scale, folds = ErrorScale.of(T, division), [k for k in np.unique(division.fold) if k >= 0]
     settings = [one for one in tried if isinstance(one, ThermalMap)]
-    jobs = [(one, fold) for one in sorted(settings, key=_slow) for fold in [*folds, None]]
-    found: dict[int, dict[int | None, FittedMap | str]] = {id(one): {} for one in settings}
+    # networks first: they take longest
+    jobs = [
+        (one, fold)
+        for one in sorted(settings, key=lambda one: not isinstance(one, NetworkMap))
+        for fold in [*folds, None]
+    ]
+    fits: dict[int, dict[int | None, FittedMap | str]] = {id(one): {} for one in settings}
 
     def fit(job: tuple[ThermalMap, int | None]) -> FittedMap | str:
         inside = slice(None) if job[1] is None else division.fold != job[1]
@@ -189,25 +209,16 @@ def compare(
         except FusionError as error:
             return str(error) if job[1] is None else f"with a part left out, {error}"
 
-    # the matrices are too small to be divided among cores: a fit a core is faster
-    with threadpool_limits(1), ThreadPoolExecutor(min(4, cpu_count() or 1)) as pool:
-        for done, (job, fitted) in enumerate(zip(jobs, pool.map(fit, jobs), strict=True), start=1):
-            found[id(job[0])][job[1]] = fitted
-            if progress is not None:
-                progress(done, len(jobs))
+    for (one, fold), fitted in zip(jobs, side_by_side(fit, jobs, progress), strict=True):
+        fits[id(one)][fold] = fitted
     rows = [
-        _row(name, one, found.get(id(one), {}), T, bias, scale)
-        for name, one in zip(names_of(tried), tried, strict=True)
+        _row(name, one, fits.get(id(one), {}), T, bias, scale) for name, one in zip(names_of(tried), tried, strict=True)
     ]
     return _chosen(rows, T, bias, scale)
 
 
-def _slow(settings: ThermalMap) -> bool:
-    return not isinstance(settings, NetworkMap)
-
-
 def names_of(tried: Sequence[ThermalMap | str]) -> list[str]:
-    """Return what settings are called: the kind, and the fields in which they differ from others of the kind."""
+    """Return the names of settings: the kind, and the fields in which they differ from others of the kind."""
     names = []
     for one in tried:
         if isinstance(one, str):
@@ -222,10 +233,8 @@ def names_of(tried: Sequence[ThermalMap | str]) -> list[str]:
 def _row(
     name: str, one: ThermalMap | str, fits: dict[int | None, FittedMap | str], T: Array, bias: Array, scale: ErrorScale
 ) -> Tried:
-    nothing = np.full(bias.shape[1], np.nan)
-    if isinstance(one, str):
-        return Tried(name, None, nothing, np.nan, np.nan, failed=one)
-    failed = next((fit for fit in fits.values() if isinstance(fit, str)), "")
+    settings, failed = (None, one) if isinstance(one, str) else (one, "")
+    failed = failed or next((fit for fit in fits.values() if isinstance(fit, str)), "")
     left = np.zeros_like(bias)
     try:
         for fold, fitted in fits.items():
@@ -235,10 +244,10 @@ def _row(
     except FusionError as error:
         failed = str(error)
     if failed:
-        return Tried(name, one, nothing, np.nan, np.nan, failed=failed)
+        return Tried(name, settings, np.full(bias.shape[1], np.nan), np.nan, np.nan, failed=failed)
     whole = fits[None]
     assert isinstance(whole, FittedMap)
-    return _scored(name, one, whole, scale.levelled(left), scale)
+    return _scored(name, settings, whole, scale.levelled(left), scale)
 
 
 def _scored(name: str, settings: ThermalMap | None, fitted: FittedMap | None, left: Array, scale: ErrorScale) -> Tried:
@@ -264,7 +273,7 @@ def _chosen(rows: list[Tried], T: Array, bias: Array, scale: ErrorScale) -> Kind
     assert best.left is not None
     S_best, w = scale.squares(best.left)
     without = _scored("no map", None, None, scale.levelled(bias - bias.mean(axis=0)), scale)
-    enough: list[Tried] = []
+    as_good: list[Tried] = []
     for k, row in enumerate(rows):
         if row.failed or row.left is None:
             continue
@@ -272,8 +281,8 @@ def _chosen(rows: list[Tried], T: Array, bias: Array, scale: ErrorScale) -> Kind
         excess, sigma = float(D.sum() / w.sum()), _spread(D, w)
         rows[k] = replace(row, more=row.error - best.error, more_sigma=sigma / ((row.error + best.error) or 1.0))
         if excess <= sigma or row.error <= best.error + NEGLIGIBLE * without.error:
-            enough.append(rows[k])
-    simplest = {row.settings.kind: row for row in reversed(enough) if row.settings is not None}
+            as_good.append(rows[k])
+    simplest = {row.settings.kind: row for row in reversed(as_good) if row.settings is not None}
     known = {kind: replace(row, freedom=_freedom(row, T, bias)) for kind, row in simplest.items()}
     rows = [next((own for kind, own in known.items() if simplest[kind] is row), row) for row in rows]
     chosen = min(known.values(), key=lambda row: (isinstance(row.settings, NetworkMap), row.freedom))
@@ -296,25 +305,25 @@ SWEEPS = 6  # with that many, each is a part
 TURN = 0.25  # of the range: a smaller way back is no turn
 FOLD_RANGES, FOLDS = 25, 5  # of temperature, where each is passed once
 NEAR = 0.025  # of the range: what is further from any other sample is not scored
-ENOUGH = 0.5  # share of the blocks to be scored
+MIN_SHARE = 0.5  # of the blocks to be scored
 
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """What is left out together, and what is scored.
+    """Division of K blocks for cross-validation.
 
     Attributes
     ----------
     fold : (K,) array
-        Which blocks are left out together; -1: never.
+        Number of the fold: its blocks are left out together; -1: never.
     part : (K,) array
-        Whose errors stand for one another; where `levels`, each has a constant of its own.
+        Number of the part: its errors stand for one another.
     scored : (K,) array of bool
-        Blocks whose temperature is also in what was not left out with them.
+        Blocks whose temperature is also among those that were not left out with them.
     levels : bool
         Whether a constant is taken off each level.
     level : (K,) array
-        Which blocks share a constant.
+        Number of the level: its blocks share a constant.
     what : str
         The parts, in words.
     """
@@ -333,21 +342,21 @@ class Division:
 
 
 def divide(recordings: Sequence[Array]) -> Division:
-    """Return how to divide recordings, of which T (K_r,) are the blocks in the order of time."""
+    """Return the division of recordings, of which T (K_r,) are the blocks in the order of time."""
     T = np.concatenate(recordings)
     sizes = np.array([len(own) for own in recordings])
     recording = np.repeat(np.arange(len(sizes)), sizes)
     sweeps = _numbered([sweeps_of(own, TURN * np.ptp(T)) for own in recordings])
     pieces = _pieces(sweeps)
     if len(recordings) > 1:
-        found = _division(T, recording, pieces, recording, f"each of {len(recordings)} recordings")
-        if found.share >= ENOUGH:
-            return found
+        by_recording = _division(T, recording, pieces, recording, f"each of {len(recordings)} recordings")
+        if by_recording.share >= MIN_SHARE:
+            return by_recording
     count = int(sweeps[-1]) + 1
     passes = f"{count} sweep" + "s" * (count > 1)
     what = f"each of {passes}" if count >= SWEEPS else f"{pieces[-1] + 1} parts of time of {passes}"
-    found = _division(T, pieces, pieces, pieces, what)
-    return found if found.share >= ENOUGH else _ranges(T)
+    by_time = _division(T, pieces, pieces, pieces, what)
+    return by_time if by_time.share >= MIN_SHARE else _ranges(T)
 
 
 def _pieces(sweeps: Index) -> Index:

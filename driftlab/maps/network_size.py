@@ -1,4 +1,4 @@
-"""How many neurons a network needs: the selection of section 5 of the paper, on one soak.
+"""Number of neurons that a network needs: the selection of section 5 of the paper, on one soak.
 
 The samples are drawn at random into 65 % for training, 20 % for validation and 15 % for testing. For each size n one
 network of the bias and one of its derivative (`target: slope`) are fitted on the first part. Then, eq. (12):
@@ -23,14 +23,13 @@ as a slow drift, is in all three: only another recording shows it. Source: Fonta
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
+from driftlab.maps.kind_selection import Progress, side_by_side
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, NetworkMap, Target, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
@@ -40,8 +39,8 @@ Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 PARTS = {"training": 0.65, "validation": 0.20, "test": 0.15}
 BINS = 50  # of the temperatures of the soak
-_FEWEST = 200  # samples to divide
-_NEGLIGIBLE = 1e-3  # of the Sr without a map
+MIN_SAMPLES = 200  # to divide
+NEGLIGIBLE = 1e-3  # of the Sr without a map
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class Convergence:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What was tried and chosen. The last three are rms over the test part, an axis each, in SI/K."""
+    """The networks that were tried, and the choice; the last three are rms over the test part (d,), in SI/K."""
 
     bias: Convergence
     slope: Convergence
@@ -83,7 +82,7 @@ class BinnedPart:
     bin: Indices
 
     def residual(self, fitted: FittedMap | None) -> BinResidual:
-        """Return the means of what a map leaves; None is a constant."""
+        """Return the means of a map's residual; None is a constant."""
         left = self.bias - (self.bias.mean(axis=0) if fitted is None else fitted.bias(self.T))
         count = np.bincount(self.bin, minlength=BINS)
         full = count > 0
@@ -96,7 +95,7 @@ class BinnedPart:
 
 @dataclass(frozen=True, eq=False)
 class BinResidual:
-    """What is left in the bins: mean T (m,), mean residual r (m, d), samples N (m,), sigma (d,) of one sample."""
+    """Residual in the bins: mean T (m,), mean residual r (m, d), samples N (m,), sigma (d,) of one sample."""
 
     T: Array
     r: Array
@@ -144,7 +143,7 @@ def select(
     bias: Array,
     neurons: Iterable[int] = range(1, 11),
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Selection:
     """Find how many neurons a network needs, for the bias and for its derivative.
 
@@ -169,8 +168,8 @@ def select(
         If the soak cannot be divided, or does not determine the smallest network.
     """
     settings, sizes = _network(settings), _sizes(neurons)
-    if len(T) < _FEWEST:
-        raise EmptyRecording(f"selection: has {len(T)} samples, expected at least {_FEWEST}; use a longer soak")
+    if len(T) < MIN_SAMPLES:
+        raise EmptyRecording(f"selection: has {len(T)} samples, expected at least {MIN_SAMPLES}; use a longer soak")
     bins = np.minimum(((T - T.min()) * (BINS / (np.ptp(T) or 1.0))).astype(np.intp), BINS - 1)
     parts = [BinnedPart(T[k], bias[k], bins[k]) for k in split(len(T), seed)]
     maps = _fit_all(settings, sizes, parts[0], progress)
@@ -213,11 +212,9 @@ def _sizes(neurons: Iterable[int]) -> tuple[int, ...]:
 
 
 def _fit_all(
-    settings: NetworkMap, sizes: tuple[int, ...], part: BinnedPart, progress: Callable[[int, int], None] | None
+    settings: NetworkMap, sizes: tuple[int, ...], part: BinnedPart, progress: Progress | None
 ) -> dict[Key, FittedMap]:
     """Fit every size for both targets, side by side; those with more weights than temperatures are left out."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     targets: tuple[Target, ...] = ("bias", "slope")
 
     def fit(key: Key) -> FittedMap | None:
@@ -231,15 +228,8 @@ def _fit_all(
             return None
 
     keys = sorted(product(targets, sizes), key=lambda key: -key[1])  # the long ones first
-    found = {}
-    # the matrices are too small to be divided among cores: a network a core is faster
-    with threadpool_limits(1), ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for done, (key, fitted) in enumerate(zip(keys, pool.map(fit, keys), strict=True), start=1):
-            if fitted is not None:
-                found[key] = fitted
-            if progress is not None:
-                progress(done, len(keys))
-    return found
+    fits = zip(keys, side_by_side(fit, keys, progress), strict=True)
+    return {key: fitted for key, fitted in fits if fitted is not None}
 
 
 def _convergence(
@@ -247,7 +237,7 @@ def _convergence(
 ) -> Convergence:
     Sr = np.array([[residual.Sr(target) for residual in left[target, n]] for n in sizes])
     best = int(np.argmin(Sr[:, 1]))
-    slack = max(2 * left[target, sizes[best]][1].error(target), _NEGLIGIBLE * without.Sr(target))
+    slack = max(2 * left[target, sizes[best]][1].error(target), NEGLIGIBLE * without.Sr(target))
     limit = float(Sr[best, 1] + slack)
     noise = np.array([residual.noise(target) for residual in left[target, sizes[best]]])
     return Convergence(target, sizes, Sr, noise, limit, sizes[int(np.argmax(Sr[:, 1] <= limit))])
@@ -256,9 +246,9 @@ def _convergence(
 def settings_selected(
     settings: ThermalMap, T: Array, bias: Array, neurons: Iterable[int], progress: Callable[..., None] | None = None
 ) -> tuple[NetworkMap, Selection, str]:
-    """Return the settings with the size that was found for samples, how, and what a map's provenance says of it.
+    """Return the settings with the chosen size for samples, the selection, and its text in a map's provenance.
 
-    `progress`, where given, is called with texts. Raises what `select` raises.
+    `progress`, where given, is called with texts. Raises as `select` does.
     """
     network, sizes = _network(settings), _sizes(neurons)
 
@@ -267,10 +257,10 @@ def settings_selected(
             progress(f"{done} of {count} networks trained")
 
     report(0, 2 * len(sizes))
-    found = select(network, T, bias, sizes, progress=report)
-    chosen = found.of(network.target).chosen
-    tried = f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}"
-    return network.model_copy(update={"neurons": chosen}), found, tried
+    selection = select(network, T, bias, sizes, progress=report)
+    chosen = selection.of(network.target).chosen
+    tried = f"{chosen} neurons of {selection.bias.neurons[0]} to {selection.bias.neurons[-1]}"
+    return network.model_copy(update={"neurons": chosen}), selection, tried
 
 
 def check_selection(settings: ThermalMap, neurons: Iterable[int]) -> None:

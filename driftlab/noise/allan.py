@@ -1,4 +1,4 @@
-"""Allan and Hadamard deviations by cumulative sums, over the stretches of a recording that have no gap.
+"""Allan and Hadamard deviations by cumulative sums, over stretches without a gap, short gaps bridged.
 
 With the angle (or velocity) x_k = dt sum of the samples of a stretch up to k, mean removed, and tau = m dt::
 
@@ -8,42 +8,51 @@ With the angle (or velocity) x_k = dt sum of the samples of a stretch up to k, m
 The mean is over all differences that lie within one stretch, of all stretches that have at least 3 m samples: so each
 stretch has the weight of its differences, and the level at which it begins does not matter.
 
+An average over m places of the time grid counts where at least PRESENT of its samples are there, and is their mean; so
+short gaps are bridged. With the means a_i of neighbouring windows that all count::
+
+    allan^2(tau)    = mean of (a_2 - a_1)^2 / 2                hadamard^2(tau) = mean of (a_3 - 2 a_2 + a_1)^2 / 6
+
+No window reaches over a long gap, and windows of fewer than 1 / (1 - PRESENT) places are whole. White noise of n
+samples has the variance m / n of a whole window, and an integrating sensor's quantisation enters at both sides of a
+gap: how much larger the two terms become is counted.
+
 Sources: IEEE Std 952, annex C; W. J. Riley, NIST Special Publication 1065, sections 5.2.4 and 5.2.10.
 
-N samples, S stretches, J averaging times.
+N samples, S stretches without a gap, P spans of such stretches, G groups of spans of like length, J averaging times;
+the order of a difference is 0 for the second, 1 for the third.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from driftlab.noise.allan_gaps import bridged, places, spans
-from driftlab.noise.allan_model import AllanCurve
+from driftlab.noise.allan_model import PRESENT, AllanCurve, Bridge, Index, octaves
 from fusion_core.chunk import Array
-
-Index = NDArray[np.int64]
+from fusion_core.model import Flags
 
 PER_DECADE = 10  # averaging times; nearer ones are so correlated that they show nothing more
-LEAST = 3  # averaging times that all differences cover: a fewer-than-three-fold mean says nothing
+COVERED = 3  # averaging times that all differences cover: a fewer-than-three-fold mean says nothing
 ORDER = 3  # of the Hadamard difference: averaging times in the shortest stretch that counts
 FINE = 64  # overlaps in one averaging time; more of them are so alike that the mean does not move
 LONG = 2**20  # samples up to which every overlap is taken all the same
+REACH = 0.45  # of an averaging time: differences nearer than that tell the same, at white noise and at walks
+Sums = tuple[Array, Index, Index, Index]
 
 
 def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
     """Return the numbers m of samples to average over, evenly spread on a logarithmic scale.
 
     They go from 1 to a fifth of a single stretch; of several, `lengths` (S,), to the longest averaging time whose
-    differences cover LEAST of it, in stretches of at least ORDER of it.
+    differences cover COVERED of it, in stretches of at least ORDER of it.
     """
     N, n = np.unique(lengths, return_counts=True)
     low, high = 1, max(1, int(N[-1]) // ORDER)
     while low < high:
         m = (low + high + 1) // 2
         long = ORDER * m <= N
-        enough = int(n[long] @ (N[long] - 2 * m)) >= LEAST * m
+        enough = int(n[long] @ (N[long] - 2 * m)) >= COVERED * m
         low, high = (m, high) if enough else (low, m - 1)
     count = int(np.ceil(np.log10(low) * per_decade)) + 1
     return np.unique(np.rint(np.geomspace(1, low, count)).astype(np.int64))
@@ -70,10 +79,7 @@ def curve(
     if stretches is None:
         stretches = np.array([[0, len(rate)]])
     if missing is not None:
-        lengths = np.diff(stretches, axis=1)[:, 0]
-        parts = spans(lengths, missing)
-        whole = places(lengths, missing, parts)
-        parts, whole = parts[whole >= ORDER], whole[whole >= ORDER]
+        parts, whole = bridgeable(np.diff(stretches, axis=1)[:, 0], missing)
         ends = np.stack([stretches[parts[:, 0], 0], stretches[parts[:, 1] - 1, 1]], axis=1)
         if np.any(np.diff(ends, axis=1)[:, 0] < whole):
             return _bridged(rate, dt, m, (stretches, missing, parts, whole))
@@ -81,7 +87,10 @@ def curve(
     lengths = np.diff(stretches, axis=1)[:, 0]
     m, stride = _sizes(factors(lengths) if m is None else m, int(np.sum(lengths)))
     x, begins = _sums(rate, stretches, dt)
-    thinned = {int(s): (x, begins) if s == 1 else _thinned(x, begins, s) for s in np.unique(stride)}
+    thinned = {1: (x, begins)}
+    for s in set(stride.tolist()) - {1}:
+        rows, few = _thinned_rows(begins, s)
+        thinned[s] = x[rows], few
     squares = np.array([_mean_squares(*thinned[int(s)], int(k // s)) for k, s in zip(m, stride, strict=True)])
     tau: Array = np.asarray(m * dt, dtype=np.float64)
     deviations = np.sqrt(squares / [2.0, 6.0]) / tau[:, None]
@@ -96,10 +105,10 @@ def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, 
     squares, bridge = bridged(rate, stretches, missing, parts, m, stride)
     second, third = bridge.differences
     # where m was rounded to the stride it may be a little longer than `factors` has it
-    kept = third > 0 if wanted else (second >= 0.8 * LEAST * m) & (third >= m / 2)
-    deviations = np.sqrt(squares[kept] / [2.0, 6.0])
-    tau: Array = np.asarray(m[kept] * dt, dtype=np.float64)
-    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[kept], whole, dt, bridge.of(kept))
+    enough = third > 0 if wanted else (second >= 0.8 * COVERED * m) & (third >= m / 2)
+    deviations = np.sqrt(squares[enough] / [2.0, 6.0])
+    tau: Array = np.asarray(m[enough] * dt, dtype=np.float64)
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[enough], whole, dt, bridge.of(enough))
 
 
 def _sizes(m: Index, N: int) -> tuple[Index, Index]:
@@ -141,16 +150,16 @@ def _sums(rate: Array, stretches: Index, dt: float) -> tuple[Array, Index]:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _thinned(x: Array, places: Index, stride: int) -> tuple[Array, Index]:
-    """Return every so-manyth x of each stretch, and where each begins."""
-    kept = np.zeros_like(places)
-    for i in range(len(places) - 1):
-        kept[i + 1] = kept[i] + (places[i + 1] - places[i] + stride - 1) // stride
-    found = np.empty(kept[-1])
-    for i in range(len(places) - 1):
-        for k in range(kept[i + 1] - kept[i]):
-            found[kept[i] + k] = x[places[i] + k * stride]
-    return found, kept
+def _thinned_rows(edges: Index, stride: int) -> tuple[Index, Index]:
+    """Return every so-manyth row between edges (S + 1,), from each on, and the edges of these rows."""
+    few = np.zeros_like(edges)
+    for i in range(len(edges) - 1):
+        few[i + 1] = few[i] + (edges[i + 1] - edges[i] + stride - 1) // stride
+    rows = np.empty(few[-1], dtype=np.int64)
+    for i in range(len(edges) - 1):
+        for k in range(few[i + 1] - few[i]):
+            rows[few[i] + k] = edges[i] + k * stride
+    return rows, few
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc"})  # type: ignore[untyped-decorator]
@@ -175,3 +184,208 @@ def _mean_squares(x: Array, places: Index, m: int) -> tuple[float, float]:
         seconds += second
         thirds += third
     return squares / seconds, cubes / thirds
+
+
+def spans(lengths: Index, missing: Index) -> Index:
+    """Return first stretch and end (P, 2) of the spans between gaps that no window can bridge.
+
+    A gap is within a span where some interval around it has PRESENT of its samples. Such intervals cover a span at
+    most twice, so it has at least 80 % of its samples: the time grid never is much longer than the recording.
+
+    Parameters
+    ----------
+    lengths : (S,) array of int
+        Samples of each stretch.
+    missing : (S - 1,) array of int
+        Samples lost behind each stretch but the last.
+    """
+    lost = np.minimum(missing, np.sum(lengths)) * PRESENT / (1 - PRESENT)
+    after = np.cumsum(lengths - np.concatenate([[0.0], lost]))
+    least = np.minimum.accumulate(after - lengths)[:-1]
+    most = np.maximum.accumulate(after[::-1])[::-1][1:]
+    edges = np.concatenate([[0], np.flatnonzero(most < least - 1e-6) + 1, [len(lengths)]])
+    return np.stack([edges[:-1], edges[1:]], axis=1).astype(np.int64)
+
+
+def places(lengths: Index, missing: Index, parts: Index) -> Index:
+    """Return the places of the time grid in each span (P,), lost samples included."""
+    if not len(parts):
+        return np.empty(0, dtype=np.int64)
+    behind = np.append(missing, 0)
+    behind[parts[:, 1] - 1] = 0
+    return np.asarray(np.add.reduceat(lengths + behind, parts[:, 0]), dtype=np.int64)
+
+
+def bridgeable(lengths: Index, missing: Index) -> tuple[Index, Index]:
+    """Return the spans (P, 2) that are long enough for a difference, and their places (P,)."""
+    parts = spans(lengths, missing)
+    whole = places(lengths, missing, parts)
+    return parts[whole >= ORDER], whole[whole >= ORDER]
+
+
+def bridged(
+    rate: Array, stretches: Index, missing: Index, parts: Index, m: Index, stride: Index
+) -> tuple[Array, Bridge]:
+    """Return mean squares (J, 2) of the differences of means over m places, second and third, and their basis.
+
+    Parameters
+    ----------
+    stretches : (S, 2) array of int
+        First row of each stretch of `rate` (N,), and the row after its last.
+    missing : (S - 1,) array of int
+        Samples lost behind each stretch but the last.
+    parts : (P, 2) array of int
+        First stretch of each span, and the stretch after its last.
+    m, stride : (J,) arrays of int
+        Places to average over, and which overlaps are taken: m is a multiple.
+    """
+    lengths = np.diff(stretches, axis=1)[:, 0]
+    whole = places(lengths, missing, parts)
+    group = octaves(whole)
+    full = _bridged_sums(rate, stretches, np.append(missing, 0), parts, whole)
+    thinned = {1: full}
+    for s in set(stride.tolist()) - {1}:
+        rows, few = _thinned_rows(full[3], s)
+        thinned[s] = full[0][rows], full[1][rows], full[2][rows], few
+    sums, stands = np.zeros((len(m), 2, 3)), np.zeros((len(m), 2))
+    taken = np.zeros((len(m), 2, 4, int(group.max()) + 1))
+    for j, (size, s) in enumerate(zip(m.tolist(), stride.tolist(), strict=True)):
+        least = int(np.ceil(PRESENT * size - 1e-9))
+        stands[j] = _window(thinned[s], (size // s, size, least, int(REACH * size / s)), group, sums[j], taken[j])
+    count = np.sum(taken[:, :, 0], axis=2)
+    mean = sums / np.maximum(count, 1)[:, :, None]
+    ratio = taken[:, :, ::2] / np.maximum(taken[:, :, 1::2], 1)
+    inner = np.concatenate([missing[a : b - 1] for a, b in parts])
+    bridge = Bridge(
+        stretches=np.concatenate([lengths[a:b] for a, b in parts]),
+        gaps=inner[inner > 0],
+        differences=(count * stride[:, None]).T,
+        white=(mean[:, :, 1] * m[:, None] / [2, 6]).T,
+        angle=(mean[:, :, 2] * m[:, None].astype(np.float64) ** 2 / [6, 20]).T,
+        part=ratio[:, :, 0].transpose(1, 2, 0),
+        square=ratio[:, :, 1].transpose(1, 2, 0),
+        pieces=stands[:, 0].astype(np.int64),
+        samples=stands[:, 1].astype(np.int64),
+    )
+    return mean[:, :, 0], bridge
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, whole: Index) -> Sums:
+    """Return sums over one span after the other, a zero before each, and where each begins (P + 1,).
+
+    They are of the samples less their mean, of samples that are there, and of runs of such: twice their number, and
+    one more where the sample before and the one behind belong to the same run.
+    """
+    edges = np.zeros(len(whole) + 1, dtype=np.int64)
+    for i in range(len(whole)):
+        edges[i + 1] = edges[i] + whole[i] + 1
+    x, count, runs = np.zeros(edges[-1]), np.zeros(edges[-1], dtype=np.int32), np.zeros(edges[-1], dtype=np.int32)
+    for i in range(len(parts)):
+        level, mean, n = rate[stretches[parts[i, 0], 0]], 0.0, 0
+        for s in range(parts[i, 0], parts[i, 1]):
+            for k in range(stretches[s, 0], stretches[s, 1]):
+                mean += rate[k] - level
+                n += 1
+        mean /= n
+        at, begun, joined = edges[i], 0, False
+        for s in range(parts[i, 0], parts[i, 1]):
+            for k in range(stretches[s, 0], stretches[s, 1]):
+                runs[at] = 2 * begun + joined
+                begun += not joined
+                joined = True
+                x[at + 1] = x[at] + (rate[k] - level - mean)
+                count[at + 1] = count[at] + 1
+                at += 1
+            lost = behind[s] if s + 1 < parts[i, 1] else 0
+            for _ in range(lost):
+                runs[at] = 2 * begun
+                joined = False
+                x[at + 1] = x[at]
+                count[at + 1] = count[at]
+                at += 1
+        runs[at] = 2 * begun
+    return x, count, runs, edges
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _number(runs: Index, a: int, b: int) -> int:
+    """Return the number of runs of samples in the window from a to b; one that began before it, too."""
+    return int((runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _window(grid: Sums, sizes: tuple[int, int, int, int], group: Index, sums: Array, taken: Array) -> tuple[int, int]:
+    """Add up the differences over m places; return the pieces that they cover without a break, and their samples.
+
+    To `sums` (2, 3) go squares, and the variances of white noise and of the angle's; to `taken` (2, 4, G) how many
+    differences count, how many there would be without a gap, and of both the pairs of them within `reach`.
+    """
+    x, count, runs, edges = grid
+    m, size, least, reach = sizes
+    pieces = samples = 0
+    inverse = 1 / np.arange(least, size + 1)
+    for i in range(len(edges) - 1):
+        start, n = edges[i], edges[i + 1] - edges[i]
+        if n <= 3 * m:
+            continue
+        covered = start - 1
+        seconds, thirds = np.zeros(n - 2 * m, dtype=np.bool_), np.zeros(n - 3 * m, dtype=np.bool_)
+        for k in range(start, start + n - 2 * m):
+            a, b, c = k, k + m, k + 2 * m
+            n_1, n_2 = count[b] - count[a], count[c] - count[b]
+            if n_1 < least or n_2 < least:
+                continue
+            seconds[k - start] = True
+            first, second = inverse[n_1 - least], inverse[n_2 - least]
+            now = (x[c] - x[b]) * second - (x[b] - x[a]) * first
+            one, two = 2 * _number(runs, a, b) * first * first, 2 * _number(runs, b, c) * second * second
+            shared = 2 * (runs[b] & 1) * first * second
+            sums[0, 0] += now * now
+            sums[0, 1] += first + second
+            sums[0, 2] += one + two + shared
+            pieces += a > covered
+            samples += count[c] - count[max(a, covered)]
+            covered = c
+            d = c + m
+            if d >= start + n or count[d] - count[c] < least:
+                continue
+            thirds[k - start] = True
+            third = inverse[count[d] - count[c] - least]
+            later = (x[d] - x[c]) * third - (x[c] - x[b]) * second
+            sums[1, 0] += (later - now) * (later - now)
+            sums[1, 1] += first + 4 * second + third
+            sums[1, 2] += one + 4 * two + 2 * _number(runs, c, d) * third * third
+            sums[1, 2] += 2 * shared + 4 * (runs[c] & 1) * second * third
+        _add_pairs(seconds, reach, taken[0, :, group[i]])
+        _add_pairs(thirds, reach, taken[1, :, group[i]])
+    return pieces, samples
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
+    """Add to `taken` (4,) as in `_window`, of differences of which some count."""
+    n = len(counts)
+    near = min(reach, n - 1)
+    every = n + 2.0 * near * n - near * (near + 1.0)
+    valid = np.sum(counts)
+    taken[0] += valid
+    taken[1] += n
+    taken[2] += every if valid == n else _pairs(counts, near)
+    taken[3] += every
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _pairs(counts: Flags, reach: int) -> int:
+    """Return the number of pairs of differences that count at most `reach` apart, each in both orders."""
+    n, near, pairs = len(counts), 0, 0
+    for k in range(min(reach, n)):
+        near += counts[k]
+    for k in range(n):
+        if k + reach < n:
+            near += counts[k + reach]
+        if k > reach:
+            near -= counts[k - reach - 1]
+        if counts[k]:
+            pairs += near
+    return pairs

@@ -1,4 +1,4 @@
-"""The five coefficients of an Allan curve, and between which limits each must lie.
+"""Fit of the five coefficients of an Allan curve, with their limits.
 
 ::
 
@@ -6,7 +6,7 @@
 
 Values: non-negative least squares, each averaging time weighted by its effective degrees of freedom under the fitted
 model itself, iterated. Neighbouring averaging times share nearly all their samples, so the scatter of the fit about the
-curve says nothing of its error. The limits are found by asking which values would have made such an estimate likely
+curve says nothing of its error. The limits are those of the values under which such an estimate would have been likely
 (Neyman's construction): curves are drawn under a trial value and fitted alike.
 
 J averaging times, p <= 5 coefficients.
@@ -33,7 +33,7 @@ LEFT = 15  # averaging times that are left to a fit at least
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The five coefficients in SI in the order of KEYS, and their 95 % limits; zero where the data show none.
+    """The five coefficients in SI in the order of KEYS, and their 95 % limits; zero where none is significant.
 
     `spread` (J,) is the relative standard deviation of the Allan deviation at each averaging time; the fit begins at
     the averaging time number `first`. `best` is the fit itself, with terms in it that are not certain.
@@ -60,26 +60,25 @@ def fit(curve: AllanCurve) -> Coefficients:
         return Coefficients(zero, zero, zero, np.zeros_like(curve.tau), zero, notes=[note])
     whole = design(curve, hadamard=False)
     first = _begin(whole, curve.allan**2, curve.dt)
-    found = _limits(whole.since(first), curve.allan[first:] ** 2, list(range(5)))
-    straight = _limits(design(curve, hadamard=True).since(first), curve.hadamard[first:] ** 2, [WALK])
-    value, low, high = found.value, found.low, found.high
+    allan = _limits(whole.since(first), curve.allan[first:] ** 2, list(range(5)))
+    hadamard = _limits(design(curve, hadamard=True).since(first), curve.hadamard[first:] ** 2, [WALK])
+    value, low, high = allan.value, allan.low, allan.high
     notes = []
-    if low[RAMP] > 0 or low[WALK] > straight.high[WALK]:
-        seen = "a rate ramp shows" if low[RAMP] > 0 else "Allan and Hadamard curves disagree on the walk"
-        for own, other in ((value, straight.value), (low, straight.low), (high, straight.high)):
-            own[WALK] = other[WALK]
+    if low[RAMP] > 0 or low[WALK] > hadamard.high[WALK]:
+        why = "a rate ramp shows" if low[RAMP] > 0 else "Allan and Hadamard curves disagree on the walk"
+        value[WALK], low[WALK], high[WALK] = hadamard.value[WALK], hadamard.low[WALK], hadamard.high[WALK]
         notes.append(
-            f"{seen}: a drift (temperature, warming up) bends the long end. The walk is fitted on the Hadamard curve, "
+            f"{why}: a drift (temperature, warming up) bends the long end. The walk is fitted on the Hadamard curve, "
             "which a constant ramp does not reach; take the drift out with a thermal map"
         )
-    elif found.doubtful:
-        names = " or ".join(KEYS[k].replace("_", " ") for k in found.doubtful)
+    elif allan.doubtful:
+        names = " or ".join(KEYS[k].replace("_", " ") for k in allan.doubtful)
         notes.append(
             f"something more is there, which {names} would explain, but another term as well: reported as a limit; a "
             "longer recording tells"
         )
-    notes += _fit_notes(curve, first, found.error)
-    return Coefficients(value, low, high, whole.spread(found.theta) / 2, np.sqrt(found.theta), first, notes)
+    notes += _fit_notes(curve, first, allan.error)
+    return Coefficients(value, low, high, whole.spread(allan.theta) / 2, np.sqrt(allan.theta), first, notes)
 
 
 def _fit_notes(curve: AllanCurve, first: int, error: float) -> Iterator[str]:
@@ -135,13 +134,13 @@ def _limits(model: Design, v: Array, wanted: list[int]) -> NoiseLimits:
         trial = ProfileTrial(model, v, c, error)
         chance[c] = trial.exceeds(0.0)
         low[c], high[c] = _interval(trial, theta)
-    kept = _needed(model, v, [c for c in wanted if low[c] == 0], chance, error)
-    found = _estimate(model, v, kept, error)
+    needed = _needed(model, v, [c for c in wanted if low[c] == 0], chance, error)
+    estimate = _estimate(model, v, needed, error)
     for c in wanted:
         # the others as they are finally reported, in place of refitted to each trial value: the wider limits count
-        low[c], high[c] = _widened(ProfileTrial(model, v, c, error, found), low[c], high[c])
+        low[c], high[c] = _widened(ProfileTrial(model, v, c, error, estimate), low[c], high[c])
     value = np.zeros(5)
-    value[wanted] = np.sqrt(found[wanted])
+    value[wanted] = np.sqrt(estimate[wanted])
     doubtful = [c for c in wanted if value[c] > 0 and low[c] == 0]
     high = np.maximum(high, value)
     value[low == 0] = 0  # never a number that may as well be none
@@ -155,11 +154,11 @@ def _misfit(model: Design, v: Array, theta: Array, error: float) -> float:
 
 def _needed(model: Design, v: Array, doubtful: list[int], chance: Array, error: float) -> list[int]:
     """Return the coefficients that are left when those not needed to explain the curve go, the least likely first."""
-    kept = list(range(model.A.shape[1]))
+    needed = list(range(model.A.shape[1]))
     for c in sorted(doubtful, key=lambda c: -float(chance[c])):
-        if len(kept) > 1 and ProfileTrial(model, v, c, error, free=kept).exceeds(0.0) > TAIL:
-            kept.remove(c)
-    return kept
+        if len(needed) > 1 and ProfileTrial(model, v, c, error, free=needed).exceeds(0.0) > TAIL:
+            needed.remove(c)
+    return needed
 
 
 def _estimate(model: Design, v: Array, free: list[int], error: float, fixed: Array | None = None) -> Array:
@@ -235,13 +234,13 @@ class ProfileTrial:
 
     def exceeds(self, t: float) -> float:
         """Return the probability of an estimate as large as that of v, or larger."""
-        drawn, seen = self._estimates(t)
-        return float(np.mean(drawn >= seen))
+        drawn, measured = self._estimates(t)
+        return float(np.mean(drawn >= measured))
 
     def falls_short(self, t: float) -> float:
         """Return the probability of an estimate as small as that of v, or smaller."""
-        drawn, seen = self._estimates(t)
-        return float(np.mean(drawn <= seen))
+        drawn, measured = self._estimates(t)
+        return float(np.mean(drawn <= measured))
 
     def _estimates(self, t: float) -> tuple[Array, float]:
         model, c = self.model, self.c
@@ -254,8 +253,8 @@ class ProfileTrial:
         mean = np.maximum(model.A @ theta, 1e-9 * self.v)  # where no term is left
         weight = 1 / (mean * np.hypot(model.spread(theta), self.error))
         drawn = np.column_stack([self.v, model.draw(theta, self.error)])
-        found = _nonnegative(model.A[:, free], drawn, weight)[free.index(c)]
-        return found[1:], float(found[0])
+        estimates = _nonnegative(model.A[:, free], drawn, weight)[free.index(c)]
+        return estimates[1:], float(estimates[0])
 
 
 def _interval(trial: ProfileTrial, theta: Array) -> tuple[float, float]:
@@ -285,7 +284,7 @@ def _widened(trial: ProfileTrial, low: float, high: float) -> tuple[float, float
 
 
 def _bisect(above: Callable[[float], bool], low: float, high: float) -> float:
-    """Return where `above` turns from false to true between two positive numbers, to 2 % or so."""
+    """Return the place at which `above` turns true between two positive numbers, to 2 % or so."""
     while high > 1.02 * low:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if above(middle) else (middle, high)

@@ -1,4 +1,4 @@
-"""What the five terms of an Allan curve look like, how they scatter, and curves drawn under them.
+"""Model of an Allan curve: the shapes of its five terms, their scatter, and curves drawn under them.
 
 A deviation is the spectrum seen through a filter. So a curve is drawn as the sum over frequency bands of the spectrum
 times the filter times a gamma variate with one degree for every independent line of the periodogram in the band: all
@@ -33,7 +33,7 @@ LINES = 12  # lines of the periodogram that are bands of their own, from the low
 
 @dataclass(frozen=True)
 class Bridge:
-    """What averaging times stand on where gaps are bridged; of second differences, then of third ones.
+    """Basis of averaging times where gaps are bridged; of second differences, then of third ones.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Bridge:
     part, square : (2, G, J) arrays
         Of the differences of G groups of spans, the part that counts; and of the pairs of them that tell the same.
     pieces, samples : (J,) arrays
-        What the differences cover: how many pieces without a gap that is not bridged, and their samples.
+        Coverage of the differences: how many pieces without a gap that is not bridged, and their samples.
     """
 
     stretches: Index
@@ -166,7 +166,7 @@ class Class:
 
 @dataclass(frozen=True)
 class Design:
-    """What the five terms look like on one kind of curve.
+    """Shapes of the five terms on one kind of curve.
 
     Attributes
     ----------
@@ -271,7 +271,7 @@ def _classes(curve: AllanCurve, A: Array, order: int) -> Iterator[Class]:
 
 
 def _differences(N: Index, n: Index, m: int, order: int) -> tuple[float, float]:
-    """Return how many differences n stretches of N samples have, and the sum of their squares, each by what it tells.
+    """Return the number of differences of n stretches of N samples, and the sum of their squares, by information.
 
     The mean over one stretch has a relative variance of c / (N - ENDS m): for differences at all places, fewer than
     c / (N - order m) would have it, since those at the ends overlap less.

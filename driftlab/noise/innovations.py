@@ -1,4 +1,4 @@
-"""What noise and walk must be multiplied with, so that a run's innovations are as large as the model says.
+"""Inflation: the factors on noise and walk with which a run's innovations are as large as the model predicts.
 
 A sensor's reading d less what was predicted of its bias is a level and white noise, on each axis::
 
@@ -11,7 +11,7 @@ measured: with the score g_b of each of B parts of the run and the second deriva
     Cov(log alpha, log beta) = A^-1 (sum g_b g_b') A^-1
 
 which holds where noise is not quite white or Gaussian too (H. White, Econometrica 50 (1982) 1). Steps of one update
-decide; what the bias does over a longer time is asked apart, by the differences of adjacent means m_j over a lag L::
+decide; the bias over longer times is tested apart, by the differences of adjacent means m_j over a lag L::
 
     E (m_{j+1} - m_j)^2 = 2 (alpha noise)^2 / L + 2/3 (beta walk)^2 L
 
@@ -23,18 +23,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-from scipy import optimize, special
+from scipy import special
 
+from driftlab.noise.local_level import innovation_sums, minimum_near
 from fusion_core.chunk import Array
 from fusion_core.contracts import Factor, Inflation, Lag
 from fusion_core.errors import SingularFit
 from fusion_core.model import Flags
 
 LAGS = (10.0, 60.0, 600.0, 3600.0)  # s
-FEWEST = 8  # differences at a lag: with fewer it says nothing
-LEAST = 300  # updates
-PARTS = 16  # of a run, whose scores tell how sure the factors are
+MIN_DIFFERENCES = 8  # at a lag: with fewer it says nothing
+MIN_UPDATES = 300
+PARTS = 16  # of a run, whose scores give the deviation of the factors
 SPAN = (-25.0, 25.0)  # of log((beta / alpha)^2)
 TWO_SIDED = 1.96  # deviations: 95 %
 DROP = 1.92  # of a log-likelihood: 95 %
@@ -46,7 +46,7 @@ FALSE_ALARM = 1e-3  # of a lag: there are a dozen of them
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """Readings d (N, d) of a sensor less what was predicted of its bias; NaN where they do not count.
+    """Readings d (N, d) of a sensor less the predicted part of its bias; NaN where they do not count.
 
     `t` (N,) is the time, `tau` (N,) how long each lasted, s; `fresh` (N,) is true where the prediction starts anew.
     """
@@ -63,19 +63,19 @@ def inflation(readings: SensorReadings, noise: Array, walk: Array) -> Inflation:
     Raises
     ------
     SingularFit
-        If fewer than LEAST updates count, or a declared density is zero.
+        If fewer than MIN_UPDATES updates count, or a declared density is zero.
     """
     count = int(np.sum(np.all(np.isfinite(readings.d), axis=1)))
-    if count < LEAST:
+    if count < MIN_UPDATES:
         raise SingularFit(
-            f"inflation of the noise: only {count} updates at rest count, at least {LEAST} are needed; "
+            f"inflation of the noise: only {count} updates at rest count, at least {MIN_UPDATES} are needed; "
             "use a run of a longer recording"
         )
     if np.any(noise <= 0) or np.any(walk <= 0):
         raise SingularFit("inflation of the noise: noise or walk is declared zero; declare both larger than zero")
     axes = [_Axis(readings, k, float(noise[k]), float(walk[k])) for k in range(readings.d.shape[1])]
-    found = np.array([axis.factors() for axis in axes])  # (d, 2, 3)
-    white, walked = (Factor(*found[:, k].T) for k in (0, 1))
+    factors = np.array([axis.factors() for axis in axes])  # (d, 2, 3)
+    white, walked = (Factor(*factors[:, k].T) for k in (0, 1))
     variances = (white.value * noise) ** 2, (walked.value * walk) ** 2
     lags = [_lag(readings, L, *variances, walk) for L in LAGS]
     return Inflation(noise, walk, white, walked, tuple(lag for lag in lags if lag is not None))
@@ -89,11 +89,9 @@ class _Axis:
         self.rest = readings.tau, np.diff(readings.t, prepend=readings.t[0]), readings.fresh
         self.declared = (walk / noise) ** 2
 
-    def sums(self, log_ratio: float) -> tuple[Array, Array, Array]:
-        """Return sums (B,) of nis and log S at alpha = 1, and the count."""
-        found = np.zeros((3, PARTS))
-        _filter(self.d, *self.rest, self.declared * np.exp(log_ratio), found)
-        return found[0], found[1], found[2]
+    def sums(self, log_ratio: float) -> Array:
+        """Return sums (3, B) of nis and log S at alpha = 1, and the count."""
+        return np.asarray(innovation_sums(self.d, *self.rest, self.declared * np.exp(log_ratio), PARTS))
 
     def concentrated(self, log_ratio: float) -> tuple[float, float]:
         """Return alpha^2, and less the log-likelihood at it."""
@@ -108,16 +106,13 @@ class _Axis:
 
     def factors(self) -> Array:
         """Return value, low and high of alpha and of beta (2, 3)."""
-        grid = np.linspace(*SPAN, 26)
-        k = int(np.argmin([self.concentrated(float(v))[1] for v in grid]))
-        near = (float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)]))
-        best = optimize.minimize_scalar(lambda v: self.concentrated(v)[1], bounds=near, method="bounded")
-        a, least = self.concentrated(float(best.x))
-        theta = np.array([0.5 * np.log(a), 0.5 * (np.log(a) + float(best.x))])
+        best = minimum_near(lambda v: self.concentrated(v)[1], np.linspace(*SPAN, 26))
+        a, least = self.concentrated(best)
+        theta = np.array([0.5 * np.log(a), 0.5 * (np.log(a) + best)])
         sigma = np.minimum(self._sigma(theta), UNKNOWN)
         reach = np.exp(np.outer(theta, np.ones(3)) + TWO_SIDED * np.outer(sigma, [0.0, -1.0, 1.0]))
-        if not sigma[1] < 1:  # hardly any walk is seen: an upper limit is all there is
-            reach[1, 1:] = 0.0, self._upper(float(best.x), least)
+        if not sigma[1] < 1:  # hardly any walk shows: an upper limit is all there is
+            reach[1, 1:] = 0.0, self._upper(best, least)
         return reach
 
     def _sigma(self, theta: Array) -> Array:
@@ -145,31 +140,8 @@ class _Axis:
         return float(np.sqrt(self.concentrated(top)[0] * np.exp(top)))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _filter(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, found: Array) -> None:
-    """Add nis, log S and count of a level with walk q in white noise 1 / tau to found (3, B)."""
-    m, P, started = 0.0, 0.0, False
-    for k in range(len(d)):
-        if fresh[k]:
-            started = False
-        P += q * dt[k]
-        if not np.isfinite(d[k]):
-            continue
-        R = 1.0 / tau[k]
-        if not started:
-            m, P, started = d[k], R, True
-            continue
-        S, y = P + R, d[k] - m
-        part = k * found.shape[1] // len(d)
-        found[0, part] += y * y / S
-        found[1, part] += np.log(S)
-        found[2, part] += 1
-        m += P / S * y
-        P -= P * P / S
-
-
 def _lag(readings: SensorReadings, L: float, white: Array, walk: Array, declared: Array) -> Lag | None:
-    """Return what differences of means over L seconds say of the variances of white noise and walk, each (d,)."""
+    """Test the variances of white noise and walk, each (d,), by differences of means over L seconds."""
     use = np.all(np.isfinite(readings.d), axis=1)
     weight = np.where(use, readings.tau, 0.0)
     # a new prediction begins a new series: two places further, so that no difference leads across
@@ -181,7 +153,7 @@ def _lag(readings: SensorReadings, L: float, white: Array, walk: Array, declared
     steps = np.diff(means, axis=0)
     steps = steps[np.isfinite(steps).all(axis=1)]
     J = len(steps)
-    if J < FEWEST or 2 * float(np.median(readings.tau)) > L:
+    if J < MIN_DIFFERENCES or 2 * float(np.median(readings.tau)) > L:
         return None
     square, noise, drift = np.mean(steps**2, axis=0), 2 * white / L, 2 / 3 * walk * L
     expected = noise + drift

@@ -1,10 +1,8 @@
-"""Rows of a soak with their walk and white noise taken apart: least squares on what is left is generalised.
+"""Local level: a random walk under white noise, its filter on rows, its estimate, and the spectrum of residuals.
 
 A bias that walks under white noise is a local level; its filter's normalised innovations are white, and the filter is
-linear. So the same filter run on a column of a model gives what that column shows in the innovations, and ordinary
+linear. So the same filter run on a column of a model gives that column's part of the innovations, and ordinary
 least squares on these is generalised least squares on the rows. R rows, m columns.
-
-Noise of what a model leaves: a walk under white noise, and the spectrum where more is asked.
 
 A random walk seen through white noise is predicted best by an exponential average (the steady filter of a local
 level): with gain g and one-step error of variance S, the white noise of a row has variance (1 - g) S and the walk
@@ -13,7 +11,7 @@ g^2 S a row. J. F. Muth, J. Am. Stat. Assoc. 55 (1960) 299. So the gain of least
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +20,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -64,7 +63,43 @@ def log_determinant(white: Array, walk: Array) -> float:
     return total
 
 
-LEAST, MOST = 1e-4, 0.98  # gains
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def innovation_sums(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, parts: int) -> Array:
+    """Return the sums of nis and log S, and the count, over parts of a series (3, parts).
+
+    The readings d (N,) are of a level of walk q in white noise 1 / tau, NaN where they do not count; the level is
+    unknown at the first one, and again from each on that is `fresh`.
+    """
+    sums = np.zeros((3, parts))
+    m, P, started = 0.0, 0.0, False
+    for k in range(len(d)):
+        if fresh[k]:
+            started = False
+        P += q * dt[k]
+        if not np.isfinite(d[k]):
+            continue
+        R = 1.0 / tau[k]
+        if not started:
+            m, P, started = d[k], R, True
+            continue
+        S, y = P + R, d[k] - m
+        part = k * parts // len(d)
+        sums[0, part] += y * y / S
+        sums[1, part] += np.log(S)
+        sums[2, part] += 1
+        m += P / S * y
+        P -= P * P / S
+    return sums
+
+
+def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:
+    """Return the minimum of a cost, between the neighbours of the best place of a grid."""
+    k = int(np.argmin([cost(float(x)) for x in grid]))
+    bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
+
+
+MIN_GAIN, MAX_GAIN = 1e-4, 0.98
 
 
 @dataclass(frozen=True)
@@ -78,7 +113,7 @@ class LocalLevel:
     def of(cls, white: float, walk: float) -> LocalLevel:
         """Return that of white noise of a row and of a walk's step from row to row, both as variances."""
         ratio = walk / max(white, 1e-300)
-        gain = float(np.clip((np.sqrt(ratio**2 + 4 * ratio) - ratio) / 2, LEAST, MOST))
+        gain = float(np.clip((np.sqrt(ratio**2 + 4 * ratio) - ratio) / 2, MIN_GAIN, MAX_GAIN))
         return cls(gain, white / (1 - gain))
 
     @property
@@ -99,32 +134,28 @@ class LocalLevel:
 
 def one_step(parts: Sequence[Array], gain: float) -> list[Array]:
     """Return the one-step errors (n - 1, ...) of signals (n, ...) predicted by an exponential average of their past."""
-    found = []
+    errors = []
     for x in parts:
         before = lfilter([gain], [1.0, gain - 1.0], x - x[:1], axis=0)
-        found.append(x[1:] - x[:1] - before[:-1])
-    return found
+        errors.append(x[1:] - x[:1] - before[:-1])
+    return errors
 
 
-def fitted(parts: Sequence[Array]) -> LocalLevel:
-    """Return the noise of residuals, one (n,) a recording."""
+def fit_local_level(parts: Sequence[Array]) -> LocalLevel:
+    """Return the noise of residuals, one (n,) a recording, that of least one-step error."""
 
     def error(log_gain: float) -> float:
         return float(np.mean(np.concatenate(one_step(parts, float(np.exp(log_gain)))) ** 2))
 
-    grid = np.log(np.geomspace(LEAST, MOST, 13))
-    costs = [error(x) for x in grid]
-    k = int(np.argmin(costs))
-    low, high = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
-    best = float(minimize_scalar(error, bounds=(low, high), method="bounded", options={"xatol": 0.02}).x)
+    best = minimum_near(error, np.log(np.geomspace(MIN_GAIN, MAX_GAIN, 13)), xatol=0.02)
     return LocalLevel(float(np.exp(best)), max(error(best), 1e-300))
 
 
 def effective(e: Array, s: Array, *, walking: bool) -> float:
-    """Return how many independent rows residual e (n,) has for a signal s (n,).
+    """Return the number of independent rows that residual e (n,) has for a signal s (n,).
 
-    n |s|^2 var(e) / (s' Omega s), Omega the covariance that the periodogram of e says, smooth and falling; where the
-    signal runs with time alone (`walking`), white and flicker noise and a walk, and not what is left of the signal.
+    n |s|^2 var(e) / (s' Omega s), Omega the covariance by the periodogram of e, smooth and falling; where the
+    signal runs with time alone (`walking`), white and flicker noise and a walk, and not the rest of the signal.
     """
     n = len(e)
     power = np.abs(np.fft.rfft(e - e.mean()))[1:] ** 2 / n
@@ -158,9 +189,9 @@ def _of_walk(power: Array) -> Array:
     f = np.arange(1, len(power) + 1) / len(power)
     shapes = np.stack([np.ones_like(f), 1 / f, 1 / f**2], axis=1)
     omega = np.full(len(f), float(np.mean(power)))
-    keep = np.arange(len(f)) >= min(5, len(f) // 4)
+    high = np.arange(len(f)) >= min(5, len(f) // 4)
     for _ in range(8):  # Whittle's likelihood by reweighted least squares
-        weight = 1 / omega[keep]
-        found, _ = nnls(shapes[keep] * weight[:, None], power[keep] * weight)
-        omega = np.maximum(shapes @ found, 1e-12 * float(np.mean(power)))
+        weight = 1 / omega[high]
+        sizes, _ = nnls(shapes[high] * weight[:, None], power[high] * weight)
+        omega = np.maximum(shapes @ sizes, 1e-12 * float(np.mean(power)))
     return np.asarray(omega)

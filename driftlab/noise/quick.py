@@ -17,7 +17,7 @@ import numpy as np
 from driftlab.noise.allan import curve
 from fusion_core.chunk import Array
 
-LEAST = 200  # samples of a stretch
+MIN_SAMPLES = 200  # of a stretch
 WINDOWS = 20  # in which the rows are looked at
 STILL = 2.0  # times the scatter of the quietest window: more is motion
 GAP = 1.5  # usual steps
@@ -42,10 +42,10 @@ def noise_of(t: Array, values: Array) -> QuickNoise | None:
     dt = float(np.median(np.diff(t[rows])))
     white, walk = np.empty(values.shape[1]), np.empty(values.shape[1])
     for k in range(values.shape[1]):
-        found = curve(np.ascontiguousarray(quiet[:, k]), dt)
-        early = found.tau <= max(1.0, 4 * dt)
-        white[k] = float(np.median(found.allan[early] * np.sqrt(found.tau[early])))
-        walk[k] = np.sqrt(3) / 2 * float(np.min(found.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
+        allan = curve(np.ascontiguousarray(quiet[:, k]), dt)
+        early = allan.tau <= max(1.0, 4 * dt)
+        white[k] = float(np.median(allan.allan[early] * np.sqrt(allan.tau[early])))
+        walk[k] = np.sqrt(3) / 2 * float(np.min(allan.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
     if not np.all(white > 0):
         return None
     return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt)
@@ -58,7 +58,7 @@ def _quietest(t: Array, values: Array) -> slice | None:
     usual = float(np.median(step[step > 0])) if np.any(step > 0) else 0.0
     broken = ~good[1:] | ~good[:-1] | (step > GAP * usual) | (step <= 0)
     begin, end = _longest(np.concatenate([[True], broken, [True]]))
-    size = max(LEAST // 2, (end - begin) // WINDOWS)
+    size = max(MIN_SAMPLES // 2, (end - begin) // WINDOWS)
     count = (end - begin) // size
     if count < 2:
         return None

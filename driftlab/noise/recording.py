@@ -1,4 +1,4 @@
-"""A recording of a sensor at rest: its Allan and Hadamard curves, and the coefficients that they show.
+"""Allan analysis of a sensor's recording at rest: its Allan and Hadamard curves, and their coefficients.
 
 Gaps, rows that are left out, and motion cut a recording into stretches; all stretches are used.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from driftlab.noise.allan import curve
 from driftlab.noise.allan_fit import Coefficients, fit
 from driftlab.noise.allan_model import PRESENT, AllanCurve
-from driftlab.noise.stretches import LEAST, SHORTEST, Pieces, RestWindows, at_rest, limits, pieces
+from driftlab.noise.stretches import MIN_SAMPLES, MIN_STRETCH, Pieces, RestWindows, at_rest, limits, pieces
 from driftlab.recordings.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from driftlab.config import Config
-    from fusion_core.contracts import MeasurementModel, Sensor
+    from fusion_core.contracts import Sensor
     from fusion_core.faults import Faults
 
 IMU = ("gyro", "accel")
@@ -49,11 +50,11 @@ class Analysis:
     axes, curves, coefficients : dict of channel to list of d items
         Name, curve and coefficients of each axis.
     notes : list of str
-        What a user should know, a sentence each.
+        Remarks for the user, a sentence each.
     plugins : list of dict
         Those that took part.
     sensors : dict of channel to Sensor
-        What the config says of them.
+        As the config has them.
     """
 
     name: str
@@ -85,7 +86,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     Raises
     ------
     TooShort
-        If there are fewer than LEAST samples, or no stretch without a gap has SHORTEST.
+        If there are fewer than MIN_SAMPLES samples, or no stretch without a gap has MIN_STRETCH.
     DataError
         If the recording cannot be read.
     """
@@ -96,30 +97,28 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     if not cut.enough:
         raise TooShort(
             f"{name}: has {cut.samples} samples in stretches without a long gap, {len(cut.places)} of them, at most "
-            f"{np.max(cut.places, initial=0)} in one; an Allan deviation needs {LEAST}, and {SHORTEST} in one stretch; "
-            "use a longer recording, or one with fewer gaps"
+            f"{np.max(cut.places, initial=0)} in one; an Allan deviation needs {MIN_SAMPLES}, and {MIN_STRETCH} in one "
+            "stretch; use a longer recording, or one with fewer gaps"
         )
     dt = cut.dt
-    columns = [(channel, whole[channel][:, k]) for channel in whole.channels for k in range(whole[channel].shape[1])]
+    sensors = {sensor.channel: sensor for sensor in (config.filter.sensors if config.filter else ())}
     with ThreadPoolExecutor() as pool:
-        curves = list(pool.map(lambda item: curve(item[1], dt, stretches=cut.rows, missing=cut.missing), columns))
-    found = [fit(item) for item in curves]
-    by_channel = {c: [k for k, (channel, _) in enumerate(columns) if channel == c] for c in whole.channels}
-    axes = {c: _axes(config.filter, c, len(ks)) for c, ks in by_channel.items()}
+        each = partial(curve, dt=dt, stretches=cut.rows, missing=cut.missing)
+        waiting = {c: pool.map(each, whole[c].T) for c in whole.channels}
+        curves = {c: list(of_axes) for c, of_axes in waiting.items()}
+    coefficients = {c: list(map(fit, of_axes)) for c, of_axes in curves.items()}
+    axes = {c: _axes(sensors.get(c), len(of_axes)) for c, of_axes in curves.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
-    notes = [*_gap_notes(curves[0], whole, cut, faults), *_motion_notes(config, rest, faults)]
-    for channel, ks in by_channel.items():
-        notes += _grouped(channel, axes[channel], [found[k].notes for k in ks])
-    return Analysis(
-        name, dt, cut.samples * dt, total, float(whole.t[cut.spans[0, 0]]), axes,
-        {c: [curves[k] for k in ks] for c, ks in by_channel.items()},
-        {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes, participants(config.source),
-        {sensor.channel: sensor for sensor in (config.filter.sensors if config.filter else ())},
-    )  # fmt: skip
+    first = next(iter(curves.values()))[0]
+    notes = [*_gap_notes(first, whole, cut, faults), *_motion_notes(config, rest, faults)]
+    for c, of_axes in coefficients.items():
+        notes += _grouped(c, axes[c], [one.notes for one in of_axes])
+    start, plugins = float(whole.t[cut.spans[0, 0]]), participants(config.source)
+    return Analysis(name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors)
 
 
-def _axes(model: MeasurementModel | None, channel: str, d: int) -> list[str]:
-    named = next((list(s.axes) for s in (model.sensors if model else ()) if s.channel == channel), [])
+def _axes(sensor: Sensor | None, d: int) -> list[str]:
+    named = [] if sensor is None else list(sensor.axes)
     return named if len(named) == d else list("xyz"[:d])
 
 
@@ -151,17 +150,17 @@ def _load(config: Config, faults: Faults, progress: Callable[[float, int], None]
 
 
 def _rest(config: Config, whole: Chunk) -> RestWindows | None:
-    """Return when the unit is at rest, by the filter's own measure; None where there is no filter section."""
+    """Return the windows at rest, by the filter's own measure; None where there is no filter section."""
     settings = config.filter
     if settings is None or settings.tracked.channel not in whole.channels:
         return None
     return at_rest(settings.only(whole.channels.keys()), whole)
 
 
-def _gap_notes(shown: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
-    """Say what each averaging time stands on, and whether the samples are regular within a stretch."""
+def _gap_notes(first: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
+    """Yield remarks on the samples behind each averaging time, and on steps that vary within a stretch."""
     dt, lengths = cut.dt, cut.places
-    if len(bridged := shown.bridged):
+    if len(bridged := first.bridged):
         short, long = np.min(bridged), np.max(bridged)
         many = f"{len(bridged)} gaps are" if len(bridged) > 1 else "1 gap is"
         since = f"{short:.3g} s" if short == long else f"{short:.3g} s (all of them from {long:.3g} s)"
@@ -175,26 +174,26 @@ def _gap_notes(shown: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> 
         yield (
             f"{len(lengths)} stretches without a {gap} or motion are used, {share:.3g} % of the samples, of "
             f"{lengths.min() * dt:.3g} to {lengths.max() * dt:.6g} s (the longest from "
-            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(shown)}"
+            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(first)}"
         )
     low, high = limits(whole.t, cut.rows)
     if max(high - dt, dt - low) > 0.01 * dt:
         yield f"steps vary from {low:.4g} to {high:.4g} s: taken as regular, with the mean interval {dt:.6g} s"
 
 
-def _stands(shown: AllanCurve) -> str:
-    used = shown.used
+def _stands(first: AllanCurve) -> str:
+    used = first.used
     if used[-1] >= used[0]:
         return "every averaging time stands on all of them"
-    most = shown.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
+    most = first.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
     return (
         f"averaging times up to {most:.3g} s stand on 90 % of their time or more, the longest, "
-        f"{shown.tau[-1]:.3g} s, on {shown.counts[-1]} of them, {used[-1]:.6g} s"
+        f"{first.tau[-1]:.3g} s, on {first.counts[-1]} of them, {used[-1]:.6g} s"
     )
 
 
 def _motion_notes(config: Config, rest: RestWindows | None, faults: Faults) -> Iterator[str]:
-    """Say where the unit moves, and what was made of it."""
+    """Yield remarks on where the unit moves, and what was made of it."""
     if rest is None or np.all(rest.still):
         return
     moving = rest.moving

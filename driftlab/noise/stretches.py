@@ -1,4 +1,4 @@
-"""Where a recording can be used: stretches without a gap, at rest.
+"""Stretches of a recording that can be used: without a gap, at rest.
 
 N samples, S stretches, n windows.
 """
@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.noise.allan import ORDER
-from driftlab.noise.allan_gaps import places, spans
+from driftlab.noise.allan import bridgeable
 from driftlab.recordings.epochs import GAP, epochs
 from fusion_core.chunk import Array, Chunk, concatenate
 
@@ -23,11 +22,11 @@ if TYPE_CHECKING:
 
 Index = NDArray[np.int64]
 
-LEAST = 100  # samples in all that an Allan deviation needs
-SHORTEST = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
+MIN_SAMPLES = 100  # in all that an Allan deviation needs
+MIN_STRETCH = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
 NEAR = 10  # samples at each end of a gap that say when it begins and ends
 NEVER = 10**15  # samples: so long a gap is not bridged
-MOST = 0.5  # of the windows; where more of them move than that, the declared noise is wrong and not the bench
+MAX_MOVING = 0.5  # of the windows; where more of them move than that, the declared noise is wrong and not the bench
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class RestWindows:
     @property
     def doubtful(self) -> bool:
         """Whether so many windows look like motion that it is the noise that is not as declared."""
-        return bool(np.mean(~self.still) > MOST)
+        return bool(np.mean(~self.still) > MAX_MOVING)
 
     @property
     def moving(self) -> Array:
@@ -63,7 +62,7 @@ class RestWindows:
         return self.t_0 + self.length * float(first), self.t_0 + self.length * float(last + 1)
 
     def rows(self, t: Array) -> Flags:
-        """Return which samples at times t (N,) lie in windows at rest; others go with a window beside them."""
+        """Return the samples at times t (N,) in windows at rest; those between windows go with one beside them."""
         window = np.searchsorted(self.numbers, np.floor((t - self.t_0) / self.length), side="right") - 1
         return np.asarray(self.still[np.maximum(window, 0)], dtype=np.bool_)
 
@@ -114,7 +113,7 @@ class Pieces:
     @property
     def enough(self) -> bool:
         """Whether there are samples enough for an Allan deviation."""
-        return self.samples >= LEAST and bool(np.max(self.places, initial=0) >= SHORTEST)
+        return self.samples >= MIN_SAMPLES and bool(np.max(self.places, initial=0) >= MIN_STRETCH)
 
     @property
     def spans(self) -> Index:
@@ -139,11 +138,10 @@ def pieces(t: Array, usable: Flags | None = None) -> Pieces:
         end = (total[last + 1] - total[last + 1 - near]) / near + (near - 1) * dt / 2
         lost = np.clip(np.rint((begin[1:] - end[:-1]) / dt) - 1, 0, NEVER).astype(np.int64)
         missing = np.where(first[1:] > rows[:-1, 1], NEVER, lost)
-    parts = spans(lengths, missing) if len(rows) else np.empty((0, 2), dtype=np.int64)
-    whole = places(lengths, missing, parts)
-    found = Pieces(rows, missing, parts[whole >= ORDER], whole[whole >= ORDER], 0.0)
-    lasted = float(np.sum(t[found.spans[:, 1] - 1] - t[found.spans[:, 0]]))
-    return replace(found, dt=lasted / max(1, int(np.sum(found.places - 1))))
+    parts, whole = bridgeable(lengths, missing) if len(rows) else (np.empty((0, 2), dtype=np.int64), lengths)
+    cut = Pieces(rows, missing, parts, whole, 0.0)
+    lasted = float(np.sum(t[cut.spans[:, 1] - 1] - t[cut.spans[:, 0]]))
+    return replace(cut, dt=lasted / max(1, int(np.sum(cut.places - 1))))
 
 
 def _runs(t: Array, usable: Flags | None) -> Index:
@@ -154,8 +152,8 @@ def _runs(t: Array, usable: Flags | None) -> Index:
     if usable is not None:
         cut |= usable[1:] != usable[:-1]
     edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
-    found = np.stack([edges[:-1], edges[1:]], axis=1)
-    return found if usable is None else found[usable[found[:, 0]]]
+    stretches = np.stack([edges[:-1], edges[1:]], axis=1)
+    return stretches if usable is None else stretches[usable[stretches[:, 0]]]
 
 
 def limits(t: Array, stretches: Index) -> tuple[float, float]:

@@ -23,12 +23,12 @@ from driftlab.identification.candidates import candidates_of
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.normal_equations import Indices
-from driftlab.identification.records import one_way
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
 from driftlab.noise.local_level import effective, one_step
 from driftlab.planning.simulated_search import Body, Information, measured, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
+from driftlab.soak.sweeps import one_way
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect

@@ -1,13 +1,13 @@
-"""Samples at rest as a few thousand means, however long the recording: what a fit of a map needs of them.
+"""Soaks as a few thousand means, however long the recording: blocks for a fit, and a summary for an assessment.
 
-A block is the mean of n samples that follow one another. When there are `MOST` blocks, neighbours are joined two by
-two and n doubles, so all blocks weigh the same and their order is that of time. N samples, d axes, K blocks.
+A block is the mean of n samples that follow one another. When there are `MAX_BLOCKS` blocks, neighbours are joined two
+by two and n doubles, so all blocks weigh the same and their order is that of time. N samples, d axes, K blocks.
 
-A soak in brief: its samples in a few thousand means, with where the temperature turned and what white noise is.
+The summary of a soak: means with the turns of the temperature, and the white noise.
 
 The samples of a fit, N of d axes in the order of time, are read once, a slab at a time:
 
-- *slots*, S means of equally many samples that follow one another, of which the way of the temperature is read
+- *slots*, S means of equally many samples that follow one another, with the way of the temperature
   (`driftlab.soak.sweeps`);
 - *cells*, CELLS equal ranges of temperature, with the samples of each way in them;
 - white noise, from the differences between neighbouring samples: var = mean((b_k+1 - b_k)^2) / 2, to which neither a
@@ -26,7 +26,7 @@ from driftlab.soak.sweeps import Index, directions
 from fusion_core.chunk import Array
 from fusion_core.contracts import SLAB
 
-MOST = 8192  # blocks, at most; half as many, at least, once there are as many samples
+MAX_BLOCKS = 8192  # half as many, at least, once there are as many samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +56,17 @@ class SoakBlocks:
     def within(self, slope: Array) -> Array:
         """Return the mean square (d,) of the samples about a curve through their means, of slope (K, d)."""
         d = self.bias.shape[1]
-        own, mixed, of_T = self.spread[:, :d], self.spread[:, d : 2 * d], self.spread[:, 2 * d :]
-        squares = np.maximum(own - 2 * slope * mixed + slope**2 * of_T, 0.0)
+        of_bias, mixed, of_T = self.spread[:, :d], self.spread[:, d : 2 * d], self.spread[:, 2 * d :]
+        squares = np.maximum(of_bias - 2 * slope * mixed + slope**2 * of_T, 0.0)
         return np.asarray(np.mean(squares, axis=0), dtype=np.float64)
 
 
 class GrowingBlocks:
-    """Blocks of what was added so far, at most `most`, at first of `n` samples."""
+    """Blocks of the samples so far, at most `most`, at first of `n` samples."""
 
-    def __init__(self, most: int = MOST, n: int = 1) -> None:
+    def __init__(self, most: int = MAX_BLOCKS, n: int = 1) -> None:
         self.most, self.n, self.samples = most, n, 0
-        self.seen = np.inf, -np.inf  # lowest and highest temperature, degC
+        self.ends = np.inf, -np.inf  # lowest and highest temperature, degC
         self._sums: list[Array] = []  # rows (k, 3 d + 3) of whole blocks: T, bias, their squares and products, t
         self._rows = 0
         self._rest: Array | None = None  # sums (1, 3 d + 3) of the block that is not whole
@@ -80,7 +80,7 @@ class GrowingBlocks:
         if self._shift is None:
             self._shift = np.array([t[0], T.mean(), *bias.mean(axis=0)])
         self.samples += len(T)
-        self.seen = min(self.seen[0], float(T.min())), max(self.seen[1], float(T.max()))
+        self.ends = min(self.ends[0], float(T.min())), max(self.ends[1], float(T.max()))
         x, left = T[:, None] - self._shift[1], bias - self._shift[2:]
         self._append(np.hstack([x, left, left**2, left * x, x**2, t[:, None] - self._shift[0]]))
         while self._rows >= self.most:
@@ -101,7 +101,7 @@ class GrowingBlocks:
         spread = means[:, 1 + d : -1] - np.hstack([left**2, left * x, x**2])
         T = x[:, 0] + self._shift[1]
         if len(T) > 1:
-            T[np.argmin(T)], T[np.argmax(T)] = self.seen
+            T[np.argmin(T)], T[np.argmax(T)] = self.ends
         return SoakBlocks(T, left + self._shift[2:], self.n, spread, means[:, -1] + self._shift[0])
 
     def _append(self, rows: Array) -> None:
@@ -147,7 +147,7 @@ _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 @dataclass(frozen=True, eq=False)
 class SoakSummary:
-    """What a verdict on a map needs to know of the samples it was fitted on.
+    """Summary of the samples that a map was fitted on, for its assessment.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class SoakSummary:
         return np.linspace(*self.domain, CELLS + 1)
 
     def hours(self, way: int) -> float:
-        """Return how long the soak went one way."""
+        """Return the hours that the soak went one way."""
         return float(np.sum(self.n[self.way == way])) * self.interval / 3600
 
     def cells(self, way: int) -> tuple[Array, Array, Array]:
@@ -202,16 +202,14 @@ def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak
     size, stops = -(-N // SLOTS), [*starts[1:], N]
     cuts = np.concatenate([np.arange(start, stop, size) for start, stop in zip(starts, stops, strict=True)])
     n = np.diff(np.append(cuts, N)).astype(np.float64)
-    slot_T = np.add.reduceat(T, cuts) / n
+    slot_T, slot_bias = np.add.reduceat(T, cuts) / n, np.add.reduceat(bias, cuts, axis=0) / n[:, None]
     recording = np.searchsorted(np.asarray(starts), cuts, side="right") - 1
     threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(slot_T))
     way = np.concatenate([directions(slot_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
-    count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
-    return SoakSummary(
-        domain, interval, n, slot_T, cuts + (n - 1) / 2, way, recording,
-        np.add.reduceat(bias, cuts, axis=0) / n[:, None], count, cell_T, cell_bias, _white(bias),
-    )  # fmt: skip
+    cells = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
+    middle = cuts + (n - 1) / 2
+    return SoakSummary(domain, interval, n, slot_T, middle, way, recording, slot_bias, *cells, _white(bias))
 
 
 def _scatter(T: Array) -> float:
@@ -228,9 +226,8 @@ def _cells(T: Array, bias: Array, row: NDArray[np.int8], domain: tuple[float, fl
     scale = CELLS / ((domain[1] - domain[0]) or 1.0)
     for start in range(0, len(T), SLAB):
         part = slice(start, start + SLAB)
-        cell = np.minimum(((T[part] - domain[0]) * scale).astype(np.intp), CELLS - 1) + CELLS * row[part].astype(
-            np.intp
-        )
+        cell = np.minimum(((T[part] - domain[0]) * scale).astype(np.intp), CELLS - 1)
+        cell += CELLS * row[part].astype(np.intp)
         sums[0] += np.bincount(cell, minlength=size)
         for k, column in enumerate((T[part], *bias[part].T), start=1):
             sums[k] += np.bincount(cell, column, minlength=size)

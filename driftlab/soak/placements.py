@@ -1,19 +1,15 @@
-"""What placements tell of a triad whose input has a known length and a direction that only the triad itself shows.
+"""Calibration of a triad by placements, its input of known length and in a direction that only the triad itself shows.
 
 An accelerometer at rest in P placements, u_p the direction of the specific force in its axes, g its length::
 
     f = L_p + c(T) + g u_p h(T) + noise        on each axis, with levels L_p = g (1 + s) u_p + b
 
 c(T) is the change of the bias from its mean over all samples, one curve for all placements; h(T) that of the scale
-factor, which is told from c where placements show the axis in different parts of the force. All are found at once, so
-a placement need not see all temperatures. Bias b and scale factor s follow from the levels
-(`driftlab.soak.placements`): what these do not tell of b stays zero, where it is one with the tilt of the unit.
+factor, which is told from c where placements show the axis in different parts of the force. All are estimated at once,
+so a placement need not see all temperatures. Bias b and scale factor s follow from the levels: the part of b that these
+do not determine stays zero, where it is one with the tilt of the unit. N samples in K blocks, d axes.
 
-N samples in K blocks, d axes.
-
-Bias and scale factor of a triad from what it shows, on average, in P placements under an input of known length.
-
-::
+Bias and scale factor of a triad from its mean readings in P placements under an input of known length::
 
     | (L_p - b) / (1 + s) | = g,    b ~ N(0, (BIAS g)^2),    s ~ N(0, SCALE^2)        on each of d axes
 
@@ -44,24 +40,24 @@ FLAT = 0.2  # of the input, on an axis: with less nothing of its scale shows
 
 @dataclass(frozen=True, eq=False)
 class ScaleChange:
-    """What is known of how the scale factor of one axis changes, from the coldest to the warmest temperature.
+    """Change of the scale factor of one axis, from the coldest to the warmest temperature.
 
     Attributes
     ----------
-    told : bool
-        Whether the placements tell it from the change of the bias.
+    determined : bool
+        Whether the placements separate it from the change of the bias.
     value, sigma : float
-        Where told.
+        Where determined.
     """
 
-    told: bool
+    determined: bool
     value: float = 0.0
     sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """What P placements told.
+    """Estimates from P placements.
 
     Attributes
     ----------
@@ -69,12 +65,12 @@ class Placements:
         Direction of the input in each.
     levels : Levels
         Of bias and scale factor.
-    changes : tuple of Change
+    changes : tuple of ScaleChange
         Of the scale factor of each axis.
     blocks : Blocks
         The samples.
     errors : tuple of (K, r) arrays, one an axis
-        Root of the covariance of what is off in the blocks: their noise, less what of it levels and scale have taken.
+        Root of the covariance of the blocks' errors: their noise, less the part that levels and scale have taken.
     """
 
     up: Array
@@ -84,20 +80,20 @@ class Placements:
     errors: tuple[Array, ...]
 
     def widened(self, fitted: FittedMap, smoother: Smoother) -> FittedMap:
-        """Return the map with what levels and scale are off by in the error of its curve.
+        """Return the map with the errors of levels and scale in the error of its curve.
 
-        The fit has seen them taken off, and with them a part of the noise.
+        The fit was made without them, and so without a part of the noise.
         """
         return with_errors(fitted, self.blocks, smoother, self.errors)
 
 
 def placed(T: Array, reading: Array, placement: Index, length: float, unsure: float) -> tuple[Array, Placements]:
-    """Return the bias (N, d) of samples, and what was told.
+    """Return the bias (N, d) of samples, and the estimates.
 
     Parameters
     ----------
     T, reading : (N,) and (N, d) arrays
-        Temperature in degC, which moves, and what the triad shows.
+        Temperature in degC, which moves, and the readings of the triad.
     placement : (N,) array of int
         From 0 on; each is there.
     length, unsure : float
@@ -118,14 +114,14 @@ def placed(T: Array, reading: Array, placement: Index, length: float, unsure: fl
     bias = np.empty_like(reading)
     for k, axis in enumerate(axes):
         bias[:, k] = reading[:, k] - (level[:, k] - levels.bias[k])[placement]
-        if axis.change.told:
+        if axis.change.determined:
             bias[:, k] -= up[placement, k] * (design.bends(T) @ axis.scale)
-    changes = tuple(ScaleChange(a.change.told, a.change.value / length, a.change.sigma / length) for a in axes)
+    changes = tuple(ScaleChange(a.change.determined, a.change.value / length, a.change.sigma / length) for a in axes)
     return bias, Placements(up, levels, changes, blocks, tuple(axis.error for axis in axes))
 
 
 class _Design:
-    """The columns of all axes: curve B (K, q), placements Z (K, P), and what takes blocks to means of placements."""
+    """The columns of all axes: curve B (K, q), placements Z (K, P), and the means (P, K) of blocks over placements."""
 
     def __init__(self, blocks: Blocks, means: Array) -> None:
         self.blocks, self.means = blocks, means
@@ -145,20 +141,20 @@ class _Design:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """One axis: levels (P,) less the placements' means, scale (2,), its change, and roots of what they are off by."""
+    """One axis: levels (P,) less the placements' means, scale (2,), its change, and roots of their errors."""
 
     level: Array
     level_root: Array  # (P, r)
     scale: Array
     change: ScaleChange
-    error: Array  # (K, r), of the blocks less what is taken off
+    error: Array  # (K, r), of the blocks less levels and scale
 
 
 def _solved(design: _Design, up: Array) -> list[_Solved]:
-    """Return what is known of each axis, `up` (P, d) the direction of the input in each placement."""
+    """Return the estimates of each axis, `up` (P, d) the direction of the input in each placement."""
     blocks, bends = design.blocks, design.blocks.over @ design.bends(design.blocks.fine)
     scales = [(design.Z @ part)[:, None] * bends for part in up.T]
-    columns = [np.hstack([design.Z, *([H] if _told(design, H) else [])]) for H in scales]
+    columns = [np.hstack([design.Z, *([H] if _determined(design, H) else [])]) for H in scales]
     free = [Contrasts(blocks, own) for own in columns]
     one = np.eye(len(blocks.T))
     noises = [contrasts.noise(y, one) for contrasts, y in zip(free, blocks.y.T, strict=True)]
@@ -172,7 +168,7 @@ def _solved(design: _Design, up: Array) -> list[_Solved]:
 
 
 def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
-    """Return what is known of an axis by the curve and `columns` (K, P), or (K, P + 2) where its scale is told."""
+    """Return the estimates of an axis by the curve and `columns` (K, P), (K, P + 2) where its scale is determined."""
     q, P = design.B.shape[1], design.Z.shape[1]
     X = np.hstack([design.B, columns])
     penalty = np.zeros((X.shape[1], X.shape[1]))
@@ -181,16 +177,17 @@ def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
     mean = design.blocks.n @ design.B / np.sum(design.blocks.n)
     levels = operator[q : q + P] + mean @ operator[:q]
     scale = operator[q + P :]
-    taken = design.Z @ (design.means + levels) + columns[:, P:] @ scale
-    return _Solved(
-        levels @ y, (design.means + levels) @ root, scale @ y, _change(design, scale, y, root), root - taken @ root
-    )
+    taken, change = design.Z @ (design.means + levels) + columns[:, P:] @ scale, ScaleChange(determined=False)
+    if len(scale):
+        ends = np.diff(design.bends(np.array([design.low, design.high])), axis=0)[0]
+        change = ScaleChange(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
+    return _Solved(levels @ y, (design.means + levels) @ root, scale @ y, change, root - taken @ root)
 
 
-def _told(design: _Design, H: Array) -> bool:
-    """Whether scale columns H (K, 2) are so far from what curve and placements can show that these stay as sure.
+def _determined(design: _Design, H: Array) -> bool:
+    """Whether scale columns H (K, 2) are so far from the span of curve and placements that these stay as sure.
 
-    What is left of a column, as a part of it, is the variance of the curve without it to that with it.
+    The residual of a column, as a part of it, is the variance of the curve without it to that with it.
     """
     if np.max(np.abs(H)) < FLAT:
         return False
@@ -200,33 +197,26 @@ def _told(design: _Design, H: Array) -> bool:
     return bool(np.linalg.eigvals(np.linalg.solve(own.T @ own, left.T @ left)).real.min() >= 1 / WIDER**2)
 
 
-def _change(design: _Design, scale: Array, y: Array, root: Array) -> ScaleChange:
-    if not len(scale):
-        return ScaleChange(told=False)
-    ends = np.diff(design.bends(np.array([design.low, design.high])), axis=0)[0]
-    return ScaleChange(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
-
-
 BIAS, SCALE = 0.05, 0.01  # of g, and of 1: deviations of units of which nothing is known
-TOLD = 0.1  # of that deviation: what is known better has been told
+DETERMINED = 0.1  # of that deviation: a parameter that is known better is determined
 FREE = 0.5  # of it: a scale factor that is known no better stays zero
 STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """What P placements tell of d axes.
+    """Bias and scale factor of d axes from P placements.
 
     Attributes
     ----------
     bias, sigma : (d,) arrays
-        In the mean over the samples, and its deviation; scale factors that are not told are part of that.
+        In the mean over the samples, and its deviation; scale factors that are not determined are part of that.
     given_scale : (d,) array
-        The deviation where scale factors that are not told are what they should be.
+        The deviation where scale factors that are not determined are what they should be.
     scale, scale_sigma : (d,) arrays
         Scale factor less 1.
     lengths : (P,) array
-        What the solution leaves of the lengths, in the unit of the bias.
+        Residuals of the lengths, in the unit of the bias.
     expected : (P,) array
         Its deviation by the noise of the levels.
     prior : float
@@ -243,15 +233,15 @@ class Levels:
     prior: float
 
     @property
-    def scale_told(self) -> Array:
-        """Whether each scale factor is told (d,)."""
-        return np.asarray(self.scale_sigma < TOLD * SCALE)
+    def scale_determined(self) -> Array:
+        """Whether each scale factor is determined (d,)."""
+        return np.asarray(self.scale_sigma < DETERMINED * SCALE)
 
     def level(self, axis: int) -> str:
-        """Return what is known of the level of an axis: `told`, `scale` (but for its scale factor), or `tilt`."""
-        if self.sigma[axis] < TOLD * self.prior:
+        """Return how far the level of an axis is known: `told`, `scale` (but for its scale factor), or `tilt`."""
+        if self.sigma[axis] < DETERMINED * self.prior:
             return "told"
-        return "scale" if self.given_scale[axis] < TOLD * self.prior else "tilt"
+        return "scale" if self.given_scale[axis] < DETERMINED * self.prior else "tilt"
 
 
 def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -> Levels:
@@ -275,14 +265,11 @@ def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -
     theta, given = _solution(level, covariances, length, unsure, deviation, free)
     left, _, spread = _equations(theta, level, covariances, length, unsure)
     # lengths that differ by more than noise explains: axes that are not square, say
-    most = max(len(level) - int(np.sum(np.sqrt(np.diag(given)) < TOLD * deviation)), 1)
+    most = max(len(level) - int(np.sum(np.sqrt(np.diag(given)) < DETERMINED * deviation)), 1)
     worse = np.sqrt(max(1.0, float(left @ np.linalg.solve(spread, left)) / most))
-    told = sigma < TOLD * deviation
-    sigma = np.where(told, worse * sigma, sigma)
-    return Levels(
-        theta[:d], sigma[:d], worse * np.sqrt(np.diag(given))[:d], theta[d:], sigma[d:], left,
-        np.sqrt(np.diag(spread)), BIAS * length,
-    )  # fmt: skip
+    sigma = np.where(sigma < DETERMINED * deviation, worse * sigma, sigma)
+    sigma_given, expected = worse * np.sqrt(np.diag(given))[:d], np.sqrt(np.diag(spread))
+    return Levels(theta[:d], sigma[:d], sigma_given, theta[d:], sigma[d:], left, expected, BIAS * length)
 
 
 def _solution(

@@ -1,4 +1,4 @@
-"""The stretches at rest of a recording: temperature, and what the tracked sensor shows beside its known input.
+"""Stretches at rest of a recording: temperature, and the tracked sensor's readings less their known input.
 
 Each stretch is aligned anew, which takes an Earth rate off a gyro. Where only the length of the input is known, as
 that of gravity in the axes of a unit that lies somehow, the direction is that of the first stretch of a placement:
@@ -50,9 +50,9 @@ class RestStretch(NamedTuple):
 
 @dataclass
 class Used:
-    """How many epochs of soaks were at rest and used, and what of them was taken for motion.
+    """Count of the epochs of soaks that were at rest and used, and of those taken for motion.
 
-    `low`, `high` are the temperatures of all epochs, degC; `axes` those that saw the motion, by epochs.
+    `low`, `high` are the temperatures of all epochs, degC; `axes` those that showed the motion, by epochs.
     """
 
     epochs: int = 0
@@ -63,7 +63,7 @@ class Used:
     axes: Counter[str] = field(default_factory=Counter)
     rows: int = 0  # of the recordings
     usable: int = 0  # of these
-    why: str = ""  # what the others were left out for
+    why: str = ""  # the others were left out
 
     @property
     def moved(self) -> float:
@@ -81,13 +81,13 @@ class Used:
         return 1 - (1 - self.moved) * (1 - self.unread)
 
     def sentence(self) -> str:
-        """Return how much is not used and why, where that is much; empty where it is not."""
+        """Return the share that is not used and why, where that is much; empty where it is not."""
         if self.share <= NOTED:
             return ""
         why = []
         if self.moved >= 0.005:
-            seen = ", ".join(name for name, count in self.axes.most_common() if 2 * count >= max(self.axes.values()))
-            why.append(f"{self.moved:.0%} was taken for motion (first {self.first}{seen and f', seen by {seen}'})")
+            by = ", ".join(name for name, count in self.axes.most_common() if 2 * count >= max(self.axes.values()))
+            why.append(f"{self.moved:.0%} was taken for motion (first {self.first}{by and f', seen by {by}'})")
         if self.unread >= 0.005:
             why.append(f"{self.unread:.0%} of the rows were left out{self.why and f' ({self.why})'}")
         return f"{self.share:.0%} of the soak is not used: {'; '.join(why)}"
@@ -97,7 +97,7 @@ class Used:
         return {"share": self.share, "motion": self.moved, "rows_left_out": self.unread}
 
     def read(self, faults: Faults, before: Faults) -> None:
-        """Take the rows that a recording had, and what they were left out for, beside the faults before it."""
+        """Take the rows of a recording, and why some were left out, beside the faults before it."""
         self.rows, self.usable = self.rows + faults.rows - before.rows, self.usable + faults.usable - before.usable
         left_out = {what: fault.count for what, fault in faults.found.items() if "rows" in what and "left out" in what}
         self.why = max(left_out, key=lambda what: left_out[what], default="").replace(", left out", "")
@@ -108,7 +108,7 @@ class Used:
 
 
 def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used | None = None) -> Iterator[RestStretch]:
-    """Yield each stretch of epochs at rest; placements are counted from 0, and `used` takes what is and is not."""
+    """Yield each stretch of epochs at rest; placements are counted from 0, and `used` counts the epochs."""
     model, used = config.filter, used or Used()
     if model is None:
         for window in _windows(stream, 60.0):
@@ -163,15 +163,15 @@ class _Cutting:
         return [window] if self.still else []
 
     def _rated(self) -> tuple[Chunk, float]:
-        """Return the last windows with the rate of their temperature in K/s, and the largest.
+        """Return the last windows with the rate of their temperature in K/s, and the largest rate.
 
         A thermometer of coarse steps does not show the rate all the time, and a bias may go on behind.
         """
         lately = concatenate(self._lately)
-        found = with_rate(lately, self.model.temperature_rate, None)[0].channels.get("temperature_rate")
-        if found is None:
+        rate = with_rate(lately, self.model.temperature_rate, None)[0].channels.get("temperature_rate")
+        if rate is None:
             return lately, 0.0
-        return lately.having(temperature_rate=found), float(np.max(np.abs(found)))
+        return lately.having(temperature_rate=rate), float(np.max(np.abs(rate)))
 
     def _cut(self, window: Chunk) -> list[Chunk]:
         lately, rate = self._rated()
@@ -188,17 +188,17 @@ class _Cutting:
         for (channel, axis), count in zip(detector.axes, np.sum(out, axis=0), strict=True):
             if count:
                 self.used.axes[axis_name(channel, axis)] += int(count)
-        found = [
+        parts = [
             window.part(a - start, b - start)
             for c, d in runs(still)
             for a, b in self._at_rest(fastest, start + c, start + d, rate)
         ]
-        if found:
-            self._before, self.still = found[-1], bool(found[-1].t[-1] == window.t[-1])
-        return found
+        if parts:
+            self._before, self.still = parts[-1], bool(parts[-1].t[-1] == window.t[-1])
+        return parts
 
     def _at_rest(self, epochs: Chunk, start: int, stop: int, rate: float) -> list[tuple[int, int]]:
-        """Return what is at rest of epochs of which none stands out: in halves, where the temperature moves far."""
+        """Return the rest in epochs of which none stands out: in halves, where the temperature moves far."""
         length = float(np.sum(epochs["tau"][start:stop]))
         if stop - start < 3 or length < SHORTEST:
             return []

@@ -1,4 +1,4 @@
-"""Where a temperature turns: ways up and down, sweeps, and how far each goes.
+"""Turns of a temperature: ways up and down, sweeps, and how far each goes.
 
 A temperature has turned where it is back by `turn` from its highest since it began to rise, or from its lowest since it
 began to fall. It turned at that extreme, at the last sample of it: a plateau belongs to the way that led there.
@@ -6,6 +6,7 @@ began to fall. It turned at that extreme, at the last sample of it: a plateau be
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -15,9 +16,12 @@ from fusion_core.chunk import Array
 
 Index = NDArray[np.int64]
 
+TURN = 0.1  # of the whole swing: a smaller way back is no turning point
+ONE_WAY = 0.1  # of the way up (or down) that the other way must have at least
+
 
 def turning_points(T: Array, turn: float) -> list[int]:
-    """Return where T (K,) begins to go a way, where it turns, and its last extreme; nothing where it hardly moves."""
+    """Return the places at which T (K,) begins to move, turns, and has its last extreme; none where it hardly moves."""
     points: list[int] = []
     low = high = way = 0  # the extremes since the last turn
     for k, value in enumerate(T.tolist()):
@@ -31,10 +35,10 @@ def turning_points(T: Array, turn: float) -> list[int]:
 
 def directions(T: Array, turn: float) -> Index:
     """Return +1 (up), -1 (down) or 0 (neither so far) for each of T (K,)."""
-    found = np.zeros(len(T), dtype=np.int64)
+    ways_of_T = np.zeros(len(T), dtype=np.int64)
     for start, stop in pairwise(turning_points(T, turn)):
-        found[start:] = np.sign(T[stop] - T[start])
-    return found
+        ways_of_T[start:] = np.sign(T[stop] - T[start])
+    return ways_of_T
 
 
 def sweeps_of(T: Array, turn: float) -> Index:
@@ -44,6 +48,21 @@ def sweeps_of(T: Array, turn: float) -> Index:
 
 
 def rise_and_fall(T: Array, turn: float) -> tuple[float, float]:
-    """Return by how much T (K,) rises in all between its turns, and by how much it falls."""
+    """Return the total rise of T (K,) between its turns, and the total fall."""
     steps = np.diff(T[turning_points(T, turn)])
     return float(np.sum(steps[steps > 0])), float(-np.sum(steps[steps < 0]))
+
+
+def ways(recordings: Sequence[Array]) -> tuple[float, float]:
+    """Return the total rise of temperatures (N,) between their turning points, and the total fall."""
+    least = TURN * (max(map(np.max, recordings)) - min(map(np.min, recordings)))
+    each = [rise_and_fall(T, least) for T in recordings]
+    return sum(up for up, _ in each), sum(down for _, down in each)
+
+
+def one_way(recordings: Sequence[Array]) -> str:
+    """Return the way of temperatures (N,) that hardly ever come back: `warms up` or `cools down`; else nothing."""
+    up, down = ways(recordings)
+    if min(up, down) >= ONE_WAY * max(up, down):
+        return ""
+    return "warms up" if up > down else "cools down"

@@ -57,13 +57,13 @@ def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[A
     count = np.diff(starts, append=len(T)).astype(np.float64)
     at, means = (np.add.reduceat(values, starts) / count for values in (t, T))
     levels = _Levels(means, each * count, _offset(T, steps.size), steps)
-    found = levels.likeliest(at, WALKS[0], means)
+    path = levels.likeliest(at, WALKS[0], means)
     for walk in WALKS[1:]:
-        tried = levels.likeliest(at, walk, found.T)
-        if tried.evidence < found.evidence:
+        tried = levels.likeliest(at, walk, path.T)
+        if tried.evidence < path.evidence:
             break
-        found = tried
-    smooth = np.interp(t, at, found.T)
+        path = tried
+    smooth = np.interp(t, at, path.T)
     return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
 
 
@@ -73,8 +73,8 @@ def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[A
     Each is a pair of times (N,) in s and readings (N,) in degC.
     """
     steps = max((steps_of(T) for _, T in recordings), default=NO_STEPS)
-    found = [soak_temperature(t, T, steps) for t, T in recordings]
-    return [T for T, _ in found], max((own for _, own in found), default=NO_STEPS)
+    smoothed = [soak_temperature(t, T, steps) for t, T in recordings]
+    return [T for T, _ in smoothed], max((own for _, own in smoothed), default=NO_STEPS)
 
 
 def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
@@ -177,7 +177,7 @@ class _Levels:
 
 
 class _Smoothness:
-    """What a walk of the rate makes of a path: second differences over times `at` (K,), as a banded matrix (3, K)."""
+    """Prior of a path whose rate walks: second differences over times `at` (K,), as a banded matrix (3, K)."""
 
     def __init__(self, at: Array, walk: float) -> None:
         h = np.diff(at)

@@ -9,13 +9,13 @@ centred 30 s average of the gyro, whose own noise (59, 66 and 75 deg/h rms on x,
 from __future__ import annotations
 
 from demo import DEG_H, HERE, PLACEMENTS, recording
+from noise_by_likelihood import fit_noise
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from driftlab.config import Config, load_config
 from driftlab.evaluation.scores import over_axes, score
-from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -20,9 +22,11 @@ from rich.table import Table
 from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from noise_by_likelihood import fit_noise
+
 from driftlab.config import Config
 from driftlab.evaluation.comparison import OFFSET, THRESHOLD
-from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs

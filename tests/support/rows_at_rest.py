@@ -6,7 +6,7 @@ from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.least_squares import LeastSquares
 from driftlab.identification.records import Evidence, Record
-from driftlab.identification.state import Search, noises_of
+from driftlab.identification.state import Search
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.channel import Channel
@@ -59,7 +59,7 @@ def squares_of(evidence):
 def search_of(evidence, model):
     squares = squares_of(evidence)
     found = Search(squares, lambda text: None, (), model, parts(squares.columns))
-    found.noises = noises_of(found, model)
+    found.noises = found.noises_of(model)
     return found
 
 

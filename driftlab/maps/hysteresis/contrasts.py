@@ -1,4 +1,4 @@
-"""What no free curve and no level can make of a soak, turned so that each law of its slow noise is diagonal.
+"""Contrasts of a soak, free of any curve and level, turned so that each law of its slow noise is diagonal.
 
 K blocks are means of slots that follow one another; a block is of one recording. A bias of d axes is taken as::
 
@@ -30,7 +30,7 @@ from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
 BLOCKS = 240  # about
-FEWEST = 24  # contrasts with which slow noise can be told from white noise
+MIN_CONTRASTS = 24  # with which slow noise can be told from white noise
 KNOTS = (8, 16, 32, 64)  # of the curve, as many as it needs
 GROUP = 3  # blocks to each at least
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 4, 22)])  # of slow to white noise, in a mean contrast
@@ -84,7 +84,7 @@ class Slots:
         return cls(of_slot, n, t, float(np.median(n)) * soak.interval, soak.recording[starts], soak.n / n[of_slot])
 
     def means(self, values: Array) -> Array:
-        """Return the means (K, q) of what the slots have (S, q)."""
+        """Return the means (K, q) of values of the slots (S, q)."""
         return np.add.reduceat(values * self.weights[:, None], np.flatnonzero(np.diff(self.of_slot, prepend=-1)))
 
 
@@ -113,13 +113,7 @@ class FreeCurve:
 
 def laws_of(blocks: Slots) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
-    whole = (
-        max(
-            float(np.max(blocks.t[blocks.recording == k])) - float(np.min(blocks.t[blocks.recording == k]))
-            for k in np.unique(blocks.recording)
-        )
-        + blocks.span
-    )
+    whole = max(float(np.ptp(blocks.t[blocks.recording == k])) for k in np.unique(blocks.recording)) + blocks.span
     apart = np.abs(blocks.t[:, None] - blocks.t)
     together = blocks.recording[:, None] == blocks.recording
     cascade = blocks.span * CASCADE ** np.arange(np.log(WALK * whole / blocks.span) / np.log(CASCADE))
@@ -138,7 +132,7 @@ def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class FollowingCurves:
     """Curves that follow J inputs, as a soak makes them.
 
     Attributes
@@ -147,13 +141,13 @@ class Made:
         Of the splines.
     partly : (J, d) array of bool
         Whether a part of the curve follows, or all of it.
-    shown : (S, J, d) array
-        What each adds on the slots.
+    added : (S, J, d) array
+        The bias that each adds on the slots.
     """
 
     coefficients: Array
     partly: NDArray[np.bool_]
-    shown: Array
+    added: Array
 
 
 class SoakContrasts:
@@ -184,7 +178,7 @@ class SoakContrasts:
         self.X = np.column_stack([self.splines * self.root, self.more])
         U, s, _ = np.linalg.svd(self.X)
         self.Z = np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
-        self.covariances = laws if self.Z.shape[1] >= FEWEST else []
+        self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
         self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
 
     def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
@@ -195,10 +189,10 @@ class SoakContrasts:
         """
         own, V = np.linalg.eigh(walk)
         weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
-        y, more, K, best = V.T @ self.y, V.T @ self.more, len(self.y), np.inf
-        found: tuple[FreeCurve, Array] | None = None
+        y, more, best = V.T @ self.y, V.T @ self.more, np.inf
+        chosen: list[tuple[FreeCurve, Array]] = []
         for count in KNOTS:
-            if found is not None and count * GROUP > K:
+            if chosen and count * GROUP > len(self.y):
                 break
             curve = FreeCurve(soak.domain, count)
             splines = self.blocks.means(curve(soak.T))
@@ -207,9 +201,9 @@ class SoakContrasts:
             cost = np.sum(costs.min(axis=0)) + 2 * y.shape[1] * X.shape[1]
             if cost >= best:
                 break
-            best, found = cost, (curve, splines)
-        assert found is not None
-        return found
+            best = cost
+            chosen.append((curve, splines))
+        return chosen[-1]
 
     @cached_property
     def u(self) -> Array:
@@ -218,28 +212,41 @@ class SoakContrasts:
 
     @cached_property
     def without(self) -> Array:
-        """Log-likelihood (R, d) of each noise where nothing is remembered, up to what is common to all."""
-        found = []
+        """Log-likelihood (R, d) of each noise without a memory, but for a constant."""
+        logs = []
         for own, V in self.laws:
             w = self.weights(own)
             squares = np.maximum(w @ (V.T @ self.u) ** 2, 1e-300)
-            found.append(np.sum(np.log(w), axis=1)[:, None] / 2 - len(own) / 2 * np.log(squares))
-        return np.concatenate(found)
+            logs.append(np.sum(np.log(w), axis=1)[:, None] / 2 - len(own) / 2 * np.log(squares))
+        return np.concatenate(logs)
 
     def of(self, values: Array) -> Array:
-        """Return what slots have (S, q) in the contrasts (m, q)."""
-        return np.asarray(self.Z.T @ (self.blocks.means(values) * self.root))
+        """Return values of slots (S, ...) in the contrasts (m, ...)."""
+        z = self.Z.T @ (self.blocks.means(values.reshape(len(values), -1)) * self.root)
+        return np.asarray(z.reshape(len(z), *values.shape[1:]))
 
     @staticmethod
     def weights(own: Array) -> Array:
         """Return the weights (len(RATIOS), m) of the eigenvectors of a law, `own` (m,) its eigenvalues."""
         return np.asarray(1.0 / (RATIOS[:, None] / np.mean(own) * own + 1.0))
 
-    def gram(self, noise: int, z: Array) -> Array:
-        """Return the inner products (J, J) of shapes z (m, J) under a noise, counted over laws, then ratios."""
+    def under(self, noise: int) -> tuple[Array, Array]:
+        """Return weights (m,) and eigenvectors (m, m) of a noise, counted over laws, then ratios."""
         own, V = self.laws[noise // len(RATIOS)]
-        shown = V.T @ z
-        return np.asarray((shown.T * self.weights(own)[noise % len(RATIOS)]) @ shown)
+        return self.weights(own)[noise % len(RATIOS)], V
+
+    def covariance(self, noise: int) -> Array:
+        """Return the covariance (K, K) of the blocks under a noise, whose white part has a variance of 1."""
+        law, ratio = divmod(noise, len(RATIOS))
+        C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
+        C[np.diag_indices(len(C))] += 1.0
+        return np.asarray(C)
+
+    def gram(self, noise: int, z: Array) -> Array:
+        """Return the inner products (J, J) of shapes z (m, J) under a noise."""
+        w, V = self.under(noise)
+        turned = V.T @ z
+        return np.asarray((turned.T * w) @ turned)
 
     def curves_under(self, noise: int, axis: int, late: Array) -> tuple[Array, Array, Array]:
         """Return the curve (P,) of an axis under a noise, those that follow inputs (P, J), and how uncertain they are.
@@ -250,14 +257,10 @@ class SoakContrasts:
         contrasts' noise is. What these leave open is some directions, each a standard deviation long where white noise
         has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
         """
-        law, ratio = divmod(noise, len(RATIOS))
-        own, V = self.laws[law]
-        C = RATIOS[ratio] / np.mean(own) * self.covariances[law]
-        C[np.diag_indices(len(C))] += 1.0
-        solved = np.linalg.solve(C, self.X)
+        w, V = self.under(noise)
+        solved = np.linalg.solve(self.covariance(noise), self.X)
         spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
         bent = spread @ (solved.T @ self.y[:, axis])
-        w = self.weights(own)[ratio]
         free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), FINEST)
         again = spread @ solved.T @ late
         one, turned = np.eye(len(bent)), np.swapaxes(again, 1, 2)
@@ -275,8 +278,8 @@ class SoakContrasts:
         there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
         return there, np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
 
-    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, Made]:
-        """Return what is added where the curve sees other temperatures (S, J).
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
+        """Return the bias that is added where the curve sees other temperatures (S, J).
 
         The curve is that of each axis under its noise (d,).
 
@@ -286,7 +289,7 @@ class SoakContrasts:
             Of the curve that is fitted to temperature.
         likelihoods : (2, R', J, d) array
             As `followed` and `parts` have them: of all and of a part of the curve that follows.
-        made : Made
+        curves : FollowingCurves
             The likelier of the two.
         """
         there, late = self.late(inputs)
@@ -294,21 +297,21 @@ class SoakContrasts:
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
         here, p = self.curve(self._T), self.splines.shape[1]
         slots = np.stack([(one - here) @ bent[:p] for one in there], axis=1)
-        S, J, d = slots.shape
-        seen = self.Z.T @ late  # (J, m, P)
-        z = self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
-        whole = np.einsum("jmp,pjd->mjd", seen, curves)
-        open_ = (seen @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
+        J, d = slots.shape[1:]
+        regressors = self.Z.T @ late  # (J, m, P)
+        whole = np.einsum("jmp,pjd->mjd", regressors, curves)
+        open_ = (regressors @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
         followed = self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
         smooth = self.curve.smooth()
-        part, parts = self.parts(seen[:, :, :p] @ smooth, int(noises[0]))
+        part, parts = self.parts(regressors[:, :, :p] @ smooth, int(noises[0]))
         likelier = log_mean(part) > log_mean(followed)
-        made = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
-        shown = np.stack([(one - here) @ own for one, own in zip(there, made, strict=True)], axis=1)
-        return slots, z, np.stack([followed, part]), Made(made, likelier, shown)
+        coefficients = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
+        added = np.stack([(one - here) @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
+        following = FollowingCurves(coefficients, likelier, added)
+        return slots, self.of(slots), np.stack([followed, part]), following
 
-    def form_variances(self, inputs: Array, made: Made, noises: Index, s2: Array, between: Array) -> Array:
-        """Return how uncertain the curves that follow inputs are in form (J, d), between two of their temperatures.
+    def form_variances(self, inputs: Array, curves: FollowingCurves, noises: Index, s2: Array, between: Array) -> Array:
+        """Return the variances of the form (J, d) of curves that follow inputs, between two of their temperatures.
 
         `between` (J, d, p): the splines at one less those at the other. Curve and size are fitted together, by
         generalised least squares under the noise (d,) of each axis, whose white part has the variance s2 (d,); a
@@ -317,30 +320,27 @@ class SoakContrasts:
 
             g' (Sigma - a a' / (a' Sigma^-1 a)) g,    Sigma^-1 = S' C^-1 S / s^2 + 1
         """
-        shown, found = self.late(inputs)[1][:, :, : self.splines.shape[1]], np.zeros(made.partly.shape)
+        S, variances = self.late(inputs)[1][:, :, : self.splines.shape[1]], np.zeros(curves.partly.shape)
         for axis, noise in enumerate(noises):
-            law, ratio = divmod(int(noise), len(RATIOS))
-            C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
-            C[np.diag_indices(len(C))] += 1.0
-            inverse = np.linalg.inv(C)
-            solved, turned = inverse @ self.X, np.swapaxes(shown, 1, 2) @ inverse
-            of_X, whole = turned @ self.X, turned @ shown  # (J, p, P) and (J, p, p)
+            inverse = np.linalg.inv(self.covariance(int(noise)))
+            solved, turned = inverse @ self.X, np.swapaxes(S, 1, 2) @ inverse
+            of_X, whole = turned @ self.X, turned @ S  # (J, p, P) and (J, p, p)
             spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
             free = whole - of_X @ spread @ np.swapaxes(of_X, 1, 2)  # of the contrasts: the curve here is another
-            M = np.where(made.partly[:, axis, None, None], free, whole) / s2[axis] + np.eye(shown.shape[2]) / FREE**2
-            a, g = made.coefficients[:, :, axis], between[:, axis]
+            M = np.where(curves.partly[:, axis, None, None], free, whole) / s2[axis] + np.eye(S.shape[2]) / FREE**2
+            a, g = curves.coefficients[:, :, axis], between[:, axis]
             along = np.sum(g * a, axis=1) ** 2 / np.maximum(np.einsum("jh,jhi,ji->j", a, M, a), 1e-300)
-            found[:, axis] = np.sum(g * np.linalg.solve(M, g[:, :, None])[:, :, 0], axis=1) - along
-        return np.maximum(found, 0.0)
+            variances[:, axis] = np.sum(g * np.linalg.solve(M, g[:, :, None])[:, :, 0], axis=1) - along
+        return np.maximum(variances, 0.0)
 
     def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
 
         Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise.
         """
-        own, V = self.laws[noise // len(RATIOS)]
-        seen = np.sqrt(self.weights(own)[noise % len(RATIOS)])[:, None] * (V.T @ shown)
-        most = np.linalg.eigh(np.swapaxes(seen, 1, 2) @ seen)[1][:, :, -PARTS:]
+        w, V = self.under(noise)
+        white = np.sqrt(w)[:, None] * (V.T @ shown)
+        most = np.linalg.eigh(np.swapaxes(white, 1, 2) @ white)[1][:, :, -PARTS:]
         bias = np.broadcast_to(self.u[:, None], (len(self.u), len(shown), self.u.shape[1]))
         like, a = self.integrated(bias, np.moveaxis(shown @ most, 0, 1), SIZES)
         return like, most @ a
@@ -378,9 +378,9 @@ class SoakContrasts:
             more = np.sum(np.log(w), axis=1)[:, None] - np.sum(np.log1p(g), axis=3)
             likes.append((more[..., None] - m * np.log(left)) / 2)
             each.append(along @ a)
-        like, found = np.concatenate(likes, axis=1), np.concatenate(each, axis=1)
+        like, estimates = np.concatenate(likes, axis=1), np.concatenate(each, axis=1)
         top = np.argmax(like.reshape(-1, *like.shape[2:]), axis=0)
-        likeliest = np.take_along_axis(found.reshape(-1, *found.shape[2:]), top[None, :, None], axis=0)[0]
+        likeliest = np.take_along_axis(estimates.reshape(-1, *estimates.shape[2:]), top[None, :, None], axis=0)[0]
         return log_mean(like), likeliest
 
 

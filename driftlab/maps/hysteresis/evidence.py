@@ -34,7 +34,7 @@ from fusion_core.chunk import Array
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
-MOST = 12.0  # t up to which the evidence is worked out
+MAX_T = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is
 TINY = 1e-300
 TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
@@ -46,7 +46,7 @@ LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: les
 
 @dataclass(frozen=True, eq=False)
 class ShapeEvidence:
-    """What the contrasts of a soak say of shapes.
+    """Evidence for shapes in the contrasts of a soak.
 
     Attributes
     ----------
@@ -149,12 +149,12 @@ class ShapeEvidence:
 
     def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
         """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
-        base, found = log_mean(log_w[:, None] - self.m / 2 * np.log(np.maximum(Q, TINY))), []
+        base, logs = log_mean(log_w[:, None] - self.m / 2 * np.log(np.maximum(Q, TINY))), []
         for g in SIZES:
             left = np.maximum(Q[:, None] - g / (1 + g) * t2, TINY)
             with_it = log_mean(log_w[:, None, None] - self.m / 2 * np.log(left)) - p * np.log1p(g) / 2
-            found.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - Q.shape[1] * np.log(2))
-        return log_mean(np.array(found))
+            logs.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - Q.shape[1] * np.log(2))
+        return log_mean(np.array(logs))
 
     @cached_property
     def single(self) -> float:
@@ -195,9 +195,9 @@ class ShapeEvidence:
         t2, each = self.pairs
         if not len(each) or np.max(each) <= np.max(self.of_shapes):
             return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
-        found = np.full_like(self.Q, np.nan)
-        found[self.thin] = np.maximum(self.Q[self.thin] - t2[:, int(np.argmax(each))], TINY)
-        return found
+        squares = np.full_like(self.Q, np.nan)
+        squares[self.thin] = np.maximum(self.Q[self.thin] - t2[:, int(np.argmax(each))], TINY)
+        return squares
 
     @cached_property
     def noises(self) -> Array:
@@ -216,7 +216,7 @@ class ShapeEvidence:
         return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
 
     def would_show(self, alike: Array) -> Array:
-        """Return which coefficients (J, d) would have been seen with 95 %, on one axis alone.
+        """Return the coefficients (J, d) that would have been seen with 95 %, on one axis alone.
 
         `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
         taken to speak against one as much as it does at t = 1.
@@ -226,7 +226,7 @@ class ShapeEvidence:
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.A.shape[1:])
         for axis in range(d):
-            low, high = np.zeros(len(prior)), np.full(len(prior), MOST)
+            low, high = np.zeros(len(prior)), np.full(len(prior), MAX_T)
             for _ in range(HALVINGS):
                 t = (low + high) / 2
                 each = []
@@ -236,14 +236,14 @@ class ShapeEvidence:
                     each.append(log_mean(factor + prior) + (d - 1) * other)
                 reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
-            needed[:, axis] = np.where(low > 0.99 * MOST, np.inf, high)
+            needed[:, axis] = np.where(low > 0.99 * MAX_T, np.inf, high)
         spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """What the likeliest pairs of shapes say: which (P, 2), log-likelihood of each (P,), coefficients and covariances.
+    """Estimates of the likeliest pairs of shapes, `which` (P, 2), with the log-likelihood of each (P,).
 
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """
@@ -268,15 +268,15 @@ class Pairs:
         return shares(self.power * self.likelihoods)
 
     @classmethod
-    def of(cls, found: ShapeEvidence, noise: Index, contrasts: SoakContrasts, z: Array, most: int) -> Pairs:
+    def of(cls, shapes: ShapeEvidence, noise: Index, contrasts: SoakContrasts, z: Array, most: int) -> Pairs:
         """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""
         J, d = z.shape[1:]
         i, k = np.triu_indices(J, 1)
-        i, k = i[i < found.added], k[i < found.added]
+        i, k = i[i < shapes.added], k[i < shapes.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
         single = np.zeros(J)
         for axis, r in enumerate(noise):
-            G, B, Q = contrasts.gram(int(r), z[:, :, axis]), found.B[r, :, axis], found.Q[r, axis]
+            G, B, Q = contrasts.gram(int(r), z[:, :, axis]), shapes.B[r, :, axis], shapes.Q[r, axis]
             a, b, c = G[i, i], G[k, k], G[i, k]
             det = a * b - c**2
             some = det > LEFT * a * b
@@ -286,12 +286,12 @@ class Pairs:
             t2 = pair[:, 0] * B[i] + pair[:, 1] * B[k]
             mean[:, :, axis] = pair
             rest = np.maximum(Q - t2, TINY)
-            covariance[..., axis] = np.moveaxis(inverse * rest / (found.m - 4), 2, 0)
-            g = max(float(np.max(t2)) / Q * found.m, SIZES[0])  # a price that grows with what is there
-            total += np.where(some, -found.m / 2 * np.log(rest), -np.inf) - np.log1p(g)
-            single += -found.m / 2 * np.log(np.maximum(Q - found.t2[r, :, axis], TINY)) - np.log1p(g) / 2
-        total += np.log(found.prior[i] * found.prior[k] * 2)
-        single += np.log(found.prior)
+            covariance[..., axis] = np.moveaxis(inverse * rest / (shapes.m - 4), 2, 0)
+            g = max(float(np.max(t2)) / Q * shapes.m, SIZES[0])  # a price that grows with what is there
+            total += np.where(some, -shapes.m / 2 * np.log(rest), -np.inf) - np.log1p(g)
+            single += -shapes.m / 2 * np.log(np.maximum(Q - shapes.t2[r, :, axis], TINY)) - np.log1p(g) / 2
+        total += np.log(shapes.prior[i] * shapes.prior[k] * 2)
+        single += np.log(shapes.prior)
         order = np.argsort(-total)[:most]
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
@@ -303,14 +303,14 @@ def _sums(contrasts: SoakContrasts, z: Array) -> tuple[Array, Array]:
     m, J, _ = z.shape
     A, B = [], []
     for own, V in contrasts.laws:
-        w, shown = contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
-        both = shown * (V.T @ contrasts.u)[:, None]
+        w, turned = contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
+        both = turned * (V.T @ contrasts.u)[:, None]
         B.append((w @ both.reshape(m, -1)).reshape(-1, *both.shape[1:]))
-        A.append(np.broadcast_to((w @ (shown**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
+        A.append(np.broadcast_to((w @ (turned**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
     return np.concatenate(A), np.concatenate(B)
 
 
 def shares(x: Array) -> Array:
     """Return exp(x), its sum over the first axis 1."""
-    found = np.exp(x - x.max(axis=0))
-    return np.asarray(found / found.sum(axis=0))
+    weights = np.exp(x - x.max(axis=0))
+    return np.asarray(weights / weights.sum(axis=0))

@@ -1,4 +1,4 @@
-"""The answer to whether a bias remembers which temperatures came before: seen, none larger than X, or undecided."""
+"""Verdict on whether a bias remembers which temperatures came before: seen, none larger than X, or undecided."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import FEWEST, FINEST, Made, SoakContrasts
+from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, FollowingCurves, SoakContrasts
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
-from driftlab.maps.hysteresis.openings import Sweeps
-from driftlab.maps.hysteresis.shapes import MemoryShapes, shapes_of
+from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import WAYS, SoakSummary
 from fusion_core.chunk import Array
 
@@ -45,7 +44,7 @@ Answer = Literal["seen", "none", "undecided"]
 
 @dataclass(frozen=True, eq=False)
 class MemoryVerdict:
-    """What a soak says of memories, in SI; d axes.
+    """Evidence of a soak for memories, in SI; d axes.
 
     Attributes
     ----------
@@ -56,11 +55,11 @@ class MemoryVerdict:
     size, sigma : (d,) arrays
         Warming less cooling where it is largest, and its standard deviation; NaN where it is unknown.
     none_larger_than : (d,) array
-        What this soak would have shown with 95 %: of up less down, where it is largest; infinite where it is unknown.
+        Difference that would have shown with 95 %: of up less down, where it is largest; infinite where it is unknown.
     where : (d,) array
         Temperature of the largest difference, degC; NaN where it is unknown.
     why : str
-        What the answer stands on; where it is undecided, which soak would tell.
+        Reason of the answer; where it is undecided, which soak would tell.
     evidence : float
         Natural logarithm of how much likelier the soak is with a memory than without; NaN where it was not looked for.
     together : bool
@@ -85,7 +84,7 @@ class MemoryVerdict:
 
     @classmethod
     def unknown(cls, d: int, why: str) -> MemoryVerdict:
-        """Return that nothing can be told on d axes, and why."""
+        """Return the verdict that nothing can be told on d axes, and why."""
         nothing = np.full(d, np.nan)
         return cls("undecided", (), nothing, nothing, np.full(d, np.inf), nothing, why)
 
@@ -116,21 +115,31 @@ class MemoryVerdict:
 
     def as_json(self) -> dict[str, Any]:
         """Return it for programs, in SI; null where a number is unknown."""
-        numbers = ("size", "sigma", "none_larger_than")
-        found = {name: [_finite(value) for value in getattr(self, name)] for name in numbers}
-        where = [_finite(value) for value in self.where]
-        more = {"at_degC": where, "log_evidence": _finite(self.evidence), "why": self.why}
-        return {"answer": self.answer, "kinds": list(self.kinds), **found, **more}
+        names = {"size": "size", "sigma": "sigma", "none_larger_than": "none_larger_than", "at_degC": "where"}
+        numbers = {key: [_finite(value) for value in getattr(self, name)] for key, name in names.items()}
+        rest = {"log_evidence": _finite(self.evidence), "why": self.why}
+        return {"answer": self.answer, "kinds": list(self.kinds), **numbers, **rest}
 
 
 def memory_of(soak: SoakSummary) -> MemoryVerdict:
-    """Return what a soak says of memories of temperature, of all kinds of effects that are installed."""
+    """Return the evidence of a soak for memories of temperature, of all kinds of effects that are installed."""
     d = soak.bias.shape[1]
     reason = _unseen(soak)
     if reason:
         return MemoryVerdict.unknown(d, WHY[reason])
     with _threads().limit(limits=1):  # of small matrices
-        return _weighed(soak, d)
+        contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
+        if not contrasts.laws or not shapes.kinds:
+            return MemoryVerdict.unknown(d, WHY["short"])
+        added = np.repeat(shapes.added[:, :, None], d, axis=2)
+        z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
+        likelihoods, curves = None, None
+        if shapes.inputs.size:
+            noises = np.argmax(contrasts.without, axis=0)
+            slots, more, likelihoods, curves = contrasts.added_by_inputs(shapes.inputs, noises)
+            added, z = np.concatenate([added, slots], axis=1), np.concatenate([z, more], axis=1)
+        evidence = ShapeEvidence.of(contrasts, z, shapes.kinds, likelihoods)
+        return _MemoryTest(soak, contrasts, evidence, z, added, shapes, curves).verdict()
 
 
 @cache
@@ -140,55 +149,41 @@ def _threads() -> Any:
     return ThreadpoolController()
 
 
-def _weighed(soak: SoakSummary, d: int) -> MemoryVerdict:
-    contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
-    if not contrasts.laws or not shapes.kinds:
-        return MemoryVerdict.unknown(d, WHY["short"])
-    own = np.repeat(shapes.added[:, :, None], d, axis=2)
-    z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-    followed, made = None, None
-    if shapes.inputs.size:
-        slots, more, followed, made = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
-        own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
-    found = ShapeEvidence.of(contrasts, z, shapes.kinds, followed)
-    return _Judged(soak, contrasts, found, z, own, shapes, made).memory()
-
-
 def _unseen(soak: SoakSummary) -> str:
-    """Return why no soak like this shows a memory, a key of WHY; empty where it may."""
+    """Return the reason why no soak like this shows a memory, a key of WHY; empty where it may."""
     warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
     if not (warms and cools):
         return "warms" if warms else "cools" if cools else "no way"
     both = (soak.cells(1)[0] > 0) & (soak.cells(-1)[0] > 0)
     if np.mean(both) < SHARED:
         return "apart"
-    return "short" if len(soak.T) < 2 * FEWEST else ""
+    return "short" if len(soak.T) < 2 * MIN_CONTRASTS else ""
 
 
 @dataclass(frozen=True, eq=False)
-class _Judged:
-    """Shapes, what is said of them, as contrasts z (m, J, d) and on the slots, own (S, J, d)."""
+class _MemoryTest:
+    """Shapes and their evidence, as contrasts z (m, J, d) and as the bias that they add on the slots (S, J, d)."""
 
     soak: SoakSummary
     contrasts: SoakContrasts
-    found: ShapeEvidence
+    evidence: ShapeEvidence
     z: Array
-    own: Array
+    added: Array
     shapes: MemoryShapes
-    made: Made | None
+    curves: FollowingCurves | None
 
-    def memory(self) -> MemoryVerdict:
+    def verdict(self) -> MemoryVerdict:
         """Return the answer."""
-        total = self.found.total
+        total = self.evidence.total
         seen = total > SEEN
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.means(self.soak.bias), axis=0)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
-        sized = self if total <= HINT else self._made()
-        noise = np.argmax(self.found.noises, axis=0)
-        pairs = Pairs.of(sized.found, noise, self.contrasts, sized.z, PAIRS) if seen else None
-        size, sigma, where, T, difference, spread = sized._sizes(pairs, self.found)
-        brief = self.found.as_they_are(self.shapes.brief)
+        sized = self if total <= HINT else self._following()
+        noise = np.argmax(self.evidence.noises, axis=0)
+        pairs = Pairs.of(sized.evidence, noise, self.contrasts, sized.z, PAIRS) if seen else None
+        size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
+        brief = self.evidence.as_they_are(self.shapes.brief)
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
             why = "slight"
@@ -197,18 +192,18 @@ class _Judged:
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        said = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
+        reason = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
-        return MemoryVerdict(answer, kinds, size, sigma, unseen, where, said, total, both, T, difference, spread)
+        return MemoryVerdict(answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread)
 
-    def _made(self) -> _Judged:
-        """Return the same of shapes whose curves follow their inputs as the soak says: for their sizes."""
-        if self.made is None:
+    def _following(self) -> _MemoryTest:
+        """Return the same of shapes whose curves follow their inputs, estimated from the soak: for their sizes."""
+        if self.curves is None:
             return self
-        m, added, made = len(self.z), self.found.added, self.made.shown
-        more = self.contrasts.of(made.reshape(len(made), -1)).reshape(m, *made.shape[1:])
-        z, own = (np.concatenate([x[:, :added], y], axis=1) for x, y in ((self.z, more), (self.own, made)))
-        return replace(self, found=self.found.made(self.contrasts, more), z=z, own=own)
+        alone, curves = self.evidence.added, self.curves.added
+        more = self.contrasts.of(curves)
+        z, added = (np.concatenate([x[:, :alone], y], axis=1) for x, y in ((self.z, more), (self.added, curves)))
+        return replace(self, evidence=self.evidence.made(self.contrasts, more), z=z, added=added)
 
     @property
     def _divided(self) -> bool:
@@ -218,7 +213,7 @@ class _Judged:
 
     @cached_property
     def _sweeps(self) -> Sweeps:
-        return Sweeps(self.soak, self.own)
+        return Sweeps(self.soak, self.added)
 
     @cached_property
     def _openings(self) -> tuple[Array, Array]:
@@ -226,18 +221,18 @@ class _Judged:
 
     def _larger(self) -> Array:
         """Return the largest opening (d,) of a shape that is seen with less than 95 %."""
-        noises = np.argmax(self.found.noises, axis=0)
+        noises = np.argmax(self.evidence.noises, axis=0)
         alike = np.empty((len(self.shapes.kinds),) * 2 + (self.z.shape[2],))
         for axis, noise in enumerate(noises):
             gram = self.contrasts.gram(int(noise), self.z[:, :, axis])
             size = np.maximum(np.diag(gram), 1e-300)
             alike[:, :, axis] = gram**2 / size / size[:, None]
-        shown = self.found.would_show(np.minimum(alike, 1.0)) * np.abs(self._openings[0])
-        return np.asarray(np.max(shown, axis=0) * self.contrasts.scale)
+        sizes = self.evidence.would_show(np.minimum(alike, 1.0)) * np.abs(self._openings[0])
+        return np.asarray(np.max(sizes, axis=0) * self.contrasts.scale)
 
     def _kinds(self, pairs: Pairs) -> tuple[tuple[str, ...], bool]:
         """Return the kinds that are likely, the likeliest first, and whether two of them are there together."""
-        names, each = [{kind} for kind in self.shapes.kinds], self.found.weights
+        names, each = [{kind} for kind in self.shapes.kinds], self.evidence.weights
         both = pairs.evidence > TWO
         if both:
             names, each = [{self.shapes.kinds[j] for j in which} for which in pairs.which], pairs.weights
@@ -249,18 +244,18 @@ class _Judged:
         order = sorted(weights, key=lambda kind: -weights[kind])
         return tuple(kind for kind in order if weights[kind] > ALIKE * weights[order[0]]), both
 
-    def _sizes(self, pairs: Pairs | None, found: ShapeEvidence) -> tuple[Array, ...]:
+    def _sizes(self, pairs: Pairs | None, evidence: ShapeEvidence) -> tuple[Array, ...]:
         """Return size, sigma, where (d,) and T (G,), difference and spread (G, d): over all shapes, as likely as each.
 
         Of pairs of shapes too, where they are given.
         """
-        mean, variance = self.found.estimates
+        mean, variance = self.evidence.estimates
         opening, at = self._openings
         per_kelvin = self._sweeps.mean_differences()
-        formed = self._forms(found)
+        formed = self._forms(evidence)
         power = pairs.power if pairs is not None else 1.0
         share = 1 / (1 + np.exp(power * np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
-        weights, forms = found.tempered(power) * share, formed
+        weights, forms = evidence.tempered(power) * share, formed
         sizes, variances = [*(mean * opening)], [*(variance * opening**2)]
         curves, spreads = [*np.moveaxis(mean * per_kelvin, 1, 0)], [*np.moveaxis(variance * per_kelvin**2, 1, 0)]
         if pairs is not None:
@@ -275,31 +270,31 @@ class _Judged:
                 spreads.append(np.einsum("Gqd,qrd,Grd->Gd", each, covariance, each))
         among = np.array(sizes)
         sign = np.sign(np.tensordot(weights, among, axes=1))
-        both = self._sweeps.both_ways() & (np.arange(len(mean)) >= found.added)[:, None]
+        both = self._sweeps.both_ways() & (np.arange(len(mean)) >= evidence.added)[:, None]
         among[: len(mean)] = np.where(both, np.abs(among[: len(mean)]) * sign, among[: len(mean)])
         size, sigma = _mixed(weights, among, np.array(variances), forms)
         difference, spread = _mixed(weights, np.array(curves), np.array(spreads), forms)
-        where = at[int(np.argmax(found.weights))]
+        where = at[int(np.argmax(evidence.weights))]
         scale = self.contrasts.scale
         return size * scale, sigma * scale, where, self._sweeps.T, difference * scale, spread * scale
 
-    def _forms(self, found: ShapeEvidence) -> Array:
-        """Return how far off the form of each shape may be, of its size (J, d): that of a curve is an estimate."""
+    def _forms(self, evidence: ShapeEvidence) -> Array:
+        """Return the relative error of the form of each shape (J, d): that of a curve is an estimate."""
         forms = np.full(self.z.shape[1:], FORM)
-        if self.made is None:
+        if self.curves is None:
             return forms
-        inputs, noises = self.shapes.inputs, np.argmax(found.noises, axis=0)
-        seen = Sweeps(self.soak, inputs[:, :, None]).shown[..., 0]
-        between = np.empty((inputs.shape[1], len(noises), self.made.coefficients.shape[1]))
+        inputs, noises = self.shapes.inputs, np.argmax(evidence.noises, axis=0)
+        there = Sweeps(self.soak, inputs[:, :, None]).shown[..., 0]
+        between = np.empty((inputs.shape[1], len(noises), self.curves.coefficients.shape[1]))
         for j, axis in np.ndindex(*between.shape[:2]):
-            above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, found.added + j, axis])
-            up, down = self.contrasts.curve(np.nan_to_num([seen[above, g, j], seen[below, g, j]]))
+            above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, evidence.added + j, axis])
+            up, down = self.contrasts.curve(np.nan_to_num([there[above, g, j], there[below, g, j]]))
             between[j, axis] = up - down
-        s2 = np.nan_to_num(np.take_along_axis(found.left, noises[None], axis=0)[0]) / found.m
-        variances = self.contrasts.form_variances(inputs, self.made, noises, np.maximum(s2, FINEST), between)
-        wide = np.abs(self._openings[0][found.added :])
+        s2 = np.nan_to_num(np.take_along_axis(evidence.left, noises[None], axis=0)[0]) / evidence.m
+        variances = self.contrasts.form_variances(inputs, self.curves, noises, np.maximum(s2, FINEST), between)
+        wide = np.abs(self._openings[0][evidence.added :])
         some = wide > 0
-        forms[found.added :] = np.hypot(FORMED, np.sqrt(variances) / np.where(some, wide, np.inf))
+        forms[evidence.added :] = np.hypot(FORMED, np.sqrt(variances) / np.where(some, wide, np.inf))
         return forms
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from driftlab.identification.records import Evidence, Record, missing_excitation, ways
+from driftlab.identification.records import Evidence, Record, missing_excitation
+from driftlab.soak.sweeps import ways
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from sensors_at_rest import DT, simulated
 
-from driftlab.noise.allan import curve
+from driftlab.noise.allan import curve, places, spans
 from driftlab.noise.allan_fit import fit
-from driftlab.noise.allan_gaps import places, spans
 from driftlab.noise.allan_model import KEYS, design
 from driftlab.noise.stretches import NEVER, pieces
 

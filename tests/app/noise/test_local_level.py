@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.noise.local_level import effective, fitted
+from driftlab.noise.local_level import effective, fit_local_level
 
 
 @pytest.mark.parametrize(("walk", "white"), [(0.05, 1.0), (0.3, 1.0), (2.0, 1.0)])
@@ -15,7 +15,7 @@ def test_the_noise_is_that_of_a_local_level(walk, white):
     likelier = structural.UnobservedComponents(x, level="local level").fit(disp=False)
     r, q = likelier.params
     P = (q + np.sqrt(q**2 + 4 * q * r)) / 2  # steady prediction of the level
-    found = fitted([x])
+    found = fit_local_level([x])
     assert found.gain == pytest.approx(P / (P + r), rel=0.1)
     assert found.variance == pytest.approx(P + r, rel=0.01)
     assert found.white == pytest.approx(r, rel=0.1)

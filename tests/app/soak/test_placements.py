@@ -63,7 +63,7 @@ def test_six_placements_tell_bias_and_scale_factor_within_their_deviations():
     bias, told = placed(T, f, number, G, UNSURE)
     levels = told.levels
     assert [levels.level(axis) for axis in range(3)] == ["told"] * 3
-    assert np.all(levels.scale_told)
+    assert np.all(levels.scale_determined)
     true = b + curve(T).mean(axis=0)
     assert np.all(np.abs(levels.bias - true) < 4 * levels.sigma)
     assert np.all(levels.sigma < 1e-3)
@@ -71,7 +71,7 @@ def test_six_placements_tell_bias_and_scale_factor_within_their_deviations():
     assert np.all(np.abs(levels.scale - scale) < 3 * levels.scale_sigma)
     for axis in range(3):
         found = told.changes[axis]
-        assert found.told
+        assert found.determined
         assert abs(found.value - change[axis]) < 4 * found.sigma
     np.testing.assert_allclose(bias.mean(axis=0), levels.bias, atol=1e-6)
 
@@ -101,7 +101,7 @@ def test_what_one_placement_does_not_tell_is_said():
     T, f, number = unit(np.random.default_rng(0), [np.array([0.0, 0.0, 1.0])])
     _, told = placed(T, f, number, G, UNSURE)
     assert [told.levels.level(axis) for axis in range(3)] == ["tilt", "tilt", "scale"]
-    assert not any(change.told for change in told.changes)
+    assert not any(change.determined for change in told.changes)
     assert abs(told.levels.bias[2] - (0.08 + curve(T)[:, 2].mean())) < 0.01
     np.testing.assert_allclose(told.levels.bias[:2], 0, atol=1e-3)
     lines = sentences(told, "xyz", MG)

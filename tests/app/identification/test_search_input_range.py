@@ -5,8 +5,8 @@ import pytest
 from rows_at_rest import C_VOLTAGE, PLAY, SLIP, VOLTAGE, evidence, known, search_of, signature
 
 from driftlab.identification.acceptance import CandidateEvidence
-from driftlab.identification.input_range import does_not_carry_over, inputs
 from driftlab.identification.least_squares import Term
+from driftlab.identification.search import does_not_carry_over, inputs
 from driftlab.identification.state import Trial
 from fusion_plugins.effects.curve import Curve
 from fusion_plugins.effects.drift import Drift

@@ -1,16 +1,21 @@
 """Noise by maximum likelihood against the noise that was put in, and against the likelihood's own definition."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
-from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_core.errors import SingularFit
+
+sys.path.insert(0, str(Path(__file__).parent.parent.parent / "examples"))
+from noise_by_likelihood import fit_noise
 
 
 def config(noise="3.18 deg/h/sqrt(Hz)", walk="1.5e-4 deg/s/sqrt(s)"):
