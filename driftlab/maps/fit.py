@@ -83,7 +83,7 @@ def fit_gathered(
     """Fit a thermal map on samples; its provenance has `more` too."""
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
     try:
-        fitted = settings.fit(soak.T, soak.bias, about)
+        fitted = settings.fit(_with_ends_as_read(soak), soak.bias, about)
     except (SingularFit, SwingTooSmall) as error:
         unused = soak.used.sentence()
         raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
@@ -95,6 +95,21 @@ def fit_gathered(
     averaged = residual.as_record(soak.interval * len(soak.T))
     fitted = replace(fitted, record=fitted.record.model_copy(update=averaged))
     return of_sensor(config, of_thermometer(fitted, soak.steps))
+
+
+def _with_ends_as_read(soak: GatheredSoak) -> Array:
+    """Return the temperatures (N,) in degC, the coldest and the warmest as they were read if smoothing drew them in.
+
+    Without the thermometer's steps they lie within half a step of their readings; a map of them would have to be
+    continued by hundredths of a kelvin, over knots that no sample determines, for the readings of its own soak.
+    """
+    T, near = soak.T.copy(), soak.steps.size / 2 + 3 * soak.steps.noise
+    coldest, warmest = int(np.argmin(T)), int(np.argmax(T))
+    if 0 < T[coldest] - soak.used.low <= near:
+        T[coldest] = soak.used.low
+    if 0 < soak.used.high - T[warmest] <= near:
+        T[warmest] = soak.used.high
+    return T
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:

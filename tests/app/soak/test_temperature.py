@@ -1,5 +1,6 @@
 """The temperature of a soak out of readings that are rounded, and how sure a map is that was fitted on it."""
 
+import h5py
 import numpy as np
 import pytest
 from foreign_soaks import behind
@@ -118,6 +119,19 @@ def test_a_map_of_a_fine_thermometer_keeps_its_ends(tmp_path):
     draw(0, 0, "FOG", step=0.0, profile="soak", rate=1.0, hours=2.0).save(tmp_path / "soak.h5")
     fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
     assert of_thermometer(fitted, NO_STEPS).record == fitted.record
+
+
+@pytest.mark.parametrize("step", [0.125, 1.0])
+def test_a_map_ends_where_its_soak_was_read(tmp_path, step):
+    """Not a knot beyond, where no sample is: straight on from the last two coefficients is wrong by any amount."""
+    (tmp_path / "unit.yaml").write_text(config("MEMS"))
+    draw(1, 0, "MEMS", step=step, noise=0.02, profile="soak", rate=1.0, hours=3.0).save(tmp_path / "soak.h5")
+    with h5py.File(tmp_path / "soak.h5") as file:
+        T = file["temperature"][:]
+    fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
+    assert fitted.domain[0] <= T.min() < T.max() <= fitted.domain[1]
+    assert fitted.domain == pytest.approx((T.min(), T.max()), abs=0.5 * step + 0.06)
+    assert fitted.record.samples <= len(T)
 
 
 def test_recordings_share_the_steps_of_their_thermometer():
