@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units
 from driftlab.config import Config
-from fusion_core.errors import ConfigError, FusionError, shown
+from fusion_core.errors import ConfigError, FusionError, quote
 
 if TYPE_CHECKING:
     from driftlab.commands.allan import allan
@@ -122,4 +122,4 @@ def _check_form(name: str, value: Any, annotation: str) -> None:
         written = repr(value)
     except Exception:  # whatever a stranger's object, or an integer of 5,000 digits, makes of it
         written = "what cannot be written down"
-    raise ConfigError(f"{name}: is {shown(written)}, of type {type(value).__name__}; give {expected}")
+    raise ConfigError(f"{name}: is {quote(written)}, of type {type(value).__name__}; give {expected}")

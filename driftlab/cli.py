@@ -163,7 +163,7 @@ def _open_streams() -> None:
 
 
 def _run() -> None:
-    from fusion_core.errors import ConfigError, shown
+    from fusion_core.errors import ConfigError, quote
 
     if "--debug" in sys.argv:  # of every command: what a plugin raised is shown whole
         sys.argv.remove("--debug")
@@ -172,13 +172,13 @@ def _run() -> None:
         value, least = os.environ.get(name, "1"), int(name.endswith("THREADS"))
         if not (value.isdecimal() and int(value) >= least):
             raise ConfigError(
-                f"{name}='{shown(value)}': a whole number from {least} on was expected of this variable; unset it"
+                f"{name}='{quote(value)}': a whole number from {least} on was expected of this variable; unset it"
             )
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
-            raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
+            raise ConfigError(f"'{quote(argument)}': is not UTF-8 text; rename the file, results could not name it")
         if CONTROL.search(argument):
-            raise ConfigError(f"'{shown(argument)}': has a control character; rename the file, or leave it out")
+            raise ConfigError(f"'{quote(argument)}': has a control character; rename the file, or leave it out")
     columns = os.environ.get("COLUMNS", "")
     if columns.isdecimal() and int(columns) < MIN_COLUMNS:
         del os.environ["COLUMNS"]

@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 
 from driftlab.storage.in_memory import CopyName, InMemoryName
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
-from fusion_core.errors import ConfigError, UnitError, shown
+from fusion_core.errors import ConfigError, UnitError, quote
 from fusion_core.escaping import is_plain
 from fusion_core.host.config import Document, override, read_document, validate
 from fusion_core.host.registry import Installed, registry
@@ -230,7 +230,7 @@ def _seconds(text: str, recording: str) -> float | None:
         return None
     if not NUMBER.fullmatch(text) or not abs(float(text)) <= LIMITS["s"][1]:
         raise ConfigError(
-            f"'{shown(recording, 200)}': '{shown(text)}' is not a number of seconds; write PATH::START:STOP"
+            f"'{quote(recording, 200)}': '{quote(text)}' is not a number of seconds; write PATH::START:STOP"
         )
     return Quantity(float(text), f"{text} s", "s")
 
@@ -245,7 +245,7 @@ def _serial(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if isinstance(value, str) and not (0 < len(value) <= LONGEST and is_plain(value) and value == value.strip()):
-        raise _problem(f"'{shown(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
+        raise _problem(f"'{quote(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
     return value
 
 

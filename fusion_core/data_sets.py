@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, UNWRITTEN, TimeBudget, check_size, size_of
-from fusion_core.errors import UnreadableFile, shown
+from fusion_core.errors import UnreadableFile, quote
 
 if TYPE_CHECKING:
     import h5py
@@ -85,7 +85,7 @@ def attribute(path: Path, node: h5py.Group | h5py.Dataset, name: str) -> Any:
     if name not in node.attrs:
         return None
     held = node.attrs.get_id(name)
-    what = f"the attribute '{shown(name)}' of '{shown(node.name)}'"
+    what = f"the attribute '{quote(name)}' of '{quote(node.name)}'"
     count, kind = math.prod(held.shape), held.dtype
     check_size(path, what, count * held.get_type().get_size(), ATTRIBUTE)
     most = TEXTS if h5py.check_string_dtype(kind) or h5py.check_vlen_dtype(kind) else ATTRIBUTE
@@ -121,7 +121,7 @@ class DataSetRows:
 
     def __init__(self, path: Path, node: h5py.Dataset, axis: int = 0) -> None:
         self.path, self.node, self.axis = path, node, axis
-        self.name = shown(node.name or "").strip("/")
+        self.name = quote(node.name or "").strip("/")
         self._plan = node.id.get_create_plist()
         self._check_place()
         self.written, self._largest = self._storage()
@@ -192,7 +192,7 @@ class DataSetRows:
         chunks, width = self.node.chunks, self.node.dtype.itemsize
         codes = [code for code, *_ in self.filters]
         if unknown := next((entry for entry in self.filters if entry[0] not in RATIO), None):
-            name = shown(unknown[3].decode("utf-8", "replace"))
+            name = quote(unknown[3].decode("utf-8", "replace"))
             raise self._refused(f"is compressed with filter {unknown[0]} ('{name}'), gzip, lzf or szip was expected")
         whole = math.prod(chunks) * width
         row = width * math.prod(n for k, n in enumerate(self.node.shape) if k != self.axis)

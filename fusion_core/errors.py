@@ -39,16 +39,16 @@ def seconds(t: float) -> str:
     return f"{whole}0 s" if whole.endswith(".") else f"{whole} s"
 
 
-def shown(text: object, most: int = 60) -> str:
+def quote(text: object, most: int = 60) -> str:
     """Return a text that someone else wrote, as it can stand in a message: short, and without control characters."""
     plain = str(text)
     short = plain if len(plain) <= most else f"{plain[: most - 3]}..."
     return line(short)
 
 
-def told(error: BaseException, most: int = 200) -> str:
+def describe_error(error: BaseException, most: int = 200) -> str:
     """Return the name of an error and what it says, as it can stand in a message."""
-    text = shown(error, most)
+    text = quote(error, most)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 

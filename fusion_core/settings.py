@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from fusion_core.errors import shown
+from fusion_core.errors import quote
 
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
@@ -31,7 +31,7 @@ def _beside_config(value: Any, info: ValidationInfo) -> Any:
     if isinstance(value, int | float):
         text = f"{value} is a number, a path is text; write it in quotes"
     elif isinstance(value, str) and not can_be_path(value):
-        text = f"'{shown(value)}' cannot be a path; write a shorter one"
+        text = f"'{quote(value)}' cannot be a path; write a shorter one"
     if text is not None:
         raise PydanticCustomError("path", "{text}", {"text": text})
     return folder / value if folder and isinstance(value, str) and value != "-" else value

@@ -39,7 +39,7 @@ from fusion_core.contracts import (
     ThermalMap,
 )
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, Unwritable, shown
+from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, Unwritable, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
@@ -325,7 +325,7 @@ def _fresh(folder: Path, t: Array) -> Flags:
             moments = np.asarray(summary.get("aligned_again_s", []), dtype=np.float64)
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise UnreadableFile(
-                f"{path}: is damaged ({shown(error, 120)}); write it anew with `driftlab run`"
+                f"{path}: is damaged ({quote(error, 120)}); write it anew with `driftlab run`"
             ) from None
         again = np.searchsorted(t, moments.ravel(), side="right")
         fresh[again[again < len(t)]] = True

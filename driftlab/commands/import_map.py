@@ -17,7 +17,7 @@ from driftlab.commands.export import SHOWN, exporter_of, installed
 from driftlab.commands.inputs import Place
 from driftlab.storage.map_file import check_place, save
 from fusion_core.contracts import Calibrated, FittedMap, ReadBack, ThermalMap
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.escaping import json_of
 
 PLACES = 2001  # temperatures at which a calibration is taken over
@@ -100,7 +100,7 @@ def import_map(
         fitted = replace(fitted, record=fitted.record.model_copy(update={**unknown, **sensor}))
     except ValidationError as error:
         raise ConfigError(
-            f"{path}: is of no sensor that can be named ({shown(error.errors()[0]['msg'], 120)}); mend its channel, "
+            f"{path}: is of no sensor that can be named ({quote(error.errors()[0]['msg'], 120)}); mend its channel, "
             "unit and axes"
         ) from None
     save(fitted, place)

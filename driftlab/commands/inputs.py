@@ -11,7 +11,7 @@ from driftlab.commands.result import Result
 from driftlab.config import Config, load_config, products, understood, with_recording
 from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.host.config import document_of
 
 Place = str | PathLike[str]  # a file or a folder
@@ -62,7 +62,7 @@ def recording_of(data: DataLike, units: Units | None = None, title: str = "data"
     """
     if isinstance(data, str | PathLike | Source):
         if units:
-            raise ConfigError(f"units: are given with {shown(data, 200)}, which says them itself; leave units out")
+            raise ConfigError(f"units: are given with {quote(data, 200)}, which says them itself; leave units out")
         return InMemoryName(data) if isinstance(data, Source) else str(data)
     if isinstance(data, Result):
         title, known = data.name, data.units

@@ -28,7 +28,7 @@ from driftlab.commands.result import Result
 from driftlab.config import Config
 from driftlab.evaluation.limits import verdict
 from driftlab.evaluation.overview import Overview, overview_of, survey
-from driftlab.evaluation.run_limits import averages_of, judged, map_of
+from driftlab.evaluation.run_limits import averages_of, check_run_limits, map_of
 from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
@@ -65,7 +65,7 @@ class RunResult(Result):
         self.recorded = recorded  # the file in which a live run has kept what came
         alignment, averages = journal.alignments[0], averages_of(config, journal.alignments[0])
         overview = survey_of(model, alignment, first_row=journal.faults.first_row, averages=averages)
-        self.overview, self.judged = overview, judged(config, overview, alignment, averages)
+        self.overview, self.judged = overview, check_run_limits(config, overview, alignment, averages)
         self.limits_verdict = self.verdict = verdict(self.judged)
         self.name = f"{config.file.stem}: {config.recording}" if config.file else config.recording
         self.units, self._columns = units_of(model), columns

@@ -22,7 +22,7 @@ from driftlab.config import Config
 from driftlab.evaluation import limits, ranking
 from driftlab.evaluation.limits import LimitResult
 from driftlab.evaluation.overview import Overview, overview_of
-from driftlab.evaluation.run_limits import averages_of, judged
+from driftlab.evaluation.run_limits import averages_of, check_run_limits
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
@@ -177,7 +177,7 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     first = journal.alignments[0]
     averages = averages_of(config, first)
     overview = overview_of(nominal.estimates, run.model, first, first_row=journal.faults.first_row, averages=averages)
-    results = tuple(judged(config, overview, first, averages))
+    results = tuple(check_run_limits(config, overview, first, averages))
     return Comparison(residual, nominal, offset, overview, run.model, journal, results, initial)
 
 

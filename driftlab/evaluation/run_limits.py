@@ -44,7 +44,9 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     return Averages(alignment.dt, sensor.axes, explained)
 
 
-def judged(config: Config, overview: Overview, alignment: Alignment, averages: Averages | None) -> list[LimitResult]:
+def check_run_limits(
+    config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
+) -> list[LimitResult]:
     """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
     if config.limits is None or config.filter is None:
         return []

@@ -131,7 +131,7 @@ def own_curve(soaked: UnitInformation) -> Array:
     return np.stack(solved)
 
 
-class EffectColumns:
+class UnitRows:
     """Rows of a unit under its own noise, and effects in them.
 
     Parameters

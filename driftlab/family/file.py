@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from driftlab import __version__
 from driftlab.family.mixed_model import FROM_FILE, Family
 from fusion_core.budget import read_whole
-from fusion_core.errors import MapError, Unwritable, shown
+from fusion_core.errors import MapError, Unwritable, quote
 from fusion_core.thermal.map_file import write_whole
 from fusion_core.thermal.record_texts import parse_json
 
@@ -55,9 +55,9 @@ def read_family(path: Path) -> Family:
         return Family.model_validate(parse_json(text), context=FROM_FILE)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        damage = f": {shown('.'.join(map(str, first['loc']))) or 'file'}: {shown(first['msg'])}"
+        damage = f": {quote('.'.join(map(str, first['loc']))) or 'file'}: {quote(first['msg'])}"
     except (ValueError, RecursionError) as error:
-        damage = f" ({shown(error, 120)})"
+        damage = f" ({quote(error, 120)})"
     raise MapError(f"family {path} is damaged or no family's file{damage}; fit the family again with driftlab fleet")
 
 
@@ -78,7 +78,7 @@ def load_family(
     ):  # fmt: skip
         if wanted is not None and has != wanted:
             raise MapError(
-                f"family {path} has the {what} {shown(has)}, the config {shown(wanted)}; name a family of the sensor "
+                f"family {path} has the {what} {quote(has)}, the config {quote(wanted)}; name a family of the sensor "
                 "that the config is about"
             )
     return family

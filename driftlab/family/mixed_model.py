@@ -28,7 +28,7 @@ from driftlab.family.bands import Bands
 from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
-from driftlab.family.reml import AxisFit, Index, Means, VarianceComponents, fit_axis, means_of, outlier_weights
+from driftlab.family.reml import Index, Means, RemlFit, VarianceComponents, fit_axis, means_of, outlier_weights
 from driftlab.family.tail_law import TailLaws
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
@@ -91,7 +91,7 @@ def fit_family(
     )  # fmt: skip
 
 
-def _fit(of_axis: tuple[Array, Array, Index, Array]) -> AxisFit:
+def _fit(of_axis: tuple[Array, Array, Index, Array]) -> RemlFit:
     return fit_axis(*of_axis)
 
 
@@ -144,7 +144,7 @@ def _sample(units: FamilyUnits, knots: SplineBasis, chosen: set[int]) -> tuple[A
 
 
 def _means_of_all(
-    units: FamilyUnits, knots: SplineBasis, fits: list[AxisFit], present: Array, lot: list[int]
+    units: FamilyUnits, knots: SplineBasis, fits: list[RemlFit], present: Array, lot: list[int]
 ) -> list[Means]:
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
     d, q, G = len(fits), knots.q, max(lot) + 1

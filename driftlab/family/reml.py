@@ -195,7 +195,7 @@ def change(before: VarianceComponents, after: VarianceComponents) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class AxisFit:
+class RemlFit:
     """Result of the fit of an axis.
 
     `w` (n,) are the weights, `limit` the share of the expected distance beyond which they fall, `steps` how many EM
@@ -210,7 +210,7 @@ class AxisFit:
     moved: float
 
 
-def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> AxisFit:
+def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> RemlFit:
     """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC."""
     q, lots = J.shape[1], int(lot.max()) > 0
     prior = initial_prior(peaks, initial_scale(J, h))
@@ -232,7 +232,7 @@ def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> AxisFit:
             w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
         if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
             break
-    return AxisFit(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
+    return RemlFit(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
 
 
 def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, columns_of, seen_temperatures
+from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, columns_of, seen_temperatures
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
@@ -271,7 +271,7 @@ def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> Un
         if effect.acts_on_input:
             continue
         try:
-            c = EffectColumns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
+            c = UnitRows(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
         except MissingChannel:
             continue
         for own, z in zip(bias, columns_of([effect], soaked, chunks), strict=True):
@@ -284,7 +284,7 @@ def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> Un
 
 def _contrast(soaked: UnitInformation, taken: Sequence[tuple[Offer, Effect]], k: int) -> _UnitContrast:
     offer, effect = taken[k]
-    columns = EffectColumns(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
+    columns = UnitRows(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
     contrasts = columns.contrasts([effect], [offer.size])
     try:
         c, covariance = columns.estimates(effect)

@@ -31,7 +31,7 @@ from itertools import pairwise
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, of_each_axis, own_curve
+from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.candidates import installed
@@ -181,7 +181,7 @@ def contrasts_of(
 def _contrasts(
     effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], soaked: UnitInformation
 ) -> EffectContrasts:
-    return EffectColumns(soaked, beside).contrasts(effects, sizes)
+    return UnitRows(soaked, beside).contrasts(effects, sizes)
 
 
 def together(units: Sequence[EffectContrasts]) -> EffectContrasts:
@@ -297,7 +297,7 @@ def _squares(sample: Sequence[UnitInformation], effects: Sequence[Effect], each:
 
 
 def _square(effects: Sequence[Effect], soaked: UnitInformation) -> float:
-    return sum(float(r @ r) for r in EffectColumns(soaked, effects).r)
+    return sum(float(r @ r) for r in UnitRows(soaked, effects).r)
 
 
 def _of_right_size(

@@ -22,7 +22,7 @@ from driftlab.identification.state import Search, name_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.table import auxiliary
-from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, shown
+from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, quote
 from fusion_core.host.registry import kind_of, registry
 from fusion_core.settings import nearest
 
@@ -78,7 +78,7 @@ def check_kinds(kinds: Collection[str], option: str = "--without") -> None:
         if kind not in known:
             hint = nearest(kind, known)
             raise ConfigError(
-                f"{option} {shown(kind)}: is no installed effect; "
+                f"{option} {quote(kind)}: is no installed effect; "
                 + (f"did you mean {hint}?" if hint else f"known: {', '.join(known)}")
             )
 

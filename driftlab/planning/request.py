@@ -14,7 +14,7 @@ from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Twin
-from fusion_core.errors import ConfigError, UnitError, shown
+from fusion_core.errors import ConfigError, UnitError, quote
 from fusion_core.faults import RANGES
 from fusion_core.units import LIMITS, to_si
 from fusion_core.units.grammar import NUMBER
@@ -78,7 +78,7 @@ def parse_request(
 def _check_hours(hours: Any) -> None:
     number = isinstance(hours, int | float | np.integer | np.floating)
     if not (number and HOURS[0] <= hours <= HOURS[1]):
-        given = shown(repr(hours)) if not number else "beyond 1e300" if abs(hours) > 1e300 else f"{hours:g}"
+        given = quote(repr(hours)) if not number else "beyond 1e300" if abs(hours) > 1e300 else f"{hours:g}"
         raise ConfigError(f"--hours {given}: is not a length that can be meant; write hours from 0.01 to 10000")
 
 
@@ -90,14 +90,14 @@ def quantity(name: str, text: str, unit: str) -> float:
         raise ConfigError(f"--{name}: {error}") from None
     low, high = LIMITS.get(unit, (1e-30, 1e30))
     if number and not low <= abs(number) <= high:
-        raise ConfigError(f"--{name} {shown(text)}: is not a size that can be meant; correct it")
+        raise ConfigError(f"--{name} {quote(text)}: is not a size that can be meant; correct it")
     return number
 
 
 def _walk(text: str, unit: str) -> Array:
     parts = [quantity("walk", part, f"{unit}/sqrt(s)") for part in text.split(",")]
     if min(parts) < 0:
-        raise ConfigError(f"--walk {shown(text)}: is negative; write a density of zero or more")
+        raise ConfigError(f"--walk {quote(text)}: is negative; write a density of zero or more")
     return np.array(parts)
 
 
@@ -124,4 +124,4 @@ def read_range(text: str) -> tuple[float, float]:
         with_unit = re.search(r"[A-Za-z°]\s*$", low) and not NUMBER.fullmatch(low.strip())
         with suppress(UnitError):
             return to_si(low if with_unit else f"{low.strip()} {unit}", "degC"), to_si(rest, "degC")
-    raise ConfigError(f"--range {shown(text)}: is no range of temperature; write e.g. --range '-20..50 degC'")
+    raise ConfigError(f"--range {quote(text)}: is no range of temperature; write e.g. --range '-20..50 degC'")

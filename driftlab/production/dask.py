@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 from driftlab import __version__
 from driftlab.errors import WorkersError
 from driftlab.production.workers import WorkerLost, Workers, failure
-from fusion_core.errors import shown, told
+from fusion_core.errors import describe_error, quote
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -59,7 +59,8 @@ class Scheduler(Workers):
             self._client = Client(self.address, timeout=self.patience, set_as_default=False)
         except (OSError, ValueError) as error:
             raise WorkersError(
-                f"--scheduler {shown(self.address, 200)}: no Dask scheduler answers there ({told(error)}); start one "
+                f"--scheduler {quote(self.address, 200)}: no Dask scheduler answers there "
+                f"({describe_error(error)}); start one "
                 "with dask scheduler, and give the address that it says, as tcp://10.0.0.1:8786"
             ) from None
         return self

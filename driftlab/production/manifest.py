@@ -28,7 +28,7 @@ from pathlib import Path
 
 from driftlab.production.remote import is_url, system_of
 from fusion_core.budget import COUNT, PIECE, TEXT, read_whole, size_of
-from fusion_core.errors import ConfigError, shown, told
+from fusion_core.errors import ConfigError, describe_error, quote
 from fusion_core.escaping import is_plain
 
 ROLES = {
@@ -110,7 +110,7 @@ def _of_pattern(pattern: str) -> Manifest:
     first: dict[str, str] = {}
     for name, path in zip(names, paths, strict=True):
         if why := _name_mistake(name):
-            raise ConfigError(f"--units {pattern}: {path} makes a unit '{shown(name)}', which {why}; write a manifest")
+            raise ConfigError(f"--units {pattern}: {path} makes a unit '{quote(name)}', which {why}; write a manifest")
         if (other := first.setdefault(name, path)) != path:
             raise ConfigError(f"--units {pattern}: {other} and {path} are both of unit {name}; write a manifest")
     entries = (
@@ -150,15 +150,15 @@ def _entries(text: str, name: str, folder: str) -> list[ManifestEntry]:
     for number, row in lines:
         unit, role, path = row["unit"], row.get("role", "").lower(), row["path"]
         if why := _name_mistake(unit):
-            wrong.add(number, f"unit '{shown(unit)}' {why}; name it otherwise")
+            wrong.add(number, f"unit '{quote(unit)}' {why}; name it otherwise")
         if role not in ROLES:
-            wrong.add(number, f"role '{shown(role)}' is not known; write calibration (or soak), train or holdout")
+            wrong.add(number, f"role '{quote(role)}' is not known; write calibration (or soak), train or holdout")
             continue
         if not path:
-            wrong.add(number, f"unit {shown(unit)} has no path; name its recording")
+            wrong.add(number, f"unit {quote(unit)} has no path; name its recording")
         before = paths.setdefault(os.path.normpath(path) if not is_url(path) else path, (number, unit, ROLES[role]))
         if before[0] != number and not (before[1] == unit and {before[2], ROLES[role]} == {"calibration", "train"}):
-            wrong.add(number, f"path {shown(path, 200)} is in line {before[0]} already; name each recording once")
+            wrong.add(number, f"path {quote(path, 200)} is in line {before[0]} already; name each recording once")
         units.setdefault(unit, []).append((number, row))
     entries = [_entry(unit, rows, folder, wrong) for unit, rows in units.items()]
     wrong.raise_any()
@@ -175,11 +175,11 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     names = [column.lower() if column.lower() in COLUMNS else column for column in header]
     for column in ("unit", "path"):
         if column not in names:
-            has = f"it has {', '.join(map(shown, names))}" if any(names) else "it is empty"
+            has = f"it has {', '.join(map(quote, names))}" if any(names) else "it is empty"
             raise ConfigError(f"--units {name}: has no column '{column}' ({has}); a manifest needs unit and path")
     twice = sorted({column for column in names if names.count(column) > 1})
     if twice:
-        raise ConfigError(f"--units {name}: column '{shown(twice[0])}' is there twice; name each once")
+        raise ConfigError(f"--units {name}: column '{quote(twice[0])}' is there twice; name each once")
     rows, wrong, held = list[tuple[int, dict[str, str]]](), _Mistakes(name), 0
     try:
         for cells in reader:
@@ -210,22 +210,22 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, w
         recordings.setdefault(role, []).append(_placed(folder, row["path"]))
         for column in (name for name in row if not (is_plain(name) and is_plain(row[name]) and len(row[name]) <= TEXT)):
             wrong.add(
-                number, f"column {shown(column)} has '{shown(row[column])}', which is no text of one line; mend it"
+                number, f"column {quote(column)} has '{quote(row[column])}', which is no text of one line; mend it"
             )
         if lot := row.get("lot", ""):
             lots.setdefault(lot, number)
         if date := row.get("date", ""):
             if not _is_date(date):
-                wrong.add(number, f"date '{shown(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05")
+                wrong.add(number, f"date '{quote(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05")
             dates.setdefault(role, date)
         for column, value in row.items():
             if column not in COLUMNS and value:
                 more.setdefault(column, {})[value] = None
     if len(lots) > 1:
         (one, _), (other, number) = list(lots.items())[:2]
-        wrong.add(number, f"unit {shown(unit)} is of lot {shown(other)} here and of {shown(one)} before; name one")
+        wrong.add(number, f"unit {quote(unit)} is of lot {quote(other)} here and of {quote(one)} before; name one")
     if "calibration" not in recordings:
-        wrong.add(rows[0][0], f"unit {shown(unit)} has no recording to fit on; give it one of the role calibration")
+        wrong.add(rows[0][0], f"unit {quote(unit)} has no recording to fit on; give it one of the role calibration")
     return ManifestEntry(
         unit,
         next(iter(lots), ""),
@@ -275,7 +275,9 @@ def matching(pattern: str) -> list[str]:
     try:
         return sorted(map(system.unstrip_protocol, system.glob(path)))
     except Exception as error:  # of any of its back ends
-        raise ConfigError(f"--units {pattern}: cannot be listed ({told(error)}); check address and rights") from None
+        raise ConfigError(
+            f"--units {pattern}: cannot be listed ({describe_error(error)}); check address and rights"
+        ) from None
 
 
 def read_text(path: str) -> str:
@@ -293,5 +295,5 @@ def read_text(path: str) -> str:
         raise ConfigError(f"--units {path}: is not UTF-8 text; save it as CSV in UTF-8") from None
     except OSError as error:
         raise ConfigError(
-            f"--units {path}: cannot be read ({error.strerror or told(error)}); name a file that can be"
+            f"--units {path}: cannot be read ({error.strerror or describe_error(error)}); name a file that can be"
         ) from None

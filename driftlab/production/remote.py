@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown, told
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, describe_error, quote
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 _SPAN = re.compile(r"(?P<url>.+?)(?P<span>::[^:/]*:[^:/]*)?")
@@ -80,13 +80,15 @@ def system_of(url: str) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ImportError:
         raise ConfigError(
-            f"{shown(url, 200)}: the package fsspec is not installed, it was expected for URLs; "
+            f"{quote(url, 200)}: the package fsspec is not installed, it was expected for URLs; "
             "pip install 'driftlab[dask]'"
         ) from None
     try:
         system, name = url_to_fs(url)
     except (ImportError, ValueError) as error:  # no package for it; no such kind
-        raise ConfigError(f"{shown(url, 200)}: cannot be reached ({told(error)}); install what reads it") from None
+        raise ConfigError(
+            f"{quote(url, 200)}: cannot be reached ({describe_error(error)}); install what reads it"
+        ) from None
     return system, name
 
 
@@ -118,7 +120,7 @@ def _ask(url: str, method: Any, *args: Any, **options: Any) -> Any:
     except FileNotFoundError:
         raise UnreadableFile(f"{url}: is not there, or its server does not answer; name an object that is") from None
     except Exception as error:
-        raise UnreadableFile(f"{url}: cannot be fetched ({told(error)}); see to access and network") from None
+        raise UnreadableFile(f"{url}: cannot be fetched ({describe_error(error)}); see to access and network") from None
 
 
 def _parts(name: str) -> tuple[str, str]:

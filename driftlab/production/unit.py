@@ -29,7 +29,7 @@ from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.storage.in_memory import CopyName
-from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, describe_error
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 from fusion_core.host.provenance import participants
@@ -125,7 +125,7 @@ def work(task: Task) -> UnitResult:
 
 def _message(error: Exception, recordings: Recordings) -> str:
     """Return an error's text, which may name copies that are soon gone, with the URLs in their place."""
-    text = str(error) if isinstance(error, FusionError) else told(error)
+    text = str(error) if isinstance(error, FusionError) else describe_error(error)
     for name in (name for names in recordings.values() for name in names if isinstance(name, CopyName)):
         text = text.replace(str(part_of(name)[0]), name.url)
     return text

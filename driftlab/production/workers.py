@@ -31,7 +31,7 @@ from typing import Any, Self, TypeVar
 from driftlab.errors import WorkersError
 from driftlab.family.parallel import BATCH
 from driftlab.production.store import UnitRef, UnitStore
-from fusion_core.errors import DataError, FusionError, told
+from fusion_core.errors import DataError, FusionError, describe_error
 
 __all__ = ["Pool", "WorkerLost", "Workers", "available"]
 
@@ -163,7 +163,7 @@ def _answer(asked: bytes) -> bytes:
 def failure(error: BaseException) -> str:
     """Return an error and its place, in words."""
     place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{told(error)} ({'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno})"
+    return f"{describe_error(error)} ({'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno})"
 
 
 @cache

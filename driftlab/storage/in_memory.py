@@ -19,7 +19,7 @@ from pydantic import PrivateAttr, computed_field
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL, Source, Usual
-from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, shown
+from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, quote
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
 from fusion_core.units import convert, si_unit_of
@@ -184,7 +184,7 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
         if name not in given:
             hint = nearest(name, given)
             raise ConfigError(
-                f"units: names '{shown(name)}', which {title} does not have; "
+                f"units: names '{quote(name)}', which {title} does not have; "
                 + (f"did you mean '{hint}'?" if hint else "remove it")
             )
     written = dict(units)
@@ -193,7 +193,7 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
             given[name] = item[0]
             if written.setdefault(name, item[1]) != item[1]:
                 raise UnitError(
-                    f"{title}: channel {name} is in '{shown(item[1])}' and in '{shown(written[name])}' by units; "
+                    f"{title}: channel {name} is in '{quote(item[1])}' and in '{quote(written[name])}' by units; "
                     "remove one of the two"
                 )
     return written
@@ -247,7 +247,7 @@ def _si(name: str, unit: str | None, usual: Usual | None, title: str) -> str | N
         si = si_unit_of(unit)
     except UnitError:
         raise UnitError(
-            f"{title}: channel {name}: unit '{shown(unit)}' is not known; write it like '{example}'"
+            f"{title}: channel {name}: unit '{quote(unit)}' is not known; write it like '{example}'"
         ) from None
     if usual is None:
         return si
@@ -256,6 +256,6 @@ def _si(name: str, unit: str | None, usual: Usual | None, title: str) -> str | N
     except UnitError:
         advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
         raise UnitError(
-            f"{title}: channel {name}: unit '{shown(unit)}' cannot be converted to {usual.si}; {advice}"
+            f"{title}: channel {name}: unit '{quote(unit)}' cannot be converted to {usual.si}; {advice}"
         ) from None
     return usual.si

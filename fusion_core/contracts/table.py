@@ -13,7 +13,7 @@ from pydantic import Field
 
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
-from fusion_core.errors import UnitConflict, UnitError, UnreadableFile, shown
+from fusion_core.errors import UnitConflict, UnitError, UnreadableFile, quote
 from fusion_core.settings import Settings
 from fusion_core.thermal.rate_estimators import CONDITIONED
 from fusion_core.thermal.thermometer import READINGS
@@ -175,11 +175,11 @@ class Channel(Settings):
             si_unit_of(self.unit)
         except UnitError:
             raise UnitError(
-                f"channel {name}: unit '{shown(self.unit)}' is not known; write it like '{example}'"
+                f"channel {name}: unit '{quote(self.unit)}' is not known; write it like '{example}'"
             ) from None
         if usual and _scale(self.unit, usual.si) is None:
             advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
-            raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {usual.si}; {advice}")
+            raise UnitError(f"channel {name}: unit '{quote(self.unit)}' cannot be converted to {usual.si}; {advice}")
 
     def conversion(self, file: Path, name: str, path: str, in_file: str | None) -> tuple[str, str] | None:
         """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
@@ -196,7 +196,7 @@ class Channel(Settings):
         theirs = None if in_file is None or si is None else _scale(in_file, si)
         if self.unit is not None and si is not None:
             if theirs is not None and not np.allclose(_scale(self.unit, si) or np.nan, theirs, rtol=1e-9, atol=0):
-                ours, other = shown(self.unit), shown(in_file)
+                ours, other = quote(self.unit), quote(in_file)
                 raise UnitConflict(
                     f"{file}: channel {name} is in '{ours}' by the config and in '{other}' by the file ('{path}'); "
                     f"remove the wrong one, e.g. source.channels.{name}.unit"
@@ -208,7 +208,7 @@ class Channel(Settings):
                 raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
             if theirs is None:
                 raise UnitError(
-                    f"{file}: channel {name} is in '{shown(in_file)}' by the file, which is no unit of {si}; {advice}"
+                    f"{file}: channel {name} is in '{quote(in_file)}' by the file, which is no unit of {si}; {advice}"
                 )
         return None if theirs is None or in_file is None or si is None else (in_file, si)
 

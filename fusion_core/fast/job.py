@@ -152,7 +152,7 @@ class Job:
         else:
             lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
         x = self.x.T.copy()
-        steady(Sizes(*groups.size), x, GroupModel(known.F, known.H, gains.kinds, gains.K, gains.root), u, z, lanes)
+        steady(GroupSizes(*groups.size), x, GroupModel(known.F, known.H, gains.kinds, gains.K, gains.root), u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
@@ -196,7 +196,7 @@ class Job:
 Size = tuple[float, ...]
 
 
-class Sizes(NamedTuple):
+class GroupSizes(NamedTuple):
     """Number of states and components of a group, and of groups, as lengths."""
 
     s: Size
@@ -225,7 +225,7 @@ class Lanes(NamedTuple):
 
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def steady(size: Sizes, x: Array, known: GroupModel, u: Array, z: Array, out: Lanes) -> None:
+def steady(size: GroupSizes, x: Array, known: GroupModel, u: Array, z: Array, out: Lanes) -> None:
     """Run the filter over N samples: x (s, G) is changed in place; u (N or 1, s, G), z (N, c, G)."""
     s, c, G = size
     F, H, kind, K, root = known

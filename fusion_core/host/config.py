@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.host.document import Lines, Location, parse, parse_value
 from fusion_core.host.provenance import parts
 from fusion_core.settings import can_be_path, nearest
@@ -115,7 +115,7 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
     hint = nearest(base, products)
     known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
     raise ConfigError(
-        f"{document.where(('extends',))}: extends: '{shown(base)}' is neither a packaged product nor a file; {known}"
+        f"{document.where(('extends',))}: extends: '{quote(base)}' is neither a packaged product nor a file; {known}"
     )
 
 
@@ -156,7 +156,7 @@ def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
     location = _written_location(item["loc"], document.data, missing=item["type"] == "missing")
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
-    key = shown(".".join(map(str, location)), 200) or "config"
+    key = quote(".".join(map(str, location)), 200) or "config"
     return f"{document.where(location)}: {key}: {_advice(item, broken)}"
 
 
@@ -171,7 +171,7 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
         case "model_type" | "model_attributes_type":
             return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":
-            return f"is '{shown(item['input'])}'; write {item['ctx']['expected']}"
+            return f"is '{quote(item['input'])}'; write {item['ctx']['expected']}"
         case _:
             return str(item["msg"])
 
@@ -183,7 +183,7 @@ def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
         )
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     hint = nearest(context["tag"], known)
-    return f"kind '{shown(context['tag'])}' is not installed; " + (
+    return f"kind '{quote(context['tag'])}' is not installed; " + (
         f"did you mean {hint}?" if hint else f"known: {', '.join(known)}"
     )
 
@@ -230,8 +230,8 @@ def override(document: Document, setting: str) -> Document:
     key, equals, text = setting.partition("=")
     at = tuple(part.strip() for part in key.split("."))
     if not equals or not all(at):
-        raise ConfigError(f"--set {shown(setting)}: is not KEY=VALUE; write e.g. --set 'filter.align=30 s'")
-    origin = Path(f"--set {shown(setting)}")
+        raise ConfigError(f"--set {quote(setting)}: is not KEY=VALUE; write e.g. --set 'filter.align=30 s'")
+    origin = Path(f"--set {quote(setting)}")
     data = _set(document.data, at, parse_value(text, origin), (), origin)
     replaced = at[:-1] if at[-1] == "kind" and len(at) > 1 else at
     lines = {place: line for place, line in document.lines.items() if place[: len(replaced)] != replaced}

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from fusion_core.budget import check_regular
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.units.grammar import NUMBER
 
 Location = tuple[str | int, ...]
@@ -59,7 +59,7 @@ def _composed(path: Path, text: str) -> yaml.Node | None:
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
-        reason = shown(problem or error, 120)
+        reason = quote(problem or error, 120)
         raise ConfigError(f"{where}: is not YAML ({reason}); correct that line or the one above") from None
     finally:
         loader.dispose()
@@ -73,7 +73,7 @@ def _content(path: Path) -> bytes:
             return file.read(LARGEST + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"{shown(path, 200)}: cannot be read ({reason}); name an existing YAML file") from None
+        raise ConfigError(f"{quote(path, 200)}: cannot be read ({reason}); name an existing YAML file") from None
 
 
 def _text(path: Path, data: bytes) -> str:
@@ -129,7 +129,7 @@ class _Reader:
             key, line = key_node.value, key_node.start_mark.line + 1
             if key in known:
                 raise self._wrong(
-                    key_node, f"key '{shown(key)}' is written twice, on line {known[key]} and here", "remove one"
+                    key_node, f"key '{quote(key)}' is written twice, on line {known[key]} and here", "remove one"
                 )
             if key_node.style is None and key == "<<":
                 raise self._wrong(key_node, "'<<' does not merge here", "use extends, or write the keys")
@@ -171,7 +171,7 @@ class _Reader:
         scalar = {"str", "int", "float", "bool", "null", "timestamp", "merge", "value"}
         usual = scalar if isinstance(node, yaml.ScalarNode) else {"map", "seq"}
         if not node.tag.startswith(_TAG) or node.tag.removeprefix(_TAG) not in usual:
-            raise self._wrong(node, f"has the tag '{shown(node.tag.replace(_TAG, '!!'))}'", "remove it")
+            raise self._wrong(node, f"has the tag '{quote(node.tag.replace(_TAG, '!!'))}'", "remove it")
 
     def _scalar(self, node: yaml.ScalarNode) -> Any:
         text, kind = node.value, node.tag.removeprefix(_TAG)
@@ -186,7 +186,7 @@ class _Reader:
             return float(text)
         if kind in {"bool", "int", "float"}:
             word = {"bool": "true or false", "int": "a plain integer", "float": "a plain, finite number"}[kind]
-            raise self._wrong(node, f"'{shown(text)}' is not {word}", "write one, or quotes around a text")
+            raise self._wrong(node, f"'{quote(text)}' is not {word}", "write one, or quotes around a text")
         return text  # a date too
 
     def _check_characters(self, node: yaml.ScalarNode) -> None:
@@ -197,7 +197,7 @@ class _Reader:
     def _check_line(self, node: yaml.ScalarNode, at: Location) -> None:
         """Refuse a text of several lines: what names it would have them too."""
         if _BREAK.search(node.value):
-            where = f"{shown('.'.join(map(str, at)))}: " if at else ""
+            where = f"{quote('.'.join(map(str, at)))}: " if at else ""
             raise self._wrong(node, f"{where}a text goes over several lines", "write it on one")
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:

@@ -18,7 +18,7 @@ from fusion_core.chunk import read_only
 from fusion_core.contracts import Plugin
 from fusion_core.contracts.families import PARTS
 from fusion_core.contracts.plugin import Check, Family, Origin, built_in, claim, origin_of, plugin_error
-from fusion_core.errors import FusionError, told
+from fusion_core.errors import FusionError, describe_error
 
 WRITERS = ("save", "export")  # a full disk is no defect of theirs
 
@@ -109,7 +109,7 @@ def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
     ours = built_in(plugin)
     if isinstance(error, OSError) and (ours or what in WRITERS):
         raise error
-    text = f"{what.lstrip('_')}: {told(error)}"
+    text = f"{what.lstrip('_')}: {describe_error(error)}"
     advice = "this is a defect of the built-in plugin, report it" if ours else "mend or remove the plugin"
     if isinstance(error, ValueError) and "read-only" in str(error):
         advice = "what a plugin is given is shared, copy it before you write to it"

@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit,
 
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.plugin import HOME, Family, Origin, Plugin
-from fusion_core.errors import FusionError, PluginError, shown, told
+from fusion_core.errors import FusionError, PluginError, describe_error, quote
 from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
 from fusion_core.settings import nearest
@@ -107,9 +107,9 @@ class Registry:
     def _bring_families(self, module: Any) -> bool:
         for family in self._answers(module, "families"):
             if not (isinstance(family, Family) and inspect.isclass(family.contract)):
-                raise PluginError(f"families() returned {shown(repr(family))}; return a list of Family(...)")
+                raise PluginError(f"families() returned {quote(repr(family))}; return a list of Family(...)")
             if family.name in (*self.families, PRODUCTS) or not family.name.isidentifier():
-                raise PluginError(f"family '{shown(family.name)}' is taken, or is no name; give it one of its own")
+                raise PluginError(f"family '{quote(family.name)}' is taken, or is no name; give it one of its own")
             self.families[family.name] = family
         return True
 
@@ -162,7 +162,7 @@ class Registry:
             )
 
     def _break(self, kind: str, module: str, error: BaseException, point: EntryPoint | None, family: str = "?") -> None:
-        self.entries.append(Entry(family, kind, *_distribution(point), module, error=told(error, 300)))
+        self.entries.append(Entry(family, kind, *_distribution(point), module, error=describe_error(error, 300)))
 
 
 def _hooks_of(module: Any) -> list[str]:
@@ -174,7 +174,7 @@ def _hooks_of(module: Any) -> list[str]:
 def _product(name: Any, place: Any) -> tuple[str, Path]:
     path = Path(str(place))
     if not (isinstance(name, str) and name and name.isprintable() and "/" not in name):
-        raise PluginError(f"product {shown(repr(name))}: is no name; write one like acme_x1")
+        raise PluginError(f"product {quote(repr(name))}: is no name; write one like acme_x1")
     if not path.is_file():
         raise PluginError(f"product {name}: {path} is not there; products() returns names with the paths of YAML files")
     return name, path
@@ -183,11 +183,11 @@ def _product(name: Any, place: Any) -> tuple[str, Path]:
 def _called(item: Any) -> str:
     """Return the name of something that is broken: its kind or name where it has one."""
     if isinstance(item, tuple):
-        return shown(item[0])
+        return quote(item[0])
     try:
         return kind_of(item)
     except Exception:
-        return str(getattr(item, "__name__", shown(repr(item))))
+        return str(getattr(item, "__name__", quote(repr(item))))
 
 
 def _distribution(point: EntryPoint | None) -> tuple[str, str]:
@@ -255,7 +255,7 @@ class Installed:
             except BaseException as error:
                 kind = value.get("kind", "?") if isinstance(value, dict) else "?"
                 raise PluginError(
-                    f"{shown(kind)}: checking its settings: {told(error)}; mend or remove the plugin",
+                    f"{quote(kind)}: checking its settings: {describe_error(error)}; mend or remove the plugin",
                     plugin=str(kind),
                 ) from error
 
@@ -270,7 +270,7 @@ def check_class(family: Family, plugin: Any) -> None:
     name = family.contract.__name__
     if not (isinstance(plugin, type) and issubclass(plugin, family.contract)):
         raise PluginError(
-            f"{shown(repr(plugin))} is not a {name}; the hook {family.name}() returns a list of such classes"
+            f"{quote(repr(plugin))} is not a {name}; the hook {family.name}() returns a list of such classes"
         )
     if inspect.isabstract(plugin):
         missing = ", ".join(sorted(plugin.__abstractmethods__))
@@ -279,7 +279,7 @@ def check_class(family: Family, plugin: Any) -> None:
     written = next((vars(base)["contract"] for base in classes if "contract" in vars(base)), 1)
     if written != family.contract.contract:
         raise PluginError(
-            f"{plugin.__name__} was written for version {shown(written)} of the contract {name}, version "
+            f"{plugin.__name__} was written for version {quote(written)} of the contract {name}, version "
             f"{family.contract.contract} is spoken here; install a release of the plugin for it"
         )
 
@@ -307,7 +307,7 @@ def check_fields(plugin: type[Plugin]) -> None:
     except Exception as error:
         first = str(error).splitlines()[0].partition(". ")[0]
         raise PluginError(
-            f"{plugin.__name__}: no config can hold it ({shown(first, 200)}); correct its fields"
+            f"{plugin.__name__}: no config can hold it ({quote(first, 200)}); correct its fields"
         ) from None
     finally:
         alone.reset(token)

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
-from fusion_core.errors import MapError, shown
+from fusion_core.errors import MapError, quote
 from fusion_core.settings import Frozen
 from fusion_core.thermal.fitted_map import LARGEST, MapRecord
 from fusion_core.thermal.record_texts import parse_json
@@ -96,23 +96,23 @@ def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) ->
     try:
         data = parse_json(text, LARGEST)
     except (ValueError, RecursionError) as error:
-        raise _wrong(kind, path, f"is damaged or not JSON ({shown(error, 120)})", "a JSON map", "refit it") from None
+        raise _wrong(kind, path, f"is damaged or not JSON ({quote(error, 120)})", "a JSON map", "refit it") from None
     if not isinstance(data, dict) or "driftlab_map" not in data:
         raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that holds a fitted map")
     if data["driftlab_map"] != 1:
-        version = f"is of version {shown(repr(data['driftlab_map']))}"
+        version = f"is of version {quote(repr(data['driftlab_map']))}"
         raise _wrong(kind, path, version, "version 1", "refit it, or use the version that wrote it")
     written = data.get("record")
     found_kind = written.get("kind") if isinstance(written, dict) else None
     if found_kind is not None and found_kind != kind:
-        theirs = shown(found_kind)
+        theirs = quote(found_kind)
         advice = f"set kind: {theirs}, or refit it"
         raise _wrong(kind, path, f"holds a map of kind '{theirs}'", f"'{kind}'", advice)
     try:
         content = model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where, why = shown(".".join(map(str, first["loc"]))) or "content", shown(first["msg"], 200)
+        where, why = quote(".".join(map(str, first["loc"]))) or "content", quote(first["msg"], 200)
         raise _wrong(kind, path, f"is damaged at {where} ({why})", "a whole map", "refit it") from None
     return content
 

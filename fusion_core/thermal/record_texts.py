@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator
 
 from fusion_core.budget import COUNT, NAME, TEXT
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 from fusion_core.escaping import is_plain, line
 from fusion_core.units import axis_names, si_unit_of
 
@@ -25,14 +25,14 @@ COMMON = {"", "1", "rad/s", "m/s^2", "Pa"}  # units that need no look into the t
 def check_name(text: str) -> str:
     """Return the name of a channel or a kind; raises ValueError where it is none."""
     if len(text) > NAME or not NAMED.fullmatch(text):
-        raise ValueError(f"'{shown(text)}' is no name; write up to {NAME} letters and digits")
+        raise ValueError(f"'{quote(text)}' is no name; write up to {NAME} letters and digits")
     return text
 
 
 def check_plain(text: str) -> str:
     """Return a text of one line that can be seen; raises ValueError where it is another, or too long."""
     if len(text) > TEXT or not is_plain(text):
-        raise ValueError(f"'{shown(text)}' is no text of one line with at most {TEXT} characters that can be seen")
+        raise ValueError(f"'{quote(text)}' is no text of one line with at most {TEXT} characters that can be seen")
     return text
 
 
@@ -43,7 +43,7 @@ def check_unit(text: str) -> str:
             return text
     except UnitError:
         pass
-    raise ValueError(f"the unit '{shown(text)}' is not known")
+    raise ValueError(f"the unit '{quote(text)}' is not known")
 
 
 def check_tree(content: Any) -> Any:
@@ -107,5 +107,5 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(content) < len(pairs):
         names: set[str] = set()
         twice = next(name for name, _ in pairs if name in names or names.add(name))  # type: ignore[func-returns-value]
-        raise ValueError(f"the key '{shown(twice)}' is there twice")
+        raise ValueError(f"the key '{quote(twice)}' is there twice")
     return content

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import PydanticCustomError, core_schema
 
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 from fusion_core.units.conversion import convert as convert
 from fusion_core.units.conversion import dimension_of, of_pint, plain, si_unit
 from fusion_core.units.conversion import registry as registry
@@ -126,14 +126,14 @@ class Unit:
         if isinstance(value, int | float) and not isinstance(value, bool) and "folder" not in (info.context or {}):
             return self._of_number(float(value))
         if not isinstance(value, str):
-            raise _problem(f"{shown(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
+            raise _problem(f"{quote(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
         try:
             unit = self._of_bias(value)
             number = to_si(value, unit)
         except UnitError as error:
             example = self._fitting_example()
             raise _problem(f"{error} (here e.g. '{example}')" if example else str(error)) from None
-        return Quantity(self._checked(number, unit, f"'{shown(value)}'"), " ".join(value.split()), unit)
+        return Quantity(self._checked(number, unit, f"'{quote(value)}'"), " ".join(value.split()), unit)
 
     def _of_number(self, number: float) -> Quantity:
         """Return a number in SI; where nothing says what the unit of the bias is, it has no unit either."""
@@ -199,7 +199,7 @@ def axis_names(axes: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of axes; raises the validation error of those that are none, or not each once."""
     for axis in axes:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,15}", axis):
-            raise _problem(f"'{shown(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
+            raise _problem(f"'{quote(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
     if len(set(axes)) < len(axes):
         raise _problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
     return axes

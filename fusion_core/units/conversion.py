@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 from fusion_core.units.grammar import read_quantity, read_scaled_unit
 
 if TYPE_CHECKING:
@@ -53,12 +53,12 @@ def to_si(text: str, unit: str) -> float:
     number, names = read_quantity(text)
     target = _known(unit)
     if not names and not target.dimensionless:
-        raise UnitError(f"'{shown(text)}' has no unit")
+        raise UnitError(f"'{quote(text)}' has no unit")
     source = of_pint(names, text)
     if str(target).startswith("delta_") and str(source) in _THERMOMETERS:
-        raise UnitError(f"'{shown(text)}' is a temperature, a difference was expected; write it in K")
+        raise UnitError(f"'{quote(text)}' is a temperature, a difference was expected; write it in K")
     if source.dimensionality != target.dimensionality:
-        raise UnitError(f"'{shown(text)}' cannot be converted to {plain(unit)}; write a quantity of that dimension")
+        raise UnitError(f"'{quote(text)}' cannot be converted to {plain(unit)}; write a quantity of that dimension")
     try:
         value = float(registry().Quantity(number, source).to(target).magnitude)
     except (OverflowError, ZeroDivisionError):
@@ -87,14 +87,14 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     number, source = _scaled(unit)
     target = _known(si_unit or si_unit_of(unit))
     if source.dimensionality != target.dimensionality:
-        raise UnitError(f"unit '{shown(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
+        raise UnitError(f"unit '{quote(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
     try:
         zero = float(registry().Quantity(0.0, source).to(target).magnitude)
         slope = float(registry().Quantity(1.0, source).to(target).magnitude) - zero
     except (OverflowError, ZeroDivisionError):
         slope, zero = np.inf, 0.0
     except TypeError:  # pint's, for a difference of temperatures where a reading is meant
-        raise UnitError(f"unit '{shown(unit)}' is of a difference; name that of a reading, e.g. degC") from None
+        raise UnitError(f"unit '{quote(unit)}' is of a difference; name that of a reading, e.g. degC") from None
     return _checked(slope * number, number, unit), zero
 
 
@@ -127,7 +127,7 @@ def unit_of_density(text: str) -> tuple[str, str]:
     """
     names = read_quantity(text)[1]
     if not names:
-        raise UnitError(f"'{shown(text)}' has no unit")
+        raise UnitError(f"'{quote(text)}' has no unit")
     powers = {name: float(power) for name, power in names.items()}
     powers["Hz"] = powers.get("Hz", 0.0) + 0.5
     up, down = (
@@ -186,14 +186,14 @@ def _canonical(name: str, text: str) -> str:
     try:
         return str(registry().get_name(unicodedata.normalize("NFKC", name)))
     except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
-        part = "" if name == text else f"'{shown(text)}': "
-        raise UnitError(f"{part}unknown unit '{shown(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
+        part = "" if name == text else f"'{quote(text)}': "
+        raise UnitError(f"{part}unknown unit '{quote(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
 
 
 def _checked(value: float, number: float, text: str) -> float:
     """Return a value in SI; raises UnitError where it is beyond the numbers of a computer."""
     if not np.isfinite(value) or (number != 0 and value == 0):
-        raise UnitError(f"'{shown(text)}' is beyond the numbers of a computer; write a number and a unit of physics")
+        raise UnitError(f"'{quote(text)}' is beyond the numbers of a computer; write a number and a unit of physics")
     return value
 
 

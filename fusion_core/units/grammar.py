@@ -20,7 +20,7 @@ import re
 from fractions import Fraction
 from typing import NamedTuple
 
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 
 LONGEST = 120  # characters of a text
 DEEPEST = 8  # parentheses within one another
@@ -70,7 +70,7 @@ def read_scaled_unit(text: str) -> tuple[float, Unit]:
         return 1.0, {} if plain == "1" else read_unit(plain)
     number = read_number(plain)
     if number.value == 0:
-        raise UnitError(f"'{shown(text)}' is zero times a unit; write the size of one step, e.g. '0.5 mrad/s'")
+        raise UnitError(f"'{quote(text)}' is zero times a unit; write the size of one step, e.g. '0.5 mrad/s'")
     return number.value, read_unit(number.rest, text) if number.rest else {}
 
 
@@ -80,8 +80,8 @@ def read_number(text: str) -> Number:
     match = NUMBER.match(plain)
     if match is None:
         if re.match(r"[+-]?(nan|inf)", plain, re.IGNORECASE):
-            raise UnitError(f"'{shown(text)}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
-        raise _wrong(text, f"it begins with '{shown(plain[:1])}' and not with a number", "write e.g. '0.1 s'")
+            raise UnitError(f"'{quote(text)}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
+        raise _wrong(text, f"it begins with '{quote(plain[:1])}' and not with a number", "write e.g. '0.1 s'")
     value, rest = float(match[0]), plain[match.end() :]
     if abs(value) == float("inf") or (value == 0 and re.search("[1-9]", re.split("[eE]", match[0])[0])):
         raise _wrong(text, f"{match[0]} is beyond the numbers of a computer", "write one like 5e-4")
@@ -100,10 +100,10 @@ def _check_end(text: str, number: str, rest: str) -> None:
         raise _wrong(text, f"'{rest[0]}' follows the number {number}", "write one number with one decimal point")
     if after[:1] in {"*", "+", "-", "^", ":"}:
         advice = "expressions are not worked out, write their value and a unit"
-        raise _wrong(text, f"'{shown(after[:3])}' follows the number {number}", advice)
+        raise _wrong(text, f"'{quote(after[:3])}' follows the number {number}", advice)
     again = after[:1].isnumeric() or after[:1] in {".", ","}
     if again and not re.match(rf"1[{_SPACE}]?/", after):
-        raise _wrong(text, f"'{shown(after[:12])}' follows the number {number}", "write one number without spaces")
+        raise _wrong(text, f"'{quote(after[:12])}' follows the number {number}", "write one number without spaces")
 
 
 def read_unit(text: str, whole: str | None = None) -> Unit:
@@ -145,7 +145,7 @@ class _Reader:
             match = _TOKENS.match(text, at)
             if match is None or match.lastgroup is None:
                 advice = "write products and quotients of units, e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'"
-                raise _wrong(self.whole, f"'{shown(text[at : at + 12])}' is no part of a unit", advice)
+                raise _wrong(self.whole, f"'{quote(text[at : at + 12])}' is no part of a unit", advice)
             kind, part = match.lastgroup, match[0]
             plain = _PLAIN_POWER.fullmatch(part) if kind == "name" else None
             tokens += [("name", plain[1]), ("power", plain[2])] if plain else [(kind, part)]
@@ -211,7 +211,7 @@ class _Reader:
             if not self._take(")"):
                 raise _wrong(self.whole, "a '(' has no ')'", "write as many of the one as of the other")
             return unit
-        where = "at the end" if kind == "end" else f"where '{shown(text)}' stands"
+        where = "at the end" if kind == "end" else f"where '{quote(text)}' stands"
         raise _wrong(self.whole, f"the name of a unit is missing {where}", "write e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'")
 
     def _raised(self, unit: Unit, exponent: Fraction) -> Unit:
@@ -226,10 +226,10 @@ class _Reader:
 def _bounded(text: str) -> str:
     if len(text) > LONGEST:
         raise UnitError(
-            f"'{shown(text)}' has {len(text)} characters, a quantity has at most {LONGEST}; write a number and a unit"
+            f"'{quote(text)}' has {len(text)} characters, a quantity has at most {LONGEST}; write a number and a unit"
         )
     return text
 
 
 def _wrong(text: str, why: str, advice: str) -> UnitError:
-    return UnitError(f"'{shown(text)}' is not a quantity, {why}; {advice}")
+    return UnitError(f"'{quote(text)}' is not a quantity, {why}; {advice}")

@@ -34,7 +34,7 @@ from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss
 from fusion_core.contracts.calibration import TEMPERATURES
-from fusion_core.errors import ConfigError, UnreadableFile, shown
+from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.escaping import comment
 from fusion_core.units import Unit, same_dimension
 
@@ -291,7 +291,7 @@ def read_parameters(path: Path) -> dict[str, float]:
         value = _number(text)
         if not NAME.match(name) or value is None or len(fields) not in (2, 5):
             raise UnreadableFile(
-                f"{path}, line {number}: '{shown(line.strip())}' is no parameter, expected NAME VALUE, NAME,VALUE or "
+                f"{path}, line {number}: '{quote(line.strip())}' is no parameter, expected NAME VALUE, NAME,VALUE or "
                 "QGroundControl's five columns; name a parameter file that a ground station saved"
             )
         if parameters.setdefault(name, value) != value:

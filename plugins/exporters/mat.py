@@ -25,7 +25,7 @@ from fusion_core.budget import DEEPEST, FILE, inflated, read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibration import TEMPERATURES
-from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, quote
 from fusion_core.escaping import is_plain, line, matlab_name
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -59,12 +59,12 @@ class Mat(Exporter):
             name = matlab_name(sensor.channel)
             if not sensor.channel or not is_plain(sensor.channel) or sensor.channel != sensor.channel.strip():
                 raise ConfigError(
-                    f"export {self.kind}: '{shown(sensor.channel)}' is no name of a channel; name it otherwise"
+                    f"export {self.kind}: '{quote(sensor.channel)}' is no name of a channel; name it otherwise"
                 )
             if name.lower() in {"driftlab", *map(str.lower, content)}:
                 raise ConfigError(
                     f"export {self.kind}: a variable called {name} is there already, as the channel "
-                    f"'{shown(sensor.channel)}' would be; name the channel otherwise"
+                    f"'{quote(sensor.channel)}' would be; name the channel otherwise"
                 )
             content[name] = _struct(sensor, T, bias, lost[-1])
         if any(one.effects for one in what.mapped):
@@ -82,7 +82,7 @@ class Mat(Exporter):
         except FusionError:
             raise
         except Exception as error:  # of a damaged file scipy raises any of a dozen
-            why = getattr(error, "strerror", None) or shown(error, 100)
+            why = getattr(error, "strerror", None) or quote(error, 100)
             raise UnreadableFile(f"{path}: is no .mat file of version 5 ({why}); name one that was exported") from None
         structs = [
             item for item in content.values() if isinstance(item, dict) and "temperature" in item and "bias" in item

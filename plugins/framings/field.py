@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from fusion_core.chunk import Array
 from fusion_core.contracts import USUAL
 from fusion_core.contracts.framing import Counter
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, convert, si_unit_of
 
@@ -45,7 +45,7 @@ def check_unit(name: str, unit: str | None) -> None:
         convert(0.0, unit, si)
     except UnitError:
         what = f"cannot be converted to {si}" if si and _is_unit(unit) else "is not known"
-        raise problem(f"channel {name}: unit '{shown(unit)}' {what}; write it like '{example}'") from None
+        raise problem(f"channel {name}: unit '{quote(unit)}' {what}; write it like '{example}'") from None
 
 
 def _is_unit(unit: str) -> bool:

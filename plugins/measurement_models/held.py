@@ -21,7 +21,7 @@ import pydantic
 from fusion_core import contracts
 from fusion_core import units as quantities
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.errors import UnitError, shown
+from fusion_core.errors import UnitError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.thermal.record_texts import Name
@@ -136,7 +136,7 @@ class Held(contracts.MeasurementModel):
             if unit is None:
                 text = f"has no unit, {declared}; write unit: {sensor.shown} if that is what the file has"
             elif not quantities.same_dimension(unit, sensor.shown):
-                text = f"is in {shown(unit)}, {declared}; correct one of the two"
+                text = f"is in {quote(unit)}, {declared}; correct one of the two"
             else:
                 continue
             raise UnitError(f"source.channels.{name}: {text}")

@@ -19,7 +19,7 @@ from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapFile, MapRecord, Target
-from fusion_core.errors import MapError, shown
+from fusion_core.errors import MapError, quote
 from fusion_plugins.thermal_maps.network import Weights
 
 Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant
@@ -216,13 +216,13 @@ class GraphValues:
         from onnx import numpy_helper
 
         if entry.data_location or entry.external_data or entry.data_type not in NUMBERS:
-            raise self._wrong(f"has the constant '{shown(entry.name)}', which is in another file or of no numbers")
+            raise self._wrong(f"has the constant '{quote(entry.name)}', which is in another file or of no numbers")
         try:
             values = np.asarray(numpy_helper.to_array(entry), dtype=np.float64)
         except (ValueError, TypeError, OverflowError, MemoryError):
-            raise self._wrong(f"has the constant '{shown(entry.name)}', which is damaged") from None
+            raise self._wrong(f"has the constant '{quote(entry.name)}', which is damaged") from None
         if values.ndim > 2:
-            raise self._wrong(f"has the constant '{shown(entry.name)}' of {values.ndim} dimensions")
+            raise self._wrong(f"has the constant '{quote(entry.name)}' of {values.ndim} dimensions")
         return values
 
     def _add(self, node: Any) -> None:
@@ -231,14 +231,14 @@ class GraphValues:
         within = any(entry.HasField("g") or entry.graphs for entry in node.attribute)
         rule = RULES.get(node.op_type)
         if rule is None or node.domain not in ("", "ai.onnx") or within or len(node.output) != 1:
-            raise self._wrong(f"has the node {shown(node.op_type)}({shown(', '.join(node.input), 100)})")
+            raise self._wrong(f"has the node {quote(node.op_type)}({quote(', '.join(node.input), 100)})")
         if node.op_type == "Constant":
             self.constants[node.output[0]] = self._tensor(node.attribute[0].t)
             return
         size = rule(self, node, options)
         if size is None or size[0] > WIDEST:
             shapes = [self._shape(name) for name in node.input]
-            raise self._wrong(f"has the node {shown(node.op_type)} of {', '.join(shapes)}")
+            raise self._wrong(f"has the node {quote(node.op_type)} of {', '.join(shapes)}")
         self.values[node.output[0]] = size
         self.cost += size[0] * (COST if node.op_type in FUNCTIONS else 1)
         if self.cost > MAX_PRODUCTS:

@@ -20,7 +20,7 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, SensorLoss
 from fusion_core.contracts.exporter import Deviation, warm_up
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension
 from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, program_of, why_not
@@ -49,7 +49,7 @@ class C99(Exporter):
         losses: list[Loss] = []
         channels = [sensor.channel for sensor in what.mapped]
         if len({identifier(channel).lower() for channel in channels}) < len(channels):
-            have = ", ".join(map(shown, channels))
+            have = ", ".join(map(quote, channels))
             raise ConfigError(f"export {self.kind}: {have} have one name in C; name one of the channels otherwise")
         files: dict[str, str] = {}
         for sensor in what.mapped:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fusion_core.contracts import Calibrated, effect
 from fusion_core.contracts.exporter import HOUR, warm_up
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, quote
 from fusion_core.escaping import c_comment
 from fusion_plugins.exporters.c.emulation import LONGEST, UPDATES, at_rest, run
 from fusion_plugins.exporters.c.program import Program, Single
@@ -127,12 +127,12 @@ def _check_names(channel: str, program: Program) -> None:
         word = _word(name)
         if not 0 < len(word) <= _LONGEST or not word.strip("_"):
             raise ConfigError(
-                f"export c: the channel '{shown(name)}' has no name in C, 1 to {_LONGEST} letters and digits; name it "
+                f"export c: the channel '{quote(name)}' has no name in C, 1 to {_LONGEST} letters and digits; name it "
                 "otherwise"
             )
         if name != channel and (other := known.setdefault(word.strip("_").lower(), name)) != name:
             raise ConfigError(
-                f"export c: the channels '{shown(other)}' and '{shown(name)}' have one name in C; name one otherwise"
+                f"export c: the channels '{quote(other)}' and '{quote(name)}' have one name in C; name one otherwise"
             )
 
 

@@ -140,7 +140,7 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class Corrections:
+class ImuCorrections:
     """The corrections of one sensor over a log.
 
     Attributes

@@ -16,7 +16,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
 from fusion_core.errors import BadValue, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
-from fusion_plugins.sources.dataflash.imu import Corrections, Sensor
+from fusion_plugins.sources.dataflash.imu import ImuCorrections, Sensor
 from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
 from fusion_plugins.sources.dataflash.scan import CLOCKS, DESCRIPTIONS, INERTIAL
 from fusion_plugins.sources.joining import joined
@@ -210,9 +210,9 @@ class RawSamples:
         k, count = stream.unit or 0, len(self.log.units)
         return k - count if count and k >= count else k
 
-    def _corrections(self, stream: MessageStream, sensor: Sensor) -> Corrections:
+    def _corrections(self, stream: MessageStream, sensor: Sensor) -> ImuCorrections:
         older = stream.message.clock == "TimeMS"
-        return Corrections(self.log.parameters, sensor, self.unit(stream), older)
+        return ImuCorrections(self.log.parameters, sensor, self.unit(stream), older)
 
     def _temperature(self, stream: MessageStream) -> Array:
         """Return the temperature (N,) in degC that the autopilot had for the rows; NaN where it logged none."""

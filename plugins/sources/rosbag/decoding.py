@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from fusion_core.budget import TimeBudget, size_of
 from fusion_core.chunk import Array
-from fusion_core.errors import UnreadableFile, shown
+from fusion_core.errors import UnreadableFile, quote
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
 
 MAX_LAYOUTS = 8  # layouts at a time
@@ -344,7 +344,7 @@ class Types:
         topic = f"topic '{connection.topic}'"
         if connection.encoding not in ("cdr", "ros1"):
             raise UnreadableFile(
-                f"{topic} has messages encoded as '{shown(connection.encoding)}', cdr or ros1 was expected; record it "
+                f"{topic} has messages encoded as '{quote(connection.encoding)}', cdr or ros1 was expected; record it "
                 "with a ROS message type"
             )
         try:
@@ -435,7 +435,7 @@ class Types:
             else:
                 self._add(get_types_from_msg(connection.definition, connection.type))
         except Exception as error:  # of a text that is none the parser raises more than its own errors
-            self.broken[connection.type] = shown(error)
+            self.broken[connection.type] = quote(error)
 
     def _complete(self, kind: str) -> None:
         """Raise KeyError, with its name, where a type or one inside it is not known."""

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Set
 from contextlib import closing
 from itertools import compress
 from pathlib import Path
-from urllib.parse import quote
+from urllib import parse
 
 import numpy as np
 
 from fusion_core.budget import LISTED, PIECE, TEXTS, TimeBudget, check_size, size_of
-from fusion_core.errors import UnreadableFile, shown
+from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, ros2_name
 
@@ -43,7 +43,7 @@ class Sqlite:
                 self.connections = list(self._topics(base))
         except (sqlite3.Error, MemoryError, ValueError) as error:
             raise self._beyond(error) or UnreadableFile(
-                f"{path}: is no bag, or is damaged ({shown(error, 200)}); {REPAIR}"
+                f"{path}: is no bag, or is damaged ({quote(error, 200)}); {REPAIR}"
             ) from None
 
     def count(self, connection: int) -> int | None:
@@ -78,7 +78,7 @@ class Sqlite:
             if (beyond := self._beyond(error)) is not None:
                 raise beyond from None
             where = f"after {read + len(some)} messages"
-            self.faults.add(f"damaged page ({shown(error, 200)}), what follows is lost; {REPAIR}", 1, where)
+            self.faults.add(f"damaged page ({quote(error, 200)}), what follows is lost; {REPAIR}", 1, where)
         yield from self._grouped(some)
 
     def _check_total(self, messages: int, size: int) -> None:
@@ -117,7 +117,7 @@ class Sqlite:
     def _connect(self) -> sqlite3.Connection:
         """Open for reading; without a log beside it, nothing is written next to the file."""
         log = self.log
-        place = quote(str(self.path.resolve()))
+        place = parse.quote(str(self.path.resolve()))
         if log.exists() and log.stat().st_size:
             base = self._limited(f"file:{place}?mode=ro")
             try:

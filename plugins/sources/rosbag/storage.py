@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.budget import LISTED, TEXTS, TimeBudget, check_size, inflated
-from fusion_core.errors import UnreadableFile, shown
+from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
 
 Integers = NDArray[np.int64]
@@ -208,7 +208,7 @@ def unpacked(data: bytes, compression: str, path: Path, what: str, most: int = L
     make = _decompressors().get(compression)
     if make is None:
         raise UnreadableFile(
-            f"{path}: is compressed with '{shown(compression)}', bz2, lz4 or zstd was expected; rewrite it with one of "
+            f"{path}: is compressed with '{quote(compression)}', bz2, lz4 or zstd was expected; rewrite it with one of "
             "them"
         )
     engine = make()

@@ -22,7 +22,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from fusion_core.contracts import FileSource, Source, Table
 from fusion_core.contracts.file_source import problem
-from fusion_core.errors import ConfigError, MissingChannel, shown
+from fusion_core.errors import ConfigError, MissingChannel, quote
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 
@@ -45,7 +45,7 @@ def _number(value: object) -> object:
     try:
         return int(value, 0)
     except ValueError:
-        raise problem(f"'{shown(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
+        raise problem(f"'{quote(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
 
 
 class Ulog(FileSource):

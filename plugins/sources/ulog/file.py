@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
 from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
-from fusion_core.errors import ConfigError, UnreadableFile, shown
+from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.faults import Faults
 
 SIGNATURE = b"ULog\x01\x125"
@@ -221,7 +221,7 @@ def bounded(path: Path) -> Callable[[BinaryIO], Any]:
         def _parse_format(self, formats: Mapping[str, Any]) -> None:
             nonlocal total
             total += numbers(formats, self.message_name, {})
-            check_count(path, f"numbers in the rows of {shown(self.message_name)} and before it", total, FIELDS - 1)
+            check_count(path, f"numbers in the rows of {quote(self.message_name)} and before it", total, FIELDS - 1)
             super()._parse_format(formats)
 
     return type("Bounded", (ULog,), {"_MessageAddLogged": Added})

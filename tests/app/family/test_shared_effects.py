@@ -12,7 +12,7 @@ from families_at_rest import AXES, DEG_H, effect_of, of_other_type, planted, soa
 from statsmodels.stats.meta_analysis import combine_effects
 
 from driftlab.family.basis import SplineBasis
-from driftlab.family.contrasts import EffectColumns, without_noise
+from driftlab.family.contrasts import UnitRows, without_noise
 from driftlab.family.shared_effect_search import Offer, between, contrasts_of, gains, mean_of, of_size
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.unit_information import SoakRows, UnitInformation
@@ -158,7 +158,7 @@ def test_coefficients_are_those_of_dense_generalised_least_squares() -> None:
 
 def test_placebos_have_the_noise_that_rows_have() -> None:
     rng = np.random.default_rng(3)
-    columns = EffectColumns(soaked(family.deal(1, seed=4), 4)[0][0])
+    columns = UnitRows(soaked(family.deal(1, seed=4), 4)[0][0])
     drawn = []
     for _ in range(200):
         noise = [rng.normal(size=len(r)) for r in columns.r]
