@@ -32,7 +32,7 @@ from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
 from driftlab.recordings.identity import identity, sha256
-from driftlab.recordings.overlap import SMALL, Content, content_of
+from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
 from driftlab.reports.figures import figure_of
@@ -391,7 +391,7 @@ def _share(config: Config, name: str, other: str, contents: dict[str, Content]) 
         if one not in contents:
             assert config.filter is not None
             channel, chunks = config.filter.tracked.channel, read(with_recording(config, one), Faults())
-            contents[one] = content_of((chunk for chunk in chunks if channel in chunk.channels), channel)
+            contents[one] = recording_content((chunk for chunk in chunks if channel in chunk.channels), channel)
     return contents[name].share(contents[other])
 
 

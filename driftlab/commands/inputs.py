@@ -63,7 +63,7 @@ def recording_of(data: DataLike, units: Units | None = None, title: str = "data"
     if isinstance(data, str | PathLike | Source):
         if units:
             raise ConfigError(f"units: are given with {quote(data, 200)}, which says them itself; leave units out")
-        return InMemoryName(data) if isinstance(data, Source) else str(data)
+        return InMemoryName(data) if isinstance(data, Source) else data if isinstance(data, str) else str(data)
     if isinstance(data, Result):
         title, known = data.name, data.units
         measured = {name: values for name, values in data.items() if name != TRUTH}

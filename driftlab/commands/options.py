@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -160,11 +160,11 @@ class Command:
         for name, form in PAIRS.items():
             if isinstance(arguments.get(name), list):
                 arguments[name] = pairs(arguments[name], *form)
-        if hasattr(module, "arguments_of"):
-            arguments = module.arguments_of(arguments, options)
+        if (arguments_of := _defined(module, "arguments_of")) is not None:
+            arguments = arguments_of(arguments, options)
         reporting = progress(self.doing) if self.doing else nullcontext()
-        if hasattr(module, "progress_of"):
-            reporting = module.progress_of(arguments)
+        if (progress_of := _defined(module, "progress_of")) is not None:
+            reporting = progress_of(arguments)
         with reporting as report:
             if report is not None and "progress" in known:
                 arguments["progress"] = report
@@ -173,7 +173,8 @@ class Command:
             return
         given |= arguments
         if options.get("json"):
-            content = module.content_of(result, given) if hasattr(module, "content_of") else result.summary
+            content_of = _defined(module, "content_of")
+            content = result.summary if content_of is None else content_of(result, given)
             print_json(plain(content), self.indent)
         else:
             module.show(result, given)
@@ -218,3 +219,9 @@ def declaration(module: str, name: str) -> Declaration:
         for name in names.split(", ")
     }
     return Declaration(parameters, summary, texts)
+
+
+def _defined(module: Any, name: str) -> Callable[..., Any] | None:
+    """Return the function of that name that a command's module defines, and does not merely import."""
+    function = vars(module).get(name)
+    return function if function is not None and function.__module__ == module.__name__ else None

@@ -65,7 +65,7 @@ class Content:
         return common / min(len(one.words), len(two.words)) if common >= MIN_COMMON else 0.0
 
 
-def content_of(chunks: Iterable[Chunk], channel: str) -> Content:
+def recording_content(chunks: Iterable[Chunk], channel: str) -> Content:
     """Return the words of a channel (N, d) in all of a recording."""
     words: list[Words] = []
     values: list[Array] = []

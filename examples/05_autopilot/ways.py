@@ -38,7 +38,7 @@ def firmware(
     (ours_ardupilot,) = Ardupilot().read(files["ardupilot"])
     rows = {
         "none": np.zeros((len(t), 3)),
-        "own cubic in PX4": own_px4.offset(stairs).astype(np.float64),
+        "own cubic in PX4": own_px4.bias(stairs).astype(np.float64),
         "own cubic in ArduPilot": own_ardupilot.bias(T).astype(np.float64),
         "ours in PX4": ours_px4.bias(np.clip(stairs, *ours_px4.domain)),
         "ours in ArduPilot": ours_ardupilot.bias(np.clip(T, *ours_ardupilot.domain)),

@@ -25,9 +25,7 @@ import planted
 from family import DEG_H, HIGH, LOW, Unit
 from planted import Line
 
-from driftlab.config import load_config
-from driftlab.production.fleet import FleetOptions
-from driftlab.production.fleet import fleet as run_fleet
+import driftlab
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.host.registry import registry
 
@@ -66,8 +64,8 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     console.print(
         f"2. {len(line.fresh)} new units, {60 * line.short:.0f} min over {100 * planted.PART:.0f} % of the range"
     )
-    known = FleetOptions(family=out / "fleet" / "family.json")
-    _fleet(line.folder / "new.csv", out / "short", console, known)
+    known = out / "fleet" / "family.json"
+    _fleet(line.folder / "new.csv", out / "short", console, family=known)
     _fleet(line.folder / "whole.csv", out / "whole", console)
     table = pl.read_parquet(out / "fleet" / "units.parquet")
     why = pl.coalesce("odd_why", pl.concat_str(pl.lit("failed: "), "error"))
@@ -80,10 +78,10 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     return found
 
 
-def _fleet(manifest: Path, out: Path, console: Console, wanted: FleetOptions | None = None) -> Mapping[str, Any]:
+def _fleet(manifest: Path, out: Path, console: Console, family: Path | None = None) -> Mapping[str, Any]:
     """Do what `driftlab fleet family.yaml --units MANIFEST --out OUT` does."""
     begun = time.monotonic()
-    result = run_fleet(load_config(HERE / "family.yaml"), str(manifest), out, wanted)
+    result = driftlab.fleet(HERE / "family.yaml", manifest, out, family=family)
     for said in result.lines():
         console.print(f"   {said}", style="dim")
     console.print(f"   {time.monotonic() - begun:.0f} s")

@@ -13,7 +13,7 @@ from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.filtering.run import warm_up
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 
@@ -41,7 +41,7 @@ unit = unit_at_rest(seconds=120)
 samples = Chunk(unit.t, unit.channels())
 N = len(samples)
 pieces = [samples.part(0, 600)] + [samples.part(k, k + 1) for k in range(600, 700)] + [samples.part(700, N)]
-for _ in Run(config, Journal()).over(epochs(read(config, Faults(), stream=pieces), 0.1)):
+for _ in Run(config, RunLog()).over(epochs(read(config, Faults(), stream=pieces), 0.1)):
     pass
 print(json.dumps([before, compiled()]))
 """

@@ -14,7 +14,6 @@ from driftlab.config import load_config
 from driftlab.errors import ConfigError, DataError
 from driftlab.production import fleet as job
 from driftlab.production import units_pass
-from driftlab.production.fleet import FleetOptions
 from driftlab.production.store import UnitStore
 
 COUNT = 4
@@ -42,7 +41,7 @@ def fleet(made, tmp_path, monkeypatch):
         here = fleets.Here(lost)
         monkeypatch.setattr(units_pass, "Pool", lambda workers: here)
         loaded = load_config(Path(config), settings=settings)
-        result = job.fleet(loaded, units, Path(out), FleetOptions(**wanted), progress)
+        result = job.fleet(loaded, units, Path(out), progress=progress, **wanted)
         return result, here.pages if "pages" in wanted else here.asked
 
     return fleet

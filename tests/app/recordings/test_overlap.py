@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from driftlab.recordings.overlap import MAX_WORDS, content_of
+from driftlab.recordings.overlap import MAX_WORDS, recording_content
 from fusion_core.chunk import Chunk
 
 
 def content(x, rows=1000):
     parts = np.array_split(x, max(len(x) // rows, 1))
-    return content_of((Chunk(np.arange(len(part)) * 1.0, {"gyro": part}) for part in parts), "gyro")
+    return recording_content((Chunk(np.arange(len(part)) * 1.0, {"gyro": part}) for part in parts), "gyro")
 
 
 def noise(seed, d, N=6000):
