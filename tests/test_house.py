@@ -173,7 +173,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3501
+    assert 0 < count <= 3505
 
 
 def imports():
@@ -242,7 +242,7 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 579,
-    "driftlab/commands": 2765,
+    "driftlab/commands": 2769,
     "driftlab/evaluation": 1256,
     "driftlab/family": 2866,
     "driftlab/filtering": 1191,
@@ -259,7 +259,7 @@ BUDGET = {
     "driftlab/spc": 654,
     "driftlab/starter": 573,
     "driftlab/storage": 1065,
-    "fusion_core": 1808,
+    "fusion_core": 1812,
     "fusion_core/contracts": 1672,
     "fusion_core/fast": 710,
     "fusion_core/host": 699,
