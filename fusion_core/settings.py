@@ -63,8 +63,6 @@ class Frozen(BaseModel):
         fields = type(self).model_fields
         return type(other) is type(self) and all(getattr(self, name) == getattr(other, name) for name in fields)
 
-    __hash__ = BaseModel.__hash__
-
 
 class Settings(Frozen):
     """Base of every part of a config: a key that it does not know is an error, and so are NaN and infinity."""
