@@ -15,6 +15,14 @@ def recordings() -> Path:
     return Path(folder)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _compile_without_a_notice():
+    """What a command prints is the same whether this installation has compiled its loops already or not."""
+    from driftlab.commands import console
+
+    console.COMPILED = float("inf")
+
+
 @pytest.fixture(scope="session")
 def browser():
     """A browser without a window."""

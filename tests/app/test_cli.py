@@ -63,7 +63,7 @@ def test_run_writes_whole_outputs(bench):
     done = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert done.returncode == 0, done.stderr
     assert "coast, 1 min" in done.stdout
-    assert done.stderr == ""
+    assert done.stderr == "" or done.stderr.startswith("compiling the filter")  # the first run of an installation
     out = bench / "out"
     assert sorted(p.name for p in out.iterdir()) == ["estimates.h5", "report.html", "summary.json"]
     assert not (bench / "out.partial").exists()

@@ -1,0 +1,17 @@
+"""What commands print beside their results."""
+
+from numba.core import event
+
+from driftlab.commands import console
+
+
+def test_compiling_is_announced_once_on_standard_error(monkeypatch, capsys):
+    monkeypatch.setattr(console, "COMPILED", -1.0)
+    console.note_compiling()
+    for _ in range(2):
+        with event.trigger_event("numba:compile"):
+            pass
+    printed = capsys.readouterr()
+    assert printed.err.startswith("compiling the filter for this processor")
+    assert printed.err.count("compiling the filter") == 1
+    assert printed.out == ""
