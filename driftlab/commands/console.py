@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
@@ -164,8 +165,9 @@ def check_limits(config: Config, enforced: bool) -> None:
         raise ConfigError("--enforce-limits: the config has no limits, nothing would be enforced; set limits in it")
 
 
+@cache
 def note_compiling() -> None:
-    """Announce once, on standard error, that loops are compiled: for an installation, or another processor."""
+    """Announce once in a process, on standard error, that loops are compiled: for an installation, or another processor."""
     from numba.core import event
 
     console = terminal(stderr=True)
