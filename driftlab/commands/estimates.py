@@ -191,11 +191,13 @@ class EstimatesWriter:
             self.spool = Spool(self.folder / SPOOL, keep)
         self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
 
-    def append(self, stretch: RunSegment) -> None:
-        """Add the estimates of a stretch."""
-        self.add(stretch.columns())
+    def append(self, stretch: RunSegment) -> Columns:
+        """Add the estimates of a stretch, and return them as they are kept."""
+        columns = at_file_precision(stretch.columns())
+        self.add(columns)
         if self.spool is not None:
             self.spool.add(stretch)
+        return columns
 
     def add(self, columns: Columns) -> None:
         """Add rows of estimates."""

@@ -19,7 +19,7 @@ from driftlab.commands.result import Result
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
 from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import overview_of
+from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.evaluation.run_limits import map_of
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import remarks, summarise
@@ -311,7 +311,7 @@ def _run(config: Config) -> tuple[dict[str, Any], dict[str, Any], list[str], dic
     run = Run(config, journal)
     columns, model = joined(run), run.model
     alignment = journal.alignments[0]
-    overview = overview_of(columns, model, alignment)
+    overview = OverviewAccumulator(model, alignment).read(columns).overview()
     limited = {
         "noise": of_alignment(model.tracked, alignment, model.align),
         "coast": of_coast(overview.yardsticks, overview.end - alignment.t, model.align),

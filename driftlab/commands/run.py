@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +26,19 @@ from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Unit
 from driftlab.commands.result import Result
 from driftlab.config import Config
 from driftlab.evaluation.limits import verdict
-from driftlab.evaluation.overview import Overview, overview_of, survey
+from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.evaluation.run_limits import averages_of, check_run_limits, map_of
 from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.recordings.identity import beforehand
+from driftlab.recordings.prefetch import aside
 from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import sheet_of
 from driftlab.reports.run import bias_chart, write_report
 from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
+from driftlab.storage.hdf5 import reading
 from driftlab.storage.json import write_json
 from driftlab.units import unit_of
 from fusion_core.contracts import MeasurementModel
@@ -57,15 +58,14 @@ class RunResult(Result):
         config: Config,
         model: MeasurementModel,
         journal: RunLog,
-        survey_of: Callable[..., Overview],
+        gathered: OverviewAccumulator,
         columns: Columns,
         recorded: Path | None = None,
     ) -> None:
         self.config, self.model, self.journal = config, model, journal
         self.recorded = recorded  # the file in which a live run has kept what came
-        alignment, averages = journal.alignments[0], averages_of(config, journal.alignments[0])
-        overview = survey_of(model, alignment, first_row=journal.faults.first_row, averages=averages)
-        self.overview, self.judged = overview, check_run_limits(config, overview, alignment, averages)
+        self.overview = overview = gathered.overview(journal.faults.first_row)
+        self.judged = check_run_limits(config, overview, journal.alignments[0], gathered.averages)
         self.limits_verdict = self.verdict = verdict(self.judged)
         self.name = f"{config.file.stem}: {config.recording}" if config.file else config.recording
         self.units, self._columns = units_of(model), columns
@@ -183,23 +183,27 @@ def run(
             raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
-        return RunResult(understood, running.model, journal, partial(overview_of, columns), columns)
+        gathered = _accumulator(understood, running.model, journal).read(columns)
+        return RunResult(understood, running.model, journal, gathered, columns)
     with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
         estimates = EstimatesWriter(folder, understood, journal, smooth=smooth)
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
-        hashed = beforehand(understood.source)
+        hashed, observed = beforehand(understood.source), None
         try:
-            with closing(_segments(running, journal, progress)) as segments:
+            with closing(_segments(running, journal, progress)) as segments, aside() as do:
                 for segment in segments:
-                    estimates.append(segment)
+                    kept = estimates.append(segment)
+                    if before is None and not smooth:  # else what the file has by its end is looked at
+                        observed = observed or _accumulator(understood, running.model, journal)
+                        do(observed.add, kept)
         finally:
             estimates.close()
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
         hashed()
-        return finish(folder, understood, running.model, journal, Path(out))
+        return finish(folder, understood, running.model, journal, Path(out), observed=observed)
 
 
 def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Generator[RunSegment]:
@@ -213,16 +217,31 @@ def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Gener
                 progress(journal.faults.since(float(segment.epochs.t[-1])), count)
 
 
-def finish(
-    folder: Path, config: Config, model: MeasurementModel, journal: RunLog, out: Path, recorded: Path | None = None
-) -> RunResult:
-    """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`.
+def _accumulator(config: Config, model: MeasurementModel, journal: RunLog) -> OverviewAccumulator:
+    first = journal.alignments[0]
+    return OverviewAccumulator(model, first, averages_of(config, first))
 
-    `recorded` is the file in which a live run has kept what came.
+
+def finish(
+    folder: Path,
+    config: Config,
+    model: MeasurementModel,
+    journal: RunLog,
+    out: Path,
+    recorded: Path | None = None,
+    observed: OverviewAccumulator | None = None,
+) -> RunResult:
+    """Write `summary.json` and `report.html` of the estimates in the folder, which will be called `out`.
+
+    `recorded` is the file in which a live run has kept what came. The estimates are read back where they were not
+    `observed` while they were made.
     """
     estimates = folder / "estimates.h5"
     note_first_row(estimates, journal.faults.first_row)
-    result = RunResult(config, model, journal, partial(survey, estimates), Stored(out / "estimates.h5"), recorded)
+    if observed is None:
+        with reading(estimates) as file:
+            observed = _accumulator(config, model, journal).read(file)
+    result = RunResult(config, model, journal, observed, Stored(out / "estimates.h5"), recorded)
     result._write(folder)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result

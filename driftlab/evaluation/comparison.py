@@ -21,7 +21,7 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation import limits, ranking
 from driftlab.evaluation.limits import LimitResult
-from driftlab.evaluation.overview import Overview, overview_of
+from driftlab.evaluation.overview import Overview, OverviewAccumulator
 from driftlab.evaluation.run_limits import averages_of, check_run_limits
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
@@ -176,7 +176,8 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
     first = journal.alignments[0]
     averages = averages_of(config, first)
-    overview = overview_of(nominal.estimates, run.model, first, first_row=journal.faults.first_row, averages=averages)
+    gathered = OverviewAccumulator(run.model, first, averages).read(nominal.estimates)
+    overview = gathered.overview(journal.faults.first_row)
     results = tuple(check_run_limits(config, overview, first, averages))
     return Comparison(residual, nominal, offset, overview, run.model, journal, results, initial)
 

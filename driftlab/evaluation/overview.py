@@ -1,7 +1,8 @@
 """The overview of a run for its summary and its report, from its estimates block by block.
 
 Memory does not grow with the recording: sums for the scores and tests, and a few thousand rows for the figures. How
-many rows there are in all is known before the first block, so that curves and stretches are spread evenly over them.
+many rows there will be need not be known: whenever there are too many, every second row of a curve is left out, and two
+and two stretches become one. So an overview is made while the run goes by, and nothing is read back.
 
 The errors are drawn with every spike of them, in a few points. Rows that are picked evenly from a long run miss what
 lasts shorter than their distance. So each stretch of a run gives its smallest and its largest error, at the time of its
@@ -10,14 +11,12 @@ middle: a line through them reaches as far as the errors do. N rows, d axes, K s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, moving_average
 from driftlab.recordings.prefetch import prefetch
@@ -31,8 +30,9 @@ if TYPE_CHECKING:
 
 
 ROWS = 65_536  # of a block
-POINTS = 1500  # rows kept for the figures
-BINS = 400  # stretches over which the nis is averaged for its figure
+POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
+BINS = 250  # stretches over which the nis is averaged for its figure, to twice as many
+STRETCHES = 500  # stretches of the errors, to twice as many: two points each
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
@@ -63,15 +63,15 @@ class Overview:
     whiteness_p : (m,) array
         Of the used updates after the first alignment, as is `nis`.
     curves : dict of str to array
-        At most POINTS rows of the estimates, evenly spread, with the `reference` of the scores.
+        At most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores.
     errors : dict of str to array
         `t`, and the error of `bias` and `coast`, with every spike of it.
     nis_curve : (K, 3) array
-        Time in s, mean nis and number of updates of up to BINS stretches.
+        Time in s, mean nis and number of updates of up to 2 BINS stretches.
     nis_highest : float
         Largest nis of one update among them.
     swing : float
-        Of the temperature in the rows of `curves`, K; 0 where there is none.
+        Of the temperature, K; 0 where there is none.
     """
 
     count: int
@@ -91,147 +91,184 @@ class Overview:
     swing: float
 
 
-def survey(
-    path: Path,
-    model: MeasurementModel,
-    alignment: Alignment,
-    rows: int = ROWS,
-    *,
-    first_row: float | None = None,
-    averages: Averages | None = None,
-) -> Overview:
-    """Return the overview of an `estimates.h5`; parameters are those of `overview_of`."""
-    import h5py
+class OverviewAccumulator:
+    """The sums and rows behind an overview, taken while a run goes by: any split of it gives the same.
 
-    with h5py.File(path) as file:
-        return overview_of(file, model, alignment, rows, first_row=first_row, averages=averages)
-
-
-def overview_of(
-    columns: Mapping[str, Array],
-    model: MeasurementModel,
-    alignment: Alignment,
-    rows: int = ROWS,
-    *,
-    first_row: float | None = None,
-    averages: Averages | None = None,
-) -> Overview:
-    """Return the overview of the estimates of a run whose first alignment is `alignment`, read `rows` at a time.
-
-    `first_row` is the time of the recording's first row, s, where it is known; `averages` are given every block.
+    Parameters
+    ----------
+    model : MeasurementModel
+    alignment : Alignment
+        The first of the run.
+    averages : Averages, optional
+        They are given every block.
+    rows : int
+        Of a block, which is gathered before it is looked at.
     """
-    N, tracked, used = len(columns["t"]), model.tracked, 0
-    scores, whiteness, nis = ScoreAccumulator(len(tracked.axes)), Whiteness(model.m), _NisSums(N)
-    curves, envelope = _Thinned(N), Envelope(N, len(tracked.axes))
-    more = () if averages is None else ("calibration",)
-    for block in prefetch(_referenced(_blocks(columns, rows, (*NAMES, *more)))):
-        scores.add(block, block["reference"])
-        used += int(np.count_nonzero(block["used"]))
-        after = block["used"].astype(bool) & (block["t"] > alignment.t)
-        whiteness.add(block["white"][after])
-        nis.add(block, after)
-        for observer in (curves, envelope, averages):
+
+    def __init__(
+        self, model: MeasurementModel, alignment: Alignment, averages: Averages | None = None, rows: int = ROWS
+    ) -> None:
+        self.model, self.alignment, self.rows, d = model, alignment, rows, len(model.tracked.axes)
+        self.averages, self.names = averages, NAMES if averages is None else (*NAMES, "calibration")
+        self.count = self.used = 0
+        self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
+        self._scores, self._whiteness, self._nis = ScoreAccumulator(d), Whiteness(model.m), _NisSums()
+        self._curves, self._envelope, self._last = _Thinned(), Envelope(d), Columns()
+        self._parts: list[Mapping[str, Array]] = []  # of the next block
+        self._waiting: list[Columns] = []  # blocks whose reference is not known yet
+        self._before: list[Columns] = []  # the half window before those
+
+    def add(self, columns: Mapping[str, Array]) -> None:
+        """Take the next rows of a run."""
+        self._parts.append(columns)
+        if sum(len(part["t"]) for part in self._parts) >= self.rows:
+            self._gather()
+
+    def read(self, columns: Mapping[str, Array]) -> OverviewAccumulator:
+        """Take all rows of a run that is there as a whole, or of the file of one; return itself."""
+        for block in prefetch(_blocks(columns, self.rows, self.names)):
+            self.add(block)
+        return self
+
+    def _gather(self) -> None:
+        """Look at the block that has come together, and at those that waited for it."""
+        names = [name for name in self.names if self._parts and name in self._parts[0]]
+        block = {n: np.concatenate([part[n] for part in self._parts], dtype=np.float64) for n in names}
+        self._parts.clear()
+        if block:
+            self._waiting.append(block)
+        while self._waiting and (not block or block["t"][-1] > self._waiting[0]["t"][-1] + WINDOW / 2):
+            first, *after = self._waiting
+            self._look({**first, "reference": _reference(self._before, first, after)})
+            self._before = _half_window([*self._before, self._waiting.pop(0)])
+
+    def _look(self, block: Columns) -> None:
+        used = block["used"].astype(bool)
+        after = used & (block["t"] > self.alignment.t)
+        self.start = self.start if self.count else float(block["t"][0])
+        self.count, self.used = self.count + len(used), self.used + int(np.count_nonzero(used))
+        if "temperature" in block:
+            self._coldest = min(self._coldest, float(np.min(block["temperature"])))
+            self._warmest = max(self._warmest, float(np.max(block["temperature"])))
+        self._last = _rows(block, len(used) - 1, None)
+        self._scores.add(block, block["reference"])
+        self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
+        self._nis.add(block, after)
+        for observer in (self._curves, self._envelope, self.averages):
             if observer is not None:
                 observer.add(block)
-    drawn = curves.curves()
-    return Overview(
-        count=N,
-        used=used,
-        start=float(columns["t"][0]),
-        end=float(columns["t"][-1]),
-        first_row=float(columns["t"][0]) if first_row is None else first_row,
-        bias=columns["bias"][-1],
-        sigma=columns["bias_sigma"][-1],
-        yardsticks=scores.yardsticks(alignment.up if tracked.integral else None, tracked.axes, model.align),
-        nis=nis_test_of(nis.total, nis.count, model.m),
-        whiteness_p=whiteness.p(),
-        curves=drawn,
-        errors=envelope.curves(),
-        nis_curve=nis.curve(),
-        nis_highest=nis.highest,
-        swing=float(np.ptp(drawn["temperature"])) if "temperature" in drawn else 0.0,
-    )
+
+    def overview(self, first_row: float | None = None) -> Overview:
+        """Return the overview of all rows; `first_row` is the time of the recording's first row, s, where known."""
+        if self._parts:
+            self._gather()
+        self._gather()  # what still waits has nothing after it
+        model, nis, drawn = self.model, self._nis, self._curves.curves(self._last)
+        up = self.alignment.up if model.tracked.integral else None
+        return Overview(
+            count=self.count,
+            used=self.used,
+            start=self.start,
+            end=float(self._last["t"][-1]),
+            first_row=self.start if first_row is None else first_row,
+            bias=self._last["bias"][-1],
+            sigma=self._last["bias_sigma"][-1],
+            yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
+            nis=nis_test_of(nis.total, nis.count, model.m),
+            whiteness_p=self._whiteness.p(),
+            curves=drawn,
+            errors=self._envelope.curves(),
+            nis_curve=nis.curve(),
+            nis_highest=nis.highest,
+            swing=max(self._warmest - self._coldest, 0.0),
+        )
 
 
 class _Thinned:
-    """At most POINTS rows of N, evenly spread, block after block."""
+    """At most POINTS rows, evenly spread, and the last one; how many rows there are in all need not be known."""
 
-    def __init__(self, N: int) -> None:
-        self.rows, self.at = thin(N), 0
+    def __init__(self) -> None:
+        self.at, self.stride = 0, 1
         self.parts: list[Columns] = []
 
     def add(self, block: Columns) -> None:
         """Take those of the next block."""
-        stop = self.at + len(block["t"])
-        here = self.rows[(self.rows >= self.at) & (self.rows < stop)] - self.at
-        self.parts.append({name: block[name][here] for name in DRAWN if name in block})
-        self.at = stop
+        N = len(block["t"])
+        while (self.at + N) // self.stride >= POINTS:
+            self.stride *= 2
+            self.parts = [_every(_joined(self.parts, self.parts[0]), 0, 2)] if self.parts else []
+        kept = _every({name: block[name] for name in DRAWN if name in block}, -self.at % self.stride, self.stride)
+        self.parts.append(kept)
+        self.at += N
 
-    def curves(self) -> Columns:
-        """Return the rows by name."""
+    def curves(self, last: Columns) -> Columns:
+        """Return the rows by name; `last` is the last of all."""
+        if (self.at - 1) % self.stride:
+            self.parts.append({name: last[name] for name in self.parts[0]})
         return _joined(self.parts, self.parts[0])
 
 
-class _Bins:
-    """At most K stretches of N rows that come block after block: row r is of stretch r K // N."""
+class _Stretches:
+    """Stretches of rows that are all as long, K to 2 K of them: with twice as many, two and two are made one."""
 
-    def __init__(self, N: int, K: int) -> None:
-        self.N, self.K, self.at = N, min(K, N), 0
+    def __init__(self, K: int) -> None:
+        self.K, self.at, self.length = K, 0, 1
 
-    def next(self, rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the stretches that the next rows are of, and the first row of each among these."""
-        N, K = self.N, self.K
-        stretches = np.arange(self.at * K // N, (self.at + rows - 1) * K // N + 1)
-        starts = np.maximum(-(-stretches * N // K) - self.at, 0)
+    def next(self, rows: int, merge: Callable[[], None]) -> tuple[int, int]:
+        """Return the number of the next row and the length of a stretch, after `merge` where that has doubled."""
+        while self.at + rows > 2 * self.K * self.length:
+            merge()
+            self.length *= 2
         self.at += rows
-        return stretches, starts
+        return self.at - rows, self.length
 
 
 class _NisSums:
-    """The nis of the updates that count, block after block of N rows in all: their sum, and means of stretches."""
+    """The nis of the updates that count, block after block: their sum, and means of stretches."""
 
-    def __init__(self, N: int) -> None:
-        self.bins = _Bins(N, BINS)
-        self.sums = np.zeros((3, self.bins.K))  # number, sum of t, sum of nis
+    def __init__(self) -> None:
+        self.stretches = _Stretches(BINS)
+        self.sums = np.zeros((2 * BINS, 3))  # number, sum of t, sum of nis
         self.count, self.total, self.highest = 0, 0.0, 0.0
 
     def add(self, block: Columns, counts: Flags) -> None:
         """Take the next block, of which the rows count that `counts` says."""
-        nis = block["nis"][counts]
-        self.total, self.count = self.total + float(np.sum(nis)), self.count + len(nis)
-        self.highest = max(self.highest, float(np.max(nis, initial=0.0)))
-        stretches, starts = self.bins.next(len(counts))
-        for row, values in zip(self.sums, (np.ones(len(counts)), block["t"], block["nis"]), strict=True):
-            row[stretches] += np.add.reduceat(np.where(counts, values, 0.0), starts)
+        where = self.stretches.next(len(counts), self._merge)
+        total, highest = _sum_nis(block["t"], block["nis"], counts, *where, self.sums)
+        self.count, self.total = self.count + int(np.count_nonzero(counts)), self.total + total
+        self.highest = max(self.highest, highest)
+
+    def _merge(self) -> None:
+        self.sums = np.concatenate([self.sums[::2] + self.sums[1::2], np.zeros((BINS, 3))])
 
     def curve(self) -> Array:
         """Return mean time, mean nis and number of updates (K, 3) of the stretches in which any update counts."""
-        filled = self.sums[:, self.sums[0] > 0]
-        return np.column_stack([*(filled[1:] / filled[0]), filled[0]])
+        number, t, nis = self.sums[self.sums[:, 0] > 0].T
+        return np.column_stack([t / number, nis / number, number])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sum_nis(t: Array, nis: Array, counts: Flags, at: int, length: int, sums: Array) -> tuple[float, float]:
+    total = highest = 0.0
+    for k in range(len(t)):
+        if counts[k]:
+            row = (at + k) // length
+            total, highest = total + nis[k], max(highest, nis[k])
+            sums[row, 0] += 1.0
+            sums[row, 1] += t[k]
+            sums[row, 2] += nis[k]
+    return total, highest
 
 
 def thin(N: int) -> Array:
-    """Return the indices of at most POINTS samples, evenly spread."""
+    """Return the indices of at most POINTS samples of N, evenly spread."""
     return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
 def _blocks(columns: Mapping[str, Array], rows: int, names: Sequence[str]) -> Iterator[Columns]:
     data = {name: columns[name] for name in names if name in columns}
     for start in range(0, len(data["t"]), rows):
-        yield {name: np.asarray(values[start : start + rows], dtype=np.float64) for name, values in data.items()}
-
-
-def _referenced(blocks: Iterator[Columns]) -> Iterator[Columns]:
-    """Yield the same blocks with their `reference`, each as soon as the half window after it is there."""
-    before: list[Columns] = []  # the half window before those that wait
-    waiting: list[Columns] = []
-    for block in chain(blocks, [None]):
-        while waiting and (block is None or block["t"][-1] > waiting[0]["t"][-1] + WINDOW / 2):
-            first, *after = [*waiting, block] if block is not None else waiting
-            yield {**first, "reference": _reference(before, first, after)}
-            before = _half_window([*before, waiting.pop(0)])
-        if block is not None:
-            waiting.append(block)
+        yield {name: values[start : start + rows] for name, values in data.items()}
 
 
 def _half_window(before: list[Columns]) -> list[Columns]:
@@ -256,39 +293,57 @@ def _rows(block: Columns, start: int, stop: int | None) -> Columns:
     return {name: values[max(start, 0) : stop] for name, values in block.items()}
 
 
+def _every(block: Columns, start: int, step: int) -> Columns:
+    return {name: values[start::step].copy() for name, values in block.items()}
+
+
 def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
-STRETCHES = 750  # two points each
-
-
 class Envelope:
-    """Smallest and largest error of the estimate and of the coast, block after block of N rows in all."""
+    """Smallest and largest error of the estimate and of the coast, block after block."""
 
-    def __init__(self, N: int, d: int) -> None:
-        self.bins = _Bins(N, STRETCHES)
-        self.t = np.zeros((2, self.bins.K))  # first and last
-        self.extremes = {name: np.full((2, self.bins.K, d), np.nan) for name in ("bias", "coast")}
-        self.last = -1  # stretch of the block before
+    def __init__(self, d: int) -> None:
+        self.stretches, K = _Stretches(STRETCHES), 2 * STRETCHES
+        self.t = np.full((K, 2), np.nan)  # first and last
+        self.low, self.high = np.full((K, 2 * d), np.inf), np.full((K, 2 * d), -np.inf)
 
     def add(self, block: Mapping[str, Array]) -> None:
         """Take the next block, with its `reference`; an error is not known where the reference is not."""
-        stretches, starts = self.bins.next(len(block["t"]))
-        begun = int(stretches[0] == self.last)  # by the block before
-        self.t[0, stretches[begun:]] = block["t"][starts[begun:]]
-        self.t[1, stretches] = block["t"][np.append(starts[1:], len(block["t"])) - 1]
-        self.last = int(stretches[-1])
-        for name, (low, high) in self.extremes.items():
-            error = block[name] - block["reference"]
-            low[stretches] = np.fmin(low[stretches], np.fmin.reduceat(error, starts))
-            high[stretches] = np.fmax(high[stretches], np.fmax.reduceat(error, starts))
+        where = self.stretches.next(len(block["t"]), self._merge)
+        error = np.column_stack([block[name] - block["reference"] for name in ("bias", "coast")])
+        _extremes(block["t"], error, *where, self.t, self.low, self.high)
+
+    def _merge(self) -> None:
+        last = np.fmax(self.t[::2, 1], self.t[1::2, 1])  # of the last pair the second may not have begun
+        self.t = np.concatenate([np.column_stack([self.t[::2, 0], last]), np.full((STRETCHES, 2), np.nan)])
+        low, high = np.minimum(self.low[::2], self.low[1::2]), np.maximum(self.high[::2], self.high[1::2])
+        none = np.full_like(low, np.inf)
+        self.low, self.high = np.concatenate([low, none]), np.concatenate([high, -none])
 
     def curves(self) -> Columns:
         """Return `t` (2 K,) in s and the errors `bias` and `coast` (2 K, d) in SI, smallest and largest in turn."""
-        (first, last), quarter = self.t, (self.t[1] - self.t[0]) / 4
-        errors = {name: _in_turn(low, high) for name, (low, high) in self.extremes.items()}
-        return {"t": _in_turn(first + quarter, last - quarter), **errors}
+        K = -(-self.stretches.at // self.stretches.length)
+        (first, last), low, high = self.t[:K].T, self.low[:K], self.high[:K]
+        quarter, known = (last - first) / 4, low <= high
+        error = _in_turn(np.where(known, low, np.nan), np.where(known, high, np.nan))
+        bias, coast = np.split(error, 2, axis=1)
+        return {"t": _in_turn(first + quarter, last - quarter), "bias": bias, "coast": coast}
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _extremes(t: Array, error: Array, at: int, length: int, times: Array, low: Array, high: Array) -> None:
+    for k in range(len(t)):
+        row = (at + k) // length
+        if row * length == at + k:
+            times[row, 0] = t[k]
+        times[row, 1] = t[k]
+        for j in range(error.shape[1]):  # NaN is neither
+            if error[k, j] < low[row, j]:
+                low[row, j] = error[k, j]
+            if error[k, j] > high[row, j]:
+                high[row, j] = error[k, j]
 
 
 def _in_turn(first: Array, second: Array) -> Array:

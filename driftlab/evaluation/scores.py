@@ -118,9 +118,8 @@ class ScoreAccumulator:
         self.start = np.inf  # of the coast [s]
         self.end = -np.inf  # of the run [s]
         self.moved = 0.0  # s
-        self._filter = {FIRST: Integral(d, 30.0), WHOLE: Integral(d)}
-        self._coast = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
-        self._sigma = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
+        lengths = {FIRST: 30.0, **HORIZONS}  # of errors of estimate and coast, and of the coast's deviation
+        self._integrals = {name: Integral(3 * d, length) for name, length in lengths.items()}
         self._cells = Cells(d)
 
     def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
@@ -138,28 +137,26 @@ class ScoreAccumulator:
         self.moved += float(np.sum(tau[~estimates["still"][rows].astype(bool)]))
         bias, coast, sigma = (estimates[name][rows] for name in ("bias", "coast", "coast_sigma"))
         known = np.isfinite(reference[:, 0])
-        for integrals, error in (
-            (self._filter, bias - reference),
-            (self._coast, coast - reference),
-            (self._sigma, sigma),
-        ):
-            for integral in integrals.values():
-                integral.add(t, tau, np.ascontiguousarray(error, dtype=np.float64), known, self.start)
+        errors = np.column_stack([bias - reference, coast - reference, sigma]).astype(np.float64, copy=False)
+        for integral in self._integrals.values():
+            integral.add(t, tau, errors, known, self.start)
         self._cells.add(t - tau / 2 - self.start, tau * known, coast - reference, coast - estimates["rate"][rows])
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Scores:
         """Return the scores of the rows that were added; an alignment lasts `align` s."""
         length = self.end - self.start
         none = np.full(len(axes), np.nan)
-        coast, sigma, heading = {}, {}, {}
+        coast, sigma, heading, d = {}, {}, {}, len(axes)
         for name, horizon in HORIZONS.items():
             reached = np.isinf(horizon) or length >= horizon * (1 - 1e-9)
-            coast[name] = self._coast[name].rms(length) if reached else none
-            sigma[name] = self._sigma[name].rms(length) if reached else none
-            turned = np.nan if up is None or len(axes) != 3 else float(abs(self._coast[name].total @ up))
-            heading[name] = turned if np.all(np.isfinite(coast[name])) else np.nan
-        share = {name: integral.share(length) for name, integral in {**self._filter, **self._coast}.items()}
-        first, whole = (integral.rms(length) for integral in self._filter.values())
+            rms = self._integrals[name].rms(length)
+            coast[name], sigma[name] = (rms[d : 2 * d], rms[2 * d :]) if reached else (none, none)
+            turned = self._integrals[name].total[d : 2 * d]
+            angle = np.nan if up is None or d != 3 else float(abs(turned @ up))
+            heading[name] = angle if np.all(np.isfinite(coast[name])) else np.nan
+        share = {name: integral.share(length) for name, integral in self._integrals.items()}
+        share = {FIRST: share.pop(FIRST), WHOLE: share["to the end"], **share}
+        first, whole = (self._integrals[name].rms(length)[:d] for name in (FIRST, "to the end"))
         moved = self.moved / length if length > 0 else 0.0
         coasts = self._cells.coasts(HORIZONS["10 min"], align, coast["10 min"])
         return Scores(axes, first, whole, coast, sigma, heading, share, moved, coasts, self._cells.errors())
@@ -174,30 +171,28 @@ class Cells:
 
     def __init__(self, d: int) -> None:
         self.d = d
+        self.size = 0  # cells so far
         self._sums = np.zeros((0, 1 + 3 * d))  # time at rest [s], integrals of error, of its square, and of c - rate
 
     def add(self, t: Array, tau: Array, error: Array, raw: Array) -> None:
         """Take the next rows: times t (N,) from the start, s, at rest for tau (N,), with their errors (N, d)."""
-        cell = np.maximum((t / CELL).astype(np.int64), 0)
-        rest = tau > 0
-        size = int(cell[-1]) + 1
-        if size > len(self._sums):
-            self._sums = np.concatenate([self._sums, np.zeros((size - len(self._sums), self._sums.shape[1]))])
-        values = np.column_stack([np.ones(len(t)), error, error**2, raw])
-        for k, column in enumerate(values[rest].T):
-            self._sums[:, k] += np.bincount(cell[rest], column * tau[rest], minlength=len(self._sums))
+        self.size = max(int(t[-1] / CELL), 0) + 1
+        if self.size > len(self._sums):  # room for those to come, too
+            self._sums = np.concatenate([self._sums, np.zeros((self.size, self._sums.shape[1]))])
+        _sum_cells(t, tau, error, raw, self._sums)
 
     def errors(self) -> Array:
         """Return time, s, and mean of prediction less rate (K, 1 + d) of the cells that were at rest."""
-        rest = self._sums[:, 0] >= MEASURED * CELL
-        means = self._sums[rest, 1 + 2 * self.d :] / self._sums[rest, :1]
+        sums = self._sums[: self.size]
+        rest = sums[:, 0] >= MEASURED * CELL
+        means = sums[rest, 1 + 2 * self.d :] / sums[rest, :1]
         return np.column_stack([(np.flatnonzero(rest) + 0.5) * CELL, means])
 
     def coasts(self, length: float, align: float, first: Array) -> Array:
         """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
         coasts = [first] if np.all(np.isfinite(first)) else []
-        for start in range(n, len(self._sums) - n + 1, n):
+        for start in range(n, self.size - n + 1, n):
             aligned, coast = (
                 np.sum(self._sums[part], axis=0) for part in (slice(start - m, start), slice(start, start + n))
             )
@@ -206,6 +201,19 @@ class Cells:
                 mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]
                 coasts.append(np.sqrt(np.maximum(square - 2 * level * mean + level**2, 0.0)))
         return np.array(coasts).reshape(-1, d)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sum_cells(t: Array, tau: Array, error: Array, raw: Array, sums: Array) -> None:
+    d = error.shape[1]
+    for k in range(len(t)):
+        if tau[k] > 0:
+            cell = sums[max(int(t[k] / CELL), 0)]
+            cell[0] += tau[k]
+            for j in range(d):
+                cell[1 + j] += tau[k] * error[k, j]
+                cell[1 + d + j] += tau[k] * error[k, j] ** 2
+                cell[1 + 2 * d + j] += tau[k] * raw[k, j]
 
 
 class Integral:

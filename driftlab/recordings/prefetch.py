@@ -1,10 +1,11 @@
-"""One thread prepares the items that another one uses: a recording is read while the filter runs on earlier samples."""
+"""Threads beside the one that filters: before it one reads the recording, after it one looks at what it has made."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from typing import Any, TypeVar
 
@@ -66,3 +67,19 @@ def _make(items: Iterable[Any], queue: Queue[tuple[bool, Any]], left: threading.
     finally:
         if isinstance(items, Generator):
             items.close()  # a file that it reads, too: here, and not when the program ends
+
+
+@contextmanager
+def aside() -> Iterator[Callable[[Callable[[Item], object], Item], None]]:
+    """Give a callable that has another thread do `function(item)`, after the one before, whose error it raises."""
+    under_way: list[Future[object]] = []
+
+    def do(function: Callable[[Item], object], item: Item) -> None:
+        if under_way:
+            under_way.pop().result()
+        under_way.append(thread.submit(function, item))
+
+    with ThreadPoolExecutor(1) as thread:
+        yield do
+        if under_way:
+            under_way.pop().result()

@@ -4,7 +4,7 @@ import numpy as np
 from epochs_at_rest import DEG_H, epochs_at_rest
 
 from driftlab.config import Config
-from driftlab.evaluation.overview import overview_of
+from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from fusion_core.chunk import Chunk
@@ -60,7 +60,8 @@ def run_over(settings, chunk):
     journal = RunLog()
     run = Run(settings, journal)
     columns = joined(run.over([chunk]))
-    return journal, columns, overview_of(columns, run.model, journal.alignments[0]), run.model
+    overview = OverviewAccumulator(run.model, journal.alignments[0]).read(columns).overview()
+    return journal, columns, overview, run.model
 
 
 def true_rms(columns, name, truth):

@@ -14,7 +14,7 @@ def rows(N, seed=0):
 
 def of(block, size):
     N = len(block["t"])
-    found = Envelope(N, 2)
+    found = Envelope(2)
     for start in range(0, N, size):
         found.add({name: values[start : start + size] for name, values in block.items()})
     return found.curves()
@@ -27,7 +27,7 @@ def test_it_is_the_same_however_the_rows_come(N):
         for name, values in of(rows(N), size).items():
             np.testing.assert_array_equal(values, whole[name])
     assert np.all(np.diff(whole["t"]) >= 0)
-    assert len(whole["t"]) == 2 * min(N, STRETCHES)
+    assert 2 * min(N, STRETCHES) <= len(whole["t"]) <= 4 * STRETCHES
 
 
 @pytest.mark.parametrize("at", [0, 777, 5004, 12_344])

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from driftlab.evaluation.overview import overview_of
+from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, rms_over_time, score
 
 UP = np.array([0.6, 0.0, -0.8])
@@ -140,7 +140,7 @@ def test_refusing_data_never_changes_a_score(seed, part):
     alignment = SimpleNamespace(t=float(rows["t"][0]), up=UP)
     flags = [np.ones(N, bool), rng.random(N) > part]
     flags[1][-1] = flags[0][0] = True
-    found = [overview_of(rows | {"used": used}, model, alignment).yardsticks for used in flags]
+    found = [OverviewAccumulator(model, alignment).read(rows | {"used": used}).overview().yardsticks for used in flags]
     assert repr(found[0]) == repr(found[1])
     assert repr(score(rows | {"used": flags[1]}, UP, AXES)) == repr(score(rows, UP, AXES))
 
