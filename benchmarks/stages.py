@@ -80,6 +80,7 @@ def main() -> None:
         import driftlab.evaluation.overview as overview
         import driftlab.filtering.run as run
         import driftlab.filtering.tracker as tracker
+        import driftlab.storage.folders as folders
         from driftlab.commands.console import keep_freed_memory
         from driftlab.config import load_config
         from driftlab.storage.hdf5 import GrowingFile
@@ -93,10 +94,13 @@ def main() -> None:
     timed_iterator(tracker.Tracker, "advance", "filter")
     for name in ("append", "flush", "close", "_put_all"):
         timed(GrowingFile, name, "write")
-    timed_iterator(overview, "_blocks", "report")
-    for name in ("survey", "summarise", "write_report"):
-        if hasattr(filtering, name):
-            timed(filtering, name, "report")
+    for owner, names in (
+        (overview.OverviewAccumulator, ("add", "read", "overview")),
+        (filtering, ("summarise", "write_report")),
+    ):
+        for name in names:
+            timed(owner, name, "report")
+    timed(folders, "digest", "digest")
     keep_freed_memory()
     begun = time.perf_counter()
     filtering.run(loaded, out=Path(out))

@@ -20,6 +20,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -32,6 +33,8 @@ from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from driftlab.storage.hdf5 import reading, reason, sync
 from fusion_core.budget import read_whole
@@ -293,6 +296,8 @@ FILES = {  # of each command; the first says that all are there
     "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
 }
 LOCK, BEFORE = "driftlab.lock", ".replaced"
+LARGE, BLOCK = 1 << 24, 1 << 18  # bytes of a file whose digest is one of sums, and of a block
+SUMS = "sums:"  # how such a digest begins
 LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 MARKS = {  # how a file begins, and what stands near its beginning
     ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
@@ -329,7 +334,8 @@ def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
         if name == first:
             return is_ours(path) and (not whole or known[first] == _digest_of(content))
         if isinstance(known, dict) and (whole or name in known):
-            return known.get(name) == digest(path)
+            wanted = known.get(name)
+            return wanted == digest(path, sums=str(wanted).startswith(SUMS))
         # of a version before digests, or before those of all files
         return is_ours(path) or (known is None and "verdict" in content and not name.endswith((".html", ".h5")))
 
@@ -360,13 +366,34 @@ def is_ours(path: Path) -> bool:
     return mark is not None and head.startswith(mark[0]) and mark[1] in head
 
 
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, empty where it is a link or cannot be read."""
+def digest(path: Path, *, sums: bool | None = None) -> str:
+    """Return the SHA-256 of a file, of a large one that of sums (`_sums`), in a third of the time.
+
+    It is empty for a link, and for what cannot be read. Where `sums` is given it says which of both it is.
+    """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            if os.fstat(file.fileno()).st_size < LARGE if sums is None else not sums:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+            return SUMS + _sums(file)
     except OSError:
         return ""
+
+
+def _sums(file: io.BufferedReader) -> str:
+    """Return the SHA-256 of a file's length and of a sum of each of its blocks, of words times odd numbers modulo 2^64.
+
+    Any change within a word changes the sum; one of several words leaves it as it is once in 2^63 times or so.
+    """
+    odd = np.arange(1, BLOCK // 8 + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    odd = (odd ^ odd >> np.uint64(31)) * np.uint64(0xBF58476D1CE4E5B9) | np.uint64(1)
+    block, whole, length = np.zeros(BLOCK // 8, dtype=np.uint64), hashlib.sha256(), 0
+    while count := file.readinto(block.data):
+        block.view(np.uint8)[count:] = 0
+        length += count
+        whole.update(int(np.dot(block, odd)).to_bytes(8, "little"))
+    whole.update(length.to_bytes(8, "little"))
+    return whole.hexdigest()
 
 
 def _document(path: Path) -> dict[str, Any]:

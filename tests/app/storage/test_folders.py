@@ -1,6 +1,7 @@
 """What may be replaced, who holds a folder, and what is refused before the work begins."""
 
 # ruff: noqa: PT012, SIM117  # what is raised inside is the point
+import hashlib
 import json
 import os
 import re
@@ -348,6 +349,33 @@ def test_results_that_were_edited_since_are_not_replaced(tmp_path, name):
         with output_folder(out, "explain"):
             pass
     assert (out / name).read_bytes() == edited
+
+
+@pytest.mark.parametrize("at", [0, (1 << 18) - 1, 9_000_001, 17_000_000])
+def test_a_large_file_of_which_one_byte_was_edited_is_not_replaced(tmp_path, at):
+    def write(content):
+        with output_folder(tmp_path / "out") as folder:
+            (folder / "summary.json").write_text('{"schema": 1, "driftlab": "x", "verdict": "pass"}')
+            (folder / "report.html").write_bytes(content)
+
+    content = bytearray(np.random.default_rng(0).bytes(17_000_001))
+    write(content)
+    write(content)  # the first one was ours
+    content[at] ^= 0x80
+    (tmp_path / "out" / "report.html").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"holds report.html, which driftlab did not write, or not so"):
+        write(b"")
+
+
+def test_results_of_a_version_that_hashed_large_files_whole_are_replaced(tmp_path):
+    for _ in range(2):
+        with output_folder(tmp_path / "out") as folder:
+            (folder / "summary.json").write_text('{"schema": 1, "driftlab": "x", "verdict": "pass"}')
+            (folder / "report.html").write_bytes(bytes(17_000_001))
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["written"]["report.html"].startswith("sums:")
+        summary["written"]["report.html"] = hashlib.sha256(bytes(17_000_001)).hexdigest()
+        (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
 
 
 def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
