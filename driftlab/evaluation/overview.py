@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, moving_average
+from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
@@ -312,7 +312,7 @@ class Envelope:
     def add(self, block: Mapping[str, Array]) -> None:
         """Take the next block, with its `reference`; an error is not known where the reference is not."""
         where = self.stretches.next(len(block["t"]), self._merge)
-        error = np.column_stack([block[name] - block["reference"] for name in ("bias", "coast")])
+        error = errors_of(block["bias"], block["coast"], block["coast"], block["reference"])
         _extremes(block["t"], error, *where, self.t, self.low, self.high)
 
     def _merge(self) -> None:
@@ -339,7 +339,7 @@ def _extremes(t: Array, error: Array, at: int, length: int, times: Array, low: A
         if row * length == at + k:
             times[row, 0] = t[k]
         times[row, 1] = t[k]
-        for j in range(error.shape[1]):  # NaN is neither
+        for j in range(low.shape[1]):  # NaN is neither
             if error[k, j] < low[row, j]:
                 low[row, j] = error[k, j]
             if error[k, j] > high[row, j]:

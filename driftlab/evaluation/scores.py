@@ -80,12 +80,12 @@ def moving_average(t: Array, rate: Array, tau: Array, still: Flags, window: floa
     were not at rest. At the ends of the recording the window is as much of it as there is.
     """
     weight = np.where(still, tau, 0.0)
-    averages = _average(t, np.ascontiguousarray(rate), weight, window, min(MIN_AT_REST, window / 2))
-    return np.where(still[:, None], averages, np.nan)
+    averages: Array = _average(t, np.ascontiguousarray(rate), weight, still, window, min(MIN_AT_REST, window / 2))
+    return averages
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _average(t: Array, rate: Array, weight: Array, window: float, least: float) -> Array:
+def _average(t: Array, rate: Array, weight: Array, still: Flags, window: float, least: float) -> Array:
     # sums from the first row of each window up to its last, which both only ever move on
     N, d = rate.shape
     out = np.full((N, d), np.nan)
@@ -105,7 +105,7 @@ def _average(t: Array, rate: Array, weight: Array, window: float, least: float) 
         while last < N and t[last] < t[k] + window / 2 + 1e-9:
             last += 1
         lasted = time[last] - time[first]
-        if lasted >= least - 1e-6:
+        if still[k] and lasted >= least - 1e-6:
             for j in range(d):
                 out[k, j] = (angle[last, j] - angle[first, j]) / lasted + typical[j]
     return out
@@ -135,12 +135,14 @@ class ScoreAccumulator:
         t, tau, reference = t[rows], np.asarray(estimates["tau"][rows], dtype=np.float64), reference[rows]
         self.start = min(self.start, float(t[0] - tau[0]))
         self.moved += float(np.sum(tau[~estimates["still"][rows].astype(bool)]))
-        bias, coast, sigma = (estimates[name][rows] for name in ("bias", "coast", "coast_sigma"))
-        known = np.isfinite(reference[:, 0])
-        errors = np.column_stack([bias - reference, coast - reference, sigma]).astype(np.float64, copy=False)
+        coast, known = estimates["coast"][rows], np.isfinite(reference[:, 0])
+        columns = (np.asarray(estimates[name][rows], dtype=np.float64) for name in ("bias", "coast", "coast_sigma"))
+        errors = errors_of(*columns, reference)
         for integral in self._integrals.values():
             integral.add(t, tau, errors, known, self.start)
-        self._cells.add(t - tau / 2 - self.start, tau * known, coast - reference, coast - estimates["rate"][rows])
+        d = coast.shape[1]
+        raw = coast - estimates["rate"][rows]
+        self._cells.add(t - tau / 2 - self.start, tau * known, errors[:, d : 2 * d], raw)
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Scores:
         """Return the scores of the rows that were added; an alignment lasts `align` s."""
@@ -278,6 +280,19 @@ def _integrate(
                 total[j] += lasted * error[k, j]
         last[0] = t[k]
         last[1:] = error[k]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def errors_of(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
+    """Return the errors (N, 3 d) of bias and coast, and the coast's deviation: rows of three take NumPy too long."""
+    N, d = bias.shape
+    errors = np.empty((N, 3 * d))
+    for k in range(N):
+        for j in range(d):
+            errors[k, j] = bias[k, j] - reference[k, j]
+            errors[k, d + j] = coast[k, j] - reference[k, j]
+            errors[k, 2 * d + j] = sigma[k, j]
+    return errors
 
 
 def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Scores:

@@ -197,10 +197,11 @@ def _of_estimate(
             since = max(since, learnt[r + 1, j])
             passed[0, j], passed[1, j], passed[2, j] = (1 - g) ** 2, 2 * g * (1 - g), g * g
             sigma[k, j] = b
+        root = np.sqrt(error[k, 0]), np.sqrt(error[k, 1])
         for j in range(d):
             b, total, g = sigma[k, j], 0.0, known[1, j]
             for m in range(2):
-                y, kept = b * np.sqrt(error[k, m]), left[k, m] * following[0, m, j]
+                y, kept = b * root[m], left[k, m] * following[0, m, j]
                 if m == 0:
                     kept -= left[k, 2] * following[2, 0, j]
                     turned = left[k, 0] * following[2, 0, j] + left[k, 2] * following[0, 0, j]
@@ -257,10 +258,11 @@ def _of_coast(
 ) -> None:  # fmt: skip
     for k in range(len(T)):
         i, share = _place(T[k], low, step, len(slope))
+        root = np.sqrt(error[k, 0]), np.sqrt(error[k, 1])
         for j in range(P.shape[1]):
             b, total = (1 - share) * slope[i, j] + share * slope[i + 1, j], 0.0
             for m in range(2):
-                y, c = b * np.sqrt(error[k, m]), left[k, m] * departing[0, m, j]
+                y, c = b * root[m], left[k, m] * departing[0, m, j]
                 if m == 0:
                     c -= left[k, 2] * departing[2, 0, j]
                     turned = left[k, 0] * departing[2, 0, j] + left[k, 2] * departing[0, 0, j]

@@ -25,10 +25,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import Alignment, Measurement, Sensor, Transition
 from fusion_core.statespace import StateSpace
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _turned(tau: Array, values: Array, given: Array, drift: Array, integral: Array) -> None:
+    """Write tau (values - given - drift) into integral (N, d): with NumPy rows of three are ten times as slow."""
+    for k in range(len(values)):
+        k_u = min(k, len(drift) - 1)
+        for j in range(values.shape[1]):
+            integral[k, j] = tau[k] * (values[k, j] - given[j] - drift[k_u, j])
 
 
 @dataclass(frozen=True)
@@ -65,12 +75,13 @@ class ZeroVelocity:
             F, Q = self._kept[1]
         else:
             F, Q = self._matrices(dt, tau, steps)
-        u, places = np.zeros((len(chunk), self.space.n)), self.space.places  # filled one by one: they are large
+        u, places = np.empty((len(chunk), self.space.n)), self.space.places
         for triad, step in zip(self.triads, steps, strict=True):
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
-            channel = triad.sensor.channel
-            turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel] - drift)
-            u[:, places[triad.integral]], u[:, places[triad.sensor.block.name]] = turned, step.u
+            values, given = chunk[triad.sensor.channel], alignment.inputs[triad.sensor.channel]
+            integral = u[:, places[triad.integral]]
+            _turned(chunk["tau"], values, given, np.atleast_2d(drift), integral)
+            u[:, places[triad.sensor.block.name]] = step.u
         return Transition(F, Q, u)
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:
