@@ -6,11 +6,13 @@ everything is SI, except that temperatures are in degC.
 
 from __future__ import annotations
 
+import sys
 import unicodedata
 from collections.abc import Mapping
 from fractions import Fraction
 from functools import cache, lru_cache
 from importlib.resources import files
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,10 +31,21 @@ _THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count
 @cache
 def registry() -> pint.UnitRegistry[float]:
     """Return the unit registry of the program: pint, with the definitions of `units.txt`."""
-    import pint
-
+    pint = _pint()
     definitions = str(files(__package__).joinpath("units.txt"))
     return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
+
+
+@cache
+def _pint() -> ModuleType:
+    """Return pint; dask, which it would import to know its arrays by, takes longer than itself, and is hidden from it."""
+    hidden = sys.modules.setdefault("dask", None) is None  # type: ignore[arg-type]
+    try:
+        import pint
+    finally:
+        if hidden:
+            del sys.modules["dask"]
+    return pint
 
 
 def to_si(text: str, unit: str) -> float:
@@ -181,8 +194,7 @@ def of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
 
 def _canonical(name: str, text: str) -> str:
     """Return pint's name of a unit; nothing but a single name is ever given to pint."""
-    import pint
-
+    pint = _pint()
     try:
         return str(registry().get_name(unicodedata.normalize("NFKC", name)))
     except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
