@@ -336,8 +336,10 @@ class Prediction:
         error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
         return State(state.x + error, state.P)
 
-    def look(self, done: Chunk, estimates: Estimates, step: Transition, alignment: Alignment) -> BiasOutput:
-        """Return the bias over the next epochs, whose block went by `step`."""
+    def look(
+        self, done: Chunk, estimates: Estimates, step: Transition, alignment: Alignment, calibration: Array
+    ) -> BiasOutput:
+        """Return the bias over the next epochs, whose block went by `step`, and from which `calibration` (N, d) was taken."""
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(estimates, self.block, step.C)
@@ -351,19 +353,29 @@ class Prediction:
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        late = self._to_the_end(done, step)
-        return BiasOutput(bias + late, sigma, coast + late, coast_sigma)
+        bias, coast = (_to_the_end(values, *self._late(done, step), calibration) for values in (bias, coast))
+        return BiasOutput(bias, sigma, coast, coast_sigma)
 
-    def _to_the_end(self, done: Chunk, step: Transition) -> Array:
-        """Return the known drift (N, d) from the middle of an epoch, of which its channels are, to its end.
+    def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:
+        """Return the share (N,) of the known drift (N or 1, d) from the middle of an epoch, of which it is, to its end.
 
         None where there are effects: their channels are not smoothed, and half a step more of them is more noise.
         """
-        if self.effects:
-            return np.zeros((len(done), 1))
         drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
         share = done["tau"] / np.where(done.dt > 0, done.dt, np.inf) / 2
-        return np.asarray(share[:, None] * drift)
+        return np.zeros_like(share) if self.effects else share, np.atleast_2d(drift)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _to_the_end(values: Array, share: Array, drift: Array, calibration: Array) -> Array:
+    """Return the values (N, d) with a share (N,) of the drift and with the calibration (N, d)."""
+    N, d = values.shape
+    out = np.empty((N, d))
+    for k in range(N):
+        k_u = min(k, len(drift) - 1)
+        for j in range(d):
+            out[k, j] = values[k, j] + share[k] * drift[k_u, j] + calibration[k, j]
+    return out
 
 
 def _output(estimates: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:

@@ -27,7 +27,8 @@ from fusion_core.model import Estimates, Flags
 
 def check_finite(estimates: Estimates, t: Array, when: Callable[[float], str]) -> None:
     """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
-    if np.isfinite(np.vdot(estimates.x, estimates.x) + np.vdot(estimates.sigma, estimates.sigma)):
+    sigma = estimates.sigma if estimates.sigma.strides[0] else estimates.sigma[:1]  # one row that stands for all
+    if np.isfinite(np.vdot(estimates.x, estimates.x) + np.vdot(sigma, sigma)):
         return  # nearly always, and in one pass; what overflows is looked at below
     good = np.all(np.isfinite(estimates.x) & np.isfinite(estimates.sigma), axis=1)
     if not np.all(good):
@@ -183,13 +184,13 @@ class Tracker:
     ) -> RunSegment:
         channel = self.model.tracked.channel
         still = self.watch.look(done, estimates)
-        output = self.prediction.look(done, estimates, step, self.alignment)
+        output = self.prediction.look(done, estimates, step, self.alignment, calibration)
         return RunSegment(
             epochs=done,
             rate=done[channel] - self.model.known(done, self.alignment),
-            bias=output.bias + calibration,
+            bias=output.bias,
             sigma=output.sigma,
-            coast=output.coast + calibration,
+            coast=output.coast,
             coast_sigma=output.coast_sigma,
             calibration=calibration,
             still=still,
