@@ -339,7 +339,7 @@ class Prediction:
     def look(
         self, done: Chunk, estimates: Estimates, step: Transition, alignment: Alignment, calibration: Array
     ) -> BiasOutput:
-        """Return the bias over the next epochs, whose block went by `step`, and from which `calibration` (N, d) was taken."""
+        """Return the bias over the next epochs, whose block went by `step`; `calibration` (N, d) was subtracted."""
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(estimates, self.block, step.C)

@@ -38,7 +38,7 @@ def registry() -> pint.UnitRegistry[float]:
 
 @cache
 def _pint() -> ModuleType:
-    """Return pint; dask, which it would import only to know its arrays, takes longer than itself and is hidden from it."""
+    """Return pint; dask is hidden from it, which it would import to know its arrays by, longer than itself."""
     hidden = sys.modules.setdefault("dask", None) is None  # type: ignore[arg-type]
     try:
         import pint
