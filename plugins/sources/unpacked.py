@@ -1,23 +1,26 @@
 """The bytes of a file, unpacked where they are a gzip archive; `-` is standard input.
 
-Standard input is kept in a temporary file, so that it can be read as often as a recording is: once for each config that
-is compared, again to find the number of a line that is wrong.
+Standard input is taken as it is asked for, and kept in a temporary file without a name, so that it can be read as often
+as a recording is: once for each config that is compared, again to find the number of a line that is wrong. What is no
+recording is refused by its beginning, and nothing is left behind however the program ends.
 """
 
 from __future__ import annotations
 
-import atexit
 import io
+import os
 import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import BinaryIO
 
-from fusion_core.budget import TimeBudget, keep, no_room
+from fusion_core import budget
+from fusion_core.budget import TEXTS, TimeBudget, no_room
 from fusion_core.contracts import head
 from fusion_core.errors import UnreadableFile
 
@@ -41,16 +44,17 @@ def opened(path: Path) -> Iterator[Stream]:
     Unwritable
         If standard input cannot be kept.
     """
-    where = _standard_input() if path == STANDARD_INPUT else path
-    if not head(where, path).startswith(GZIP):
-        with where.open("rb") as file:
-            yield file
-        return
-    try:
-        with where.open("rb") as file, io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
-            yield unpacked  # type: ignore[misc]
-    except (EOFError, zlib.error) as error:
-        raise damaged(path, str(error)) from None
+    if path != STANDARD_INPUT:
+        head(path)
+    with path.open("rb") if path != STANDARD_INPUT else io.BufferedReader(_Again(_standard_input()), BUFFER) as file:
+        if not beginning(file, path, "0 bytes").startswith(GZIP):
+            yield file  # type: ignore[misc]
+            return
+        try:
+            with io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
+                yield unpacked  # type: ignore[misc]
+        except (EOFError, zlib.error) as error:
+            raise damaged(path, str(error)) from None
 
 
 def damaged(path: Path, reason: str) -> UnreadableFile:
@@ -58,34 +62,101 @@ def damaged(path: Path, reason: str) -> UnreadableFile:
     return UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again")
 
 
-def beginning(file: Stream, path: Path) -> bytes:
+def beginning(file: Stream, path: Path, none: str = "0 bytes when unpacked") -> bytes:
     """Return the first bytes of an open file and go back to them; raises UnreadableFile where there are none."""
     first = file.read(4096)
     file.seek(0)
     if not first:
-        raise UnreadableFile(f"{path}: is empty (0 bytes when unpacked); nothing was written to it, or a copy failed")
+        raise UnreadableFile(f"{path}: is empty ({none}); nothing was written to it, or a copy failed")
     return first
 
 
 @cache
-def _standard_input() -> Path:
-    """Return a temporary file with all of standard input, which is removed at exit."""
+def _standard_input() -> _Kept:
+    """Return what keeps standard input."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
     try:
-        file = tempfile.NamedTemporaryFile(prefix="driftlab-")  # noqa: SIM115
-        atexit.register(file.close)
+        return _Kept(sys.stdin.buffer, tempfile.TemporaryFile(buffering=0))  # type: ignore[arg-type]
     except OSError as error:
         raise no_room(STANDARD_INPUT, error) from None
-    try:
-        keep(STANDARD_INPUT, sys.stdin.buffer, file)
-    except BaseException:
-        file.close()
-        raise
-    return Path(file.name)
 
 
-class _Members(io.RawIOBase):
+class _Kept:
+    """A stream, and all that came of it so far, in a temporary file."""
+
+    def __init__(self, stream: io.BufferedReader, file: BinaryIO) -> None:
+        self.stream, self.file, self.size = stream, file, 0
+        self.lock = Lock()  # one of two configs may be read ahead by a thread of its own
+        with suppress(OSError, ValueError):
+            os.set_blocking(stream.fileno(), True)  # else nothing yet looks like the end
+
+    def read(self, at: int, most: int) -> bytes:
+        """Return bytes from a place on, none at the end; raises UnreadableFile beyond the limit, and Unwritable."""
+        with self.lock:
+            if at == self.size:
+                return self._next(most)
+            self.file.seek(at)
+            return self.file.read(most)
+
+    def _next(self, most: int) -> bytes:
+        data = self.stream.read1(most)
+        if self.size + len(data) > budget.MAX_TEMPORARY:
+            raise UnreadableFile(
+                f"-: standard input has more than {budget.size_of(budget.MAX_TEMPORARY)}, which is the limit; write it "
+                "to a file, and name that"
+            )
+        left = memoryview(data)
+        try:
+            self.file.seek(self.size)
+            while left:
+                left = left[self.file.write(left) :]
+        except OSError as error:
+            raise no_room(STANDARD_INPUT, error) from None
+        self.size += len(data)
+        return data
+
+
+class _Seekable(io.RawIOBase):
+    """Bytes that are read from a place `at` on."""
+
+    at = 0
+
+    def readable(self) -> bool:
+        """Whether it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Whether `seek` is possible."""
+        return True
+
+    def tell(self) -> int:
+        """Return the place in the bytes."""
+        return self.at
+
+
+class _Again(_Seekable):
+    """What is kept of a stream, from its beginning."""
+
+    def __init__(self, kept: _Kept) -> None:
+        self.kept = kept
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place in what was read."""
+        if whence == io.SEEK_END:
+            raise io.UnsupportedOperation("the end is not known")
+        self.at = offset + (self.at if whence == io.SEEK_CUR else 0)
+        return self.at
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read into a buffer; return the number of bytes, 0 at the end."""
+        data = self.kept.read(self.at, len(buffer))
+        buffer[: len(data)] = data
+        self.at += len(data)
+        return len(data)
+
+
+class _Members(_Seekable):
     """The content of the members of a gzip archive, one after the other; zeros behind one are padding."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
@@ -96,21 +167,10 @@ class _Members(io.RawIOBase):
     def _rewind(self) -> None:
         self.file.seek(0)
         self.engine, self.left, self.at, self.inside = zlib.decompressobj(WITH_HEADER), b"", 0, False
-
-    def readable(self) -> bool:
-        """Whether it can be read."""
-        return True
-
-    def seekable(self) -> bool:
-        """Whether `seek` is possible, at the cost of unpacking what lies before."""
-        return True
-
-    def tell(self) -> int:
-        """Return the place in the unpacked bytes."""
-        return self.at
+        self.idle = 0  # bytes since some that held anything
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place in the unpacked bytes."""
+        """Go to a place in the unpacked bytes, at the cost of unpacking what lies before."""
         offset += self.at if whence == io.SEEK_CUR else 0
         if whence == io.SEEK_END:
             raise io.UnsupportedOperation("the end is not known")
@@ -134,7 +194,7 @@ class _Members(io.RawIOBase):
             self.clock.tick()
             if self.engine.eof:
                 self.engine, self.left, self.inside = zlib.decompressobj(WITH_HEADER), self.engine.unused_data, False
-            packed = self.left or self.file.read(READ)
+            packed = self.left or self._packed()
             self.left = b""
             if not self.inside:
                 ended, packed = not packed, packed.lstrip(b"\0")
@@ -146,6 +206,16 @@ class _Members(io.RawIOBase):
             data = self.engine.decompress(packed, most)
             self.left = self.engine.unconsumed_tail
             if data:
+                self.idle = 0
                 return data
             if not packed and not self.engine.eof:
                 raise EOFError("Compressed file ended before the end-of-stream marker was reached")
+
+    def _packed(self) -> bytes:
+        self.idle += READ
+        if self.idle > TEXTS:
+            raise UnreadableFile(
+                f"{self.path}: has more than {budget.size_of(TEXTS)} that unpack to nothing, which is the limit; pack "
+                "it again"
+            )
+        return self.file.read(READ)
