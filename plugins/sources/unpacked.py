@@ -17,10 +17,9 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
-from fusion_core import budget
-from fusion_core.budget import TEXTS, TimeBudget, no_room
+from fusion_core.budget import TEXTS, TimeBudget, keep, no_room, size_of
 from fusion_core.contracts import head
 from fusion_core.errors import UnreadableFile
 
@@ -46,8 +45,8 @@ def opened(path: Path) -> Iterator[Stream]:
     """
     if path != STANDARD_INPUT:
         head(path)
-    with path.open("rb") if path != STANDARD_INPUT else io.BufferedReader(_Again(_standard_input()), BUFFER) as file:
-        if not beginning(file, path, "0 bytes").startswith(GZIP):
+    with path.open("rb") if path != STANDARD_INPUT else io.BufferedReader(_StandardInput(), BUFFER) as file:
+        if not beginning(file, path).startswith(GZIP):  # type: ignore[arg-type]
             yield file  # type: ignore[misc]
             return
         try:
@@ -62,59 +61,28 @@ def damaged(path: Path, reason: str) -> UnreadableFile:
     return UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again")
 
 
-def beginning(file: Stream, path: Path, none: str = "0 bytes when unpacked") -> bytes:
+def beginning(file: Stream, path: Path) -> bytes:
     """Return the first bytes of an open file and go back to them; raises UnreadableFile where there are none."""
     first = file.read(4096)
     file.seek(0)
     if not first:
+        none = "0 bytes" if path == STANDARD_INPUT else "0 bytes when unpacked"
         raise UnreadableFile(f"{path}: is empty ({none}); nothing was written to it, or a copy failed")
     return first
 
 
 @cache
-def _standard_input() -> _Kept:
-    """Return what keeps standard input."""
+def _standard_input() -> tuple[io.BufferedReader, IO[bytes], Lock]:
+    """Standard input, the file that keeps what came of it, and their lock: one may be read ahead by a thread."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
+    stream = sys.stdin.buffer
+    with suppress(OSError, ValueError):
+        os.set_blocking(stream.fileno(), True)  # else nothing yet looks like the end
     try:
-        return _Kept(sys.stdin.buffer, tempfile.TemporaryFile(buffering=0))  # type: ignore[arg-type]
+        return stream, tempfile.TemporaryFile(), Lock()  # type: ignore[return-value]
     except OSError as error:
         raise no_room(STANDARD_INPUT, error) from None
-
-
-class _Kept:
-    """A stream, and all that came of it so far, in a temporary file."""
-
-    def __init__(self, stream: io.BufferedReader, file: BinaryIO) -> None:
-        self.stream, self.file, self.size = stream, file, 0
-        self.lock = Lock()  # one of two configs may be read ahead by a thread of its own
-        with suppress(OSError, ValueError):
-            os.set_blocking(stream.fileno(), True)  # else nothing yet looks like the end
-
-    def read(self, at: int, most: int) -> bytes:
-        """Return bytes from a place on, none at the end; raises UnreadableFile beyond the limit, and Unwritable."""
-        with self.lock:
-            if at == self.size:
-                return self._next(most)
-            self.file.seek(at)
-            return self.file.read(most)
-
-    def _next(self, most: int) -> bytes:
-        data = self.stream.read1(most)
-        if self.size + len(data) > budget.MAX_TEMPORARY:
-            raise UnreadableFile(
-                f"-: standard input has more than {budget.size_of(budget.MAX_TEMPORARY)}, which is the limit; write it "
-                "to a file, and name that"
-            )
-        left = memoryview(data)
-        try:
-            self.file.seek(self.size)
-            while left:
-                left = left[self.file.write(left) :]
-        except OSError as error:
-            raise no_room(STANDARD_INPUT, error) from None
-        self.size += len(data)
-        return data
 
 
 class _Seekable(io.RawIOBase):
@@ -135,11 +103,8 @@ class _Seekable(io.RawIOBase):
         return self.at
 
 
-class _Again(_Seekable):
-    """What is kept of a stream, from its beginning."""
-
-    def __init__(self, kept: _Kept) -> None:
-        self.kept = kept
+class _StandardInput(_Seekable):
+    """Standard input from its beginning."""
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Go to a place in what was read."""
@@ -150,7 +115,14 @@ class _Again(_Seekable):
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         """Read into a buffer; return the number of bytes, 0 at the end."""
-        data = self.kept.read(self.at, len(buffer))
+        stream, file, lock = _standard_input()
+        with lock:
+            if self.at < file.seek(0, io.SEEK_END):
+                file.seek(self.at)
+                data = file.read(len(buffer))
+            else:
+                data = stream.read1(len(buffer))
+                keep(STANDARD_INPUT, data, file)
         buffer[: len(data)] = data
         self.at += len(data)
         return len(data)
@@ -215,7 +187,7 @@ class _Members(_Seekable):
         self.idle += READ
         if self.idle > TEXTS:
             raise UnreadableFile(
-                f"{self.path}: has more than {budget.size_of(TEXTS)} that unpack to nothing, which is the limit; pack "
+                f"{self.path}: has more than {size_of(TEXTS)} that unpack to nothing, which is the limit; pack "
                 "it again"
             )
         return self.file.read(READ)

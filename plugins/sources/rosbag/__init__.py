@@ -28,7 +28,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import check_count, keep, no_room, unpacked_at_most
+from fusion_core.budget import COPIED, check_count, keep, no_room, unpacked_at_most
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
@@ -422,9 +422,11 @@ def _whole(path: Path, stack: ExitStack) -> Path:
         unpacked = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="driftlab-"))) / path.stem
     except OSError as error:
         raise no_room(path, error) from None
+    most = unpacked_at_most(path)
     try:
         with zstd().open(path, "rb") as packed, unpacked.open("wb") as file:
-            keep(path, packed, file, unpacked_at_most(path))
+            while data := packed.read(COPIED):
+                keep(path, data, file, most)
     except (OSError, EOFError, zstd().ZstdError) as error:
         raise damaged(path, str(error)) from None
     return unpacked
