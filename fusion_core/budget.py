@@ -207,6 +207,22 @@ def keep(path: Path, data: bytes, to: IO[bytes], most: float = math.inf) -> None
         raise no_room(path, error) from None
 
 
+FOLDERS: list[tempfile.TemporaryDirectory[str]] = []  # for who ends the program at once, and a thread is in one
+
+
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Make a folder in TMPDIR for what a file unpacks to, and remove it; raises Unwritable where it cannot be made."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="driftlab-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise no_room(path, error) from None
+    FOLDERS.append(folder)
+    with folder as name:
+        yield Path(name)
+    FOLDERS.remove(folder)
+
+
 def no_room(path: Path, error: OSError) -> Unwritable:
     """Return the error of a temporary file that cannot be written."""
     what = "standard input" if path == Path("-") else "what it unpacks to"

@@ -93,6 +93,8 @@ class CsvLines(Table):
             if rows:
                 self.most = SKIPPED
                 yield Block(rows, values.__getitem__)
+            else:
+                self._skip(len(block))
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""

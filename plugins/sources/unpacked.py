@@ -73,7 +73,7 @@ def beginning(file: Stream, path: Path) -> bytes:
 
 @cache
 def _standard_input() -> tuple[io.BufferedReader, IO[bytes], Lock]:
-    """Standard input, the file that keeps what came of it, and their lock: one may be read ahead by a thread."""
+    """Return standard input, the file that keeps what came of it, and their lock: a thread may read ahead."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
     stream = sys.stdin.buffer
@@ -187,7 +187,6 @@ class _Members(_Seekable):
         self.idle += READ
         if self.idle > TEXTS:
             raise UnreadableFile(
-                f"{self.path}: has more than {size_of(TEXTS)} that unpack to nothing, which is the limit; pack "
-                "it again"
+                f"{self.path}: has more than {size_of(TEXTS)} that unpack to nothing, which is the limit; pack it again"
             )
         return self.file.read(READ)
