@@ -196,10 +196,10 @@ def keep(path: Path, data: bytes, to: IO[bytes], most: float = math.inf) -> None
     """
     most = min(most, MAX_TEMPORARY)
     if to.tell() + len(data) > most:
-        has, remedy = ("unpacks to", "unpack it yourself, or split it")
-        if path == Path("-"):
-            has, remedy = "standard input has", "write it to a file, and name a part of that"
-        raise UnreadableFile(f"{path}: {has} more than {size_of(most)}, which is the limit; {remedy}")
+        what = "standard input has" if path == Path("-") else "unpacks to"
+        raise UnreadableFile(
+            f"{path}: {what} more than {size_of(most)}, which is the limit; write it to a file yourself, or split it"
+        )
     try:
         to.write(data)
         to.flush()

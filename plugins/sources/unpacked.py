@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Lock
 from typing import IO, BinaryIO
 
-from fusion_core.budget import TEXTS, TimeBudget, keep, no_room, size_of
+from fusion_core.budget import TEXTS, check_all, keep, no_room, size_of
 from fusion_core.contracts import head
 from fusion_core.errors import UnreadableFile
 
@@ -28,7 +28,6 @@ GZIP = b"\x1f\x8b"
 WITH_HEADER = 31  # what zlib calls a member of a gzip archive
 READ = 1 << 16  # bytes of an archive at a time
 BUFFER = 1 << 17  # of what it holds
-SECONDS = 5e-8  # that an unpacked byte may cost: members may be empty, and padded without end
 Stream = io.BufferedReader
 
 
@@ -98,10 +97,6 @@ class _Seekable(io.RawIOBase):
         """Whether `seek` is possible."""
         return True
 
-    def tell(self) -> int:
-        """Return the place in the bytes."""
-        return self.at
-
 
 class _StandardInput(_Seekable):
     """Standard input from its beginning."""
@@ -133,7 +128,6 @@ class _Members(_Seekable):
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
-        self.clock = TimeBudget(path, "what unpacks to next to nothing")
         self._rewind()
 
     def _rewind(self) -> None:
@@ -154,16 +148,14 @@ class _Members(_Seekable):
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         """Unpack into a buffer; return the number of bytes, 0 at the end."""
-        with self.clock:
-            data = self._next(len(buffer)) if len(buffer) else b""
-            self.clock.seconds += len(data) * SECONDS
+        data = self._next(len(buffer)) if len(buffer) else b""
         buffer[: len(data)] = data
         self.at += len(data)
         return len(data)
 
     def _next(self, most: int) -> bytes:
         while True:
-            self.clock.tick()
+            check_all()
             if self.engine.eof:
                 self.engine, self.left, self.inside = zlib.decompressobj(WITH_HEADER), self.engine.unused_data, False
             packed = self.left or self._packed()
