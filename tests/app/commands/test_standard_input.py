@@ -34,5 +34,6 @@ def test_a_command_that_is_stopped_leaves_nothing_of_what_was_piped_in(tmp_path,
     command.send_signal(number)
     out, err = command.communicate()
     assert (command.returncode, out) == (130, b"")
-    assert err.startswith(b"driftlab: interrupted; ") and err.count(b"\n") == 1
+    assert err.startswith(b"driftlab: interrupted; ")
+    assert err.count(b"\n") == 1
     assert list(temporary.iterdir()) == []
