@@ -20,8 +20,8 @@ from driftlab.config import Config, load_config, understood
 from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import axes_of
 from driftlab.noise.innovations import SensorReadings, inflation
-from driftlab.storage.folders import check_writable
-from driftlab.storage.hdf5 import columns_of, reading, reason
+from driftlab.storage.folders import check_writable, refusals
+from driftlab.storage.hdf5 import columns_of, reading
 from driftlab.storage.json import plain, write_json
 from driftlab.storage.ownership import document, foreign, sign
 from fusion_core.budget import read_whole
@@ -40,7 +40,7 @@ from fusion_core.contracts import (
     ThermalMap,
 )
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, Unwritable, quote
+from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
@@ -216,7 +216,7 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
         raise ConfigError(f"--out {path}: is a file, a folder is written; name another")
     folder = path if exporter.folder else path.parent
     _check(exporter, path, folder, [] if exporter.folder else [key_of(path)], force, read)
-    try:
+    with refusals(f"--out {path}", "make room, or name another file", usage=False):
         folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
         with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=folder) as temporary:
@@ -234,10 +234,6 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
                 (folder / file.name).unlink(missing_ok=True)
             for file in [files[0].parent / LOSS, *files]:
                 os.replace(file, folder / file.name)
-    except OSError as error:
-        raise Unwritable(
-            f"--out {path}: cannot be written ({reason(error)}); make room, or name another file"
-        ) from None
     return loss
 
 
@@ -264,12 +260,12 @@ def _check(
             "file, or give --force to replace it"
         )
     before = document(folder / LOSS)
-    if before.get("schema") != SCHEMA or not all(isinstance(before.get(key), dict) for key in ("exports", "written")):
+    if before.get("schema") != SCHEMA or foreign(folder, LOSS, [LOSS]):
         return {}
-    earlier = before["exports"].get(key_of(path))
-    if not force and earlier is not None and earlier["kind"] != exporter.kind:
+    earlier = before["exports"].get(key_of(path), {}).get("kind", exporter.kind)
+    if earlier != exporter.kind and not force:
         raise ConfigError(
-            f"--out {path}: is of `driftlab export {earlier['kind']}`; name another file, or give --force to replace it"
+            f"--out {path}: is of `driftlab export {earlier}`; name another file, or give --force to replace it"
         )
     return before
 

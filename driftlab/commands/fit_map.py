@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
-
-if TYPE_CHECKING:
-    pass
 
 F = TypeVar("F")
 COMMAND = "fit-map"  # by which its files are known

@@ -61,8 +61,8 @@ class FleetFolder:
         there = {TABLE, FAMILY, REPORT} & set(names) if self.mark.get("complete") else ()
         if self.mark and (changed := foreign(self.path, MARK, [MARK, *there])):
             raise ConfigError(
-                f"--out {out}: holds {', '.join(changed)}, which was changed since driftlab wrote it, or is not "
-                f"known to {MARK}; move it away, or name another folder"
+                f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
+                "name another folder"
             )
         (self.path / UNITS).mkdir(parents=True, exist_ok=True)
         check_writable(self.path)
