@@ -135,7 +135,7 @@ class FleetFolder:
         """Write `fleet.json`, which knows itself, and the files of the fleet as a whole where all of them are there."""
         paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
         known = {path.name: digest(path) for path in paths if path.is_file()}
-        self.write(MARK, as_json(signed(plain(dict(content)), MARK, known)))
+        self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
 
     def _replace(self, unit: str) -> None:
         place = self.unit(unit)

@@ -2,7 +2,7 @@
 
 A file that stands alone (a map, its page, a simulated recording) says which command wrote it, and its SHA-256, made
 with zeros in that place. The first file of a folder has under `written` the SHA-256 of each that was written with it,
-and that of its own content without this key.
+and its own, made likewise.
 """
 
 from __future__ import annotations
@@ -86,39 +86,36 @@ def _seal(path: Path) -> tuple[int | None, str, bytes, bytes]:
 
 
 def sign(folder: Path, first: str, names: Collection[str], known: Mapping[str, str] | None = None) -> None:
-    """Write the SHA-256 of files of a folder into its first one, with those that are known, and that of its content."""
+    """Write the SHA-256 of files of a folder into its first one, with those that are known, and its own."""
     if content := document(folder / first):
         digests = {**(known or {}), **{name: digest(folder / name) for name in sorted(names)}}
-        (folder / first).write_text(json_text(signed(content, first, digests), 2) + "\n", encoding="utf-8")
+        (folder / first).write_text(signed(content, first, digests), encoding="utf-8")
 
 
-def signed(content: dict[str, Any], first: str, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Return the content of the first file of a folder with the SHA-256 of files, and that of the content itself."""
+def signed(content: dict[str, Any], first: str, digests: Mapping[str, str]) -> str:
+    """Return the text of the first file of a folder, with the SHA-256 of files and its own, made with zeros there."""
     rest = {key: value for key, value in content.items() if key != "written"}
-    return {**rest, "written": {**digests, first: _digest_of(rest)}}
+    text = json_text({**rest, "written": {**digests, first: ZEROS.decode()}}, 2, allow_nan=False) + "\n"
+    before, _, after = text.rpartition(ZEROS.decode())
+    return before + hashlib.sha256(text.encode()).hexdigest() + after
 
 
 def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
     """Return which files of a folder driftlab did not write, or not as they are."""
-    content = document(folder / first)
-    known = content.pop("written", None)
-
-    def ours(name: str) -> bool:
-        found = _digest_of(content) if name == first and not (folder / name).is_symlink() else digest(folder / name)
-        return isinstance(known, dict) and found != "" and known.get(name) == found
-
-    return sorted(name for name in names if not ours(name))
+    known = document(folder / first).get("written")
+    known = known if isinstance(known, dict) else {}
+    found = {name: digest(folder / name, str(known.get(name)) if name == first else "") for name in names}
+    return sorted(name for name in names if not found[name] or found[name] != known.get(name))
 
 
-def _digest_of(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, empty where it is a link or cannot be read."""
+def digest(path: Path, own: str = "") -> str:
+    """Return the SHA-256 of a file, with zeros where it says its own; empty where it is a link or cannot be read."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            if not own:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+            before, _, after = file.read(LARGEST).rpartition(own.encode())
+            return hashlib.sha256(before + ZEROS + after).hexdigest()
     except OSError:
         return ""
 
