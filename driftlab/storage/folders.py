@@ -1,9 +1,9 @@
-"""Folders of results that are whole or not there; their ownership, and their locks.
+"""Folders of results that are whole or not there, and their locks.
 
 A command writes to `OUT.partial`, which it locks, and renames it to OUT when all files are whole. Three rules:
 
-- What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command and
-  nothing else; `OUT.partial` is used again only if its lock file says that driftlab made it.
+- What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command, as it
+  wrote them (`driftlab.storage.ownership`), and nothing else; `OUT.partial` is used again only if its lock file says that driftlab made it.
 - Results that cannot be computed again (from a device, or from a recording that is not there any more) are replaced
   only on demand.
 - What would make the end fail is refused at the beginning.
