@@ -250,9 +250,9 @@ def _check(
         raise ConfigError(f"--out {path}: what is lost is written to {LOSS}; name another file")
     for place in (folder / name for name in (LOSS, *names)):
         if any(os.path.realpath(place) == os.path.realpath(other) for other in read):
-            raise ConfigError(f"--out {path}: {place} is read here, and would be lost; name another file")
+            raise ConfigError(f"--out {place}: is read here, and would be lost; name another file")
         if place.is_dir():
-            raise ConfigError(f"--out {path}: {place} is a folder; name another file")
+            raise ConfigError(f"--out {place}: is a folder; name another file")
     there = [name for name in (LOSS, *names) if os.path.lexists(folder / name)]
     if not force and (others := foreign(folder, LOSS, there)):
         raise ConfigError(

@@ -3,7 +3,8 @@
 A command writes to `OUT.partial`, which it locks, and renames it to OUT when all files are whole. Three rules:
 
 - What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command, as it
-  wrote them (`driftlab.storage.ownership`), and nothing else; `OUT.partial` is used again only if its lock file says that driftlab made it.
+  wrote them (`driftlab.storage.ownership`), and nothing else; `OUT.partial` is used again only if its lock file says
+  that driftlab made it.
 - Results that cannot be computed again (from a device, or from a recording that is not there any more) are replaced
   only on demand.
 - What would make the end fail is refused at the beginning.
@@ -53,7 +54,7 @@ class Folder:
     resume : bool
         Whether what an earlier run left in `.partial` stays there.
     force : bool
-        Whether results may be replaced that cannot be computed again.
+        Whether results may be replaced that cannot be computed again, or were edited.
     recording : Path or None
         The recording that a live run goes on with: results that stand on it may be replaced.
     """

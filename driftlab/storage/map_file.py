@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from driftlab.storage.folders import check_writable, refusals
-from driftlab.storage.ownership import check_own, seal_of, sealed
+from driftlab.storage.hdf5 import sync
+from driftlab.storage.ownership import check_own, seal, seal_of
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, MapError
 
@@ -40,7 +43,7 @@ def write_text(path: Path, text: str, command: str) -> None:
     known = (
         f'{{\n  "sha256": "{seal_of(command)}",{text[1:]}' if text[0] == "{" else f"{text}<!-- {seal_of(command)} -->\n"
     )
-    with refusals(str(path), "make room, or name another place", usage=False), sealed(path) as new:
+    with refusals(str(path), "make room, or name another place", usage=False), _sealed(path) as new:
         new.write_text(known, encoding="utf-8")
 
 
@@ -49,8 +52,20 @@ def save(fitted: FittedMap, path: Path, command: str) -> None:
     others = {name: text for name, text in fitted.record.provenance.items() if name != "written"}
     about = {"written": seal_of(command), **others}  # first, so that no other text is taken for it
     record = fitted.record.model_copy(update={"provenance": about})
-    with refusals(f"map {path}", "make room, or name another place", usage=False), sealed(path) as new:
+    with refusals(f"map {path}", "make room, or name another place", usage=False), _sealed(path) as new:
         try:
             replace(fitted, record=record).save(new)
         except MapError as error:
             raise MapError(str(error).replace(str(new), str(path))) from None
+
+
+@contextmanager
+def _sealed(path: Path) -> Iterator[Path]:
+    """Give a name to write a file under, which then gets its SHA-256, and its place: the one that a link leads to."""
+    place = Path(os.path.realpath(path))
+    with TemporaryDirectory(prefix=".driftlab-", dir=place.parent) as folder:
+        new = Path(folder) / place.name
+        yield new
+        seal(new)
+        sync(new)
+        os.replace(new, place)

@@ -11,14 +11,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from driftlab import __version__
-from driftlab.storage.hdf5 import sync
 from fusion_core.budget import COPIED, read_whole
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import json_text
@@ -29,7 +26,7 @@ LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 
 
 def seal_of(command: str) -> str:
-    """Return the text by which a file is known, with zeros in the place of its SHA-256; `sealed` writes that."""
+    """Return the text by which a file is known, with zeros in the place of its SHA-256; `seal` writes that."""
     return f"driftlab {command} {__version__}, sha256:{ZEROS.decode()}"
 
 
@@ -40,18 +37,6 @@ def seal(path: Path) -> None:
         with path.open("r+b") as file:
             file.seek(place)
             file.write(found)
-
-
-@contextmanager
-def sealed(path: Path) -> Iterator[Path]:
-    """Give a name to write a file under, which then gets its SHA-256, and its place: the one that a link leads to."""
-    place = Path(os.path.realpath(path))
-    with TemporaryDirectory(prefix=".driftlab-", dir=place.parent) as folder:
-        new = Path(folder) / place.name
-        yield new
-        seal(new)
-        sync(new)
-        os.replace(new, place)
 
 
 def check_own(path: Path, command: str, subject: str, remedy: str) -> None:
@@ -73,7 +58,7 @@ def _seal(path: Path) -> tuple[int | None, str, bytes, bytes]:
     """Return where a file says its SHA-256, of which command, what it says, and what it has with zeros there."""
     sha256, place, by, said, data, passed = hashlib.sha256(), None, "", b"", b"", 0
     with path.open("rb") as file:
-        while piece := file.read(COPIED):
+        while (piece := file.read(COPIED)) and (place is not None or passed < LARGEST):
             data += piece
             if place is None and (match := SEAL.search(data)):
                 place, by, said = passed + match.start(2), match[1].decode(), match[2]

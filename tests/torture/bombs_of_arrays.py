@@ -121,7 +121,8 @@ def elsewhere(rng: RNG, path: Path) -> None:
         elif how == 3:
             file[name] = h5py.SoftLink(f"/{name}")
         else:
-            file.require_group("a")[name] = file["a"]
+            circle = file.require_group("a")
+            circle[name] = circle
             file[name] = _rows(100, d)
 
     _h5(path, make)
