@@ -189,18 +189,16 @@ def run(
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
-        hashed: Callable[[], None] | None = None
+        hashed = beforehand(understood.source)
         try:
             with closing(_segments(running, journal, progress)) as segments:
                 for segment in segments:
-                    hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                     estimates.append(segment)
         finally:
             estimates.close()
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
-        if hashed is not None:
-            hashed()
+        hashed()
         return finish(folder, understood, running.model, journal, Path(out))
 
 

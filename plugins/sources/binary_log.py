@@ -109,12 +109,9 @@ class FramedFile(contracts.Table):
         """Yield the samples of `BLOCK` bytes at a time; raises UnreadableFile where there is none in the whole file."""
         memory, length, whole, damaged = None, 0, 0, 0
         clock = TimeBudget(self.path, "what is no frame")
-        while True:
+        while data := self.file.read(BLOCK):
+            length += len(data)
             with clock:
-                data = self.file.read(BLOCK)
-                if not data:
-                    break
-                length += len(data)
                 frames, memory = self.framing.decode(data, memory)
                 clock.check(frames.N)
             damaged += frames.rejected.get(DAMAGED, 0)

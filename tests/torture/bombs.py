@@ -24,7 +24,7 @@ from torture import base, bombs_of_logs
 from torture.commands import MAIN
 from torture.outcome import Outcome, Said
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 90, 2, 240.0, False
+CASES, WORKERS, LIMIT, IN_PROCESS = 90, 1, 240.0, False
 RNG = np.random.Generator
 MEMORY, SECONDS = 1_500_000_000, 60.0  # the budget, over an ordinary run and what the rows cost
 ROW, ROW_SECONDS = 100, 2e-5  # bytes and s of the processor that a row may cost

@@ -121,8 +121,7 @@ def elsewhere(rng: RNG, path: Path) -> None:
         elif how == 3:
             file[name] = h5py.SoftLink(f"/{name}")
         else:
-            circle = file.require_group("a")
-            circle[name] = circle
+            file.require_group("a")[name] = file["a"]
             file[name] = _rows(100, d)
 
     _h5(path, make)
