@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import fleets
+import h5py
 import numpy as np
 import pytest
 import yaml
 from bench import FRAMING, Device, frame, paced
 from flying_units import fitted
-from torture import base
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 
@@ -26,7 +26,10 @@ from fusion_core.contracts import Exporter
 from fusion_core.host.registry import registry
 
 WRITE_NOTHING = {"check", "plugins", "schema"}
-MAP = {"kind": "thermal_derivative", "walk": base.WALK, "map": {"kind": "polynomial", "order": 2, "min_swing": "0.5 K"}}
+UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
+CHANNELS = {name: {"path": name} for name in UNITS}
+WALK = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
+MAP = {**WALK, "kind": "thermal_derivative", "map": {"kind": "polynomial", "order": 2, "min_swing": "0.5 K"}}
 NETWORK = {**MAP, "map": {"kind": "onnx_network", "min_swing": "0.5 K", "starts": 1}}
 
 
@@ -90,28 +93,40 @@ MARKED = {
 }  # fmt: skip
 
 
+def config(source, bias, **how):
+    gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": bias}
+    accel = {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2e-3 m/s/h/sqrt(s)"}}
+    sensors = {"align": "20 s", "gyro": gyro, "accel": accel, **how}
+    return {"latitude": "40.9 deg", "source": source, "filter": sensors}
+
+
+def write_config(path, content):
+    path.write_text(yaml.safe_dump(content))
+
+
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """What the commands read."""
     folder = tmp_path_factory.mktemp("inputs")
     for seed, name in enumerate("abc"):
-        base.write_h5(folder / f"{name}.h5", base.recording(300, seed=seed))
-    source = base.source("hdf5", path="a.h5")
-    configs = {"plain": None, "other": {"kind": "constant"}, "map": MAP, "network": NETWORK}
+        unit = unit_at_rest(seconds=300, rate=10, seed=seed, temperature=lambda t: 20 + t / 60)
+        with h5py.File(folder / f"{name}.h5", "w") as file:
+            for channel, values in {"time": unit.t, **unit.channels()}.items():
+                file[channel] = values
+                file[channel].attrs["unit"] = UNITS[channel]
+    configs = {"plain": WALK, "other": {"kind": "constant"}, "map": MAP, "network": NETWORK}
     for name, bias in configs.items():
-        base.write_config(folder / f"{name}.yaml", base.config(source, bias))
+        write_config(folder / f"{name}.yaml", config({"kind": "hdf5", "path": "a.h5", "channels": CHANNELS}, bias))
     twin = {"kind": "synthetic", "duration": "1 min", "rate": "10 Hz"}
-    base.write_config(folder / "twin.yaml", {"source": twin})
+    write_config(folder / "twin.yaml", {"source": twin})
     fitted().save(folder / "unit.json")
     assert (
         CliRunner().invoke(app, ["export", "mat", f"{folder}/unit.json", "--out", f"{folder}/unit.mat"]).exit_code == 0
     )
     (folder / "line").mkdir()
     fleets.write_fleet(folder / "line", 2)
-    gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": base.RANDOM_WALK}
     live = {"kind": "serial", "port": str(folder / "ttyDEVICE"), "interval": "1 s", "framing": FRAMING}
-    how = {"update_interval": "1 s", "align": "60 s", "accel": None, "gyro": gyro}
-    (folder / "live.yaml").write_text(yaml.safe_dump({"latitude": "40.9 deg", "source": live, "filter": how}))
+    write_config(folder / "live.yaml", config(live, WALK, accel=None, update_interval="1 s", align="60 s"))
     return folder
 
 
