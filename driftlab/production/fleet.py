@@ -200,5 +200,4 @@ class _Command:
             **more,
         )
         content = summary.content()
-        folder.write_mark(content)
-        return content
+        return folder.write_mark(content)

@@ -131,11 +131,12 @@ class FleetFolder:
         new.write_bytes(content)
         os.replace(new, path)
 
-    def write_mark(self, content: Mapping[str, Any]) -> None:
-        """Write `fleet.json`, which knows itself, and the files of the fleet as a whole where all of them are there."""
+    def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Write `fleet.json` and return its content: it knows itself, and the files of all units where they are there."""
         paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
         known = {path.name: digest(path) for path in paths if path.is_file()}
         self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
+        return {**content, "written": document(self.path / MARK)["written"]}
 
     def _replace(self, unit: str) -> None:
         place = self.unit(unit)
