@@ -132,7 +132,7 @@ class FleetFolder:
         os.replace(new, path)
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Write `fleet.json` and return its content: it knows itself, and the files of all units where they are there."""
+        """Write `fleet.json` and return its content: it knows itself and the files of all units."""
         paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
         known = {path.name: digest(path) for path in paths if path.is_file()}
         self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
