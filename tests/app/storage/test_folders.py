@@ -14,6 +14,7 @@ import pytest
 from driftlab.storage.folders import LOCK, Lock, output_folder
 from driftlab.storage.hdf5 import GrowingFile
 from driftlab.storage.map_file import check_place
+from driftlab.storage.ownership import sign
 from driftlab.storage.recorder import RECORDED_MARK, Recorder
 from fusion_core.chunk import Chunk
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
@@ -191,6 +192,7 @@ def test_what_a_device_measured_is_replaced_on_demand_only(tmp_path, where):
     if where == "out":
         (tmp_path / "out.partial").rename(out)
         (out / LOCK).unlink()
+        sign(out, "summary.json", ["estimates.h5"])
     message = rf"{where} holds what a device measured \(`driftlab live`\); .*name another folder, or give --force"
     for how in ({}, {"resume": True}, {"resume": True, "recording": tmp_path / "raw.h5"}):  # which is not there
         with pytest.raises(ConfigError, match=message), output_folder(out, **how):
@@ -206,19 +208,17 @@ def test_what_a_device_measured_is_replaced_on_demand_only(tmp_path, where):
     assert names(tmp_path) == ["out", "raw.h5"]
 
 
-@pytest.mark.parametrize("rows", [0, 5])
-def test_results_of_a_recording_that_is_gone_are_replaced_on_demand_only(tmp_path, rows):
+def test_results_of_a_recording_that_is_gone_are_replaced_on_demand_only(tmp_path):
     out, recording = tmp_path / "out", tmp_path / "day.h5"
     recording.touch()
     with output_folder(out) as folder:
-        results(folder, rows, recording=str(recording))
+        results(folder, recording=str(recording))
     write(out)
     with output_folder(out) as folder:
-        results(folder, rows, recording=str(recording))
+        results(folder, recording=str(recording))
     recording.unlink()
-    if rows:
-        with pytest.raises(ConfigError, match=r"was computed from .*day.h5, which is not there any more; name another"):
-            write(out)
+    with pytest.raises(ConfigError, match=r"was computed from .*day.h5, which is not there any more; name another"):
+        write(out)
     write(out, force=True)
 
 
@@ -353,13 +353,14 @@ def test_results_that_were_edited_since_are_not_replaced(tmp_path, name):
 def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
     (tmp_path / "soak.csv").write_text("t,gx\n")
     (tmp_path / "map.json").write_text(json.dumps({"driftlab_map": 1, "record": {}}))
-    check_place(tmp_path / "map.json", [tmp_path / "soak.csv"])
-    check_place(tmp_path / "new" / "map.json", [])
-    for name in ("soak.csv", "/dev/null", "new"):
-        with pytest.raises(ConfigError, match="exists and is not a map of driftlab; name another file with --out"):
-            check_place(tmp_path / name, [])
+    check_place(tmp_path / "new" / "map.json", [], "fit-map")
+    for name in ("soak.csv", "/dev/null", "new", "map.json"):
+        with pytest.raises(
+            ConfigError, match=r"exists, and has no SHA-256 .*; move it away, or name another file with"
+        ):
+            check_place(tmp_path / name, [], "fit-map")
     (tmp_path / "link.csv").symlink_to("soak.csv")
     with pytest.raises(ConfigError, match="is read here, and would be lost; name another file with --out"):
-        check_place(tmp_path / "link.csv", [tmp_path / "soak.csv"])
+        check_place(tmp_path / "link.csv", [tmp_path / "soak.csv"], "fit-map")
     with pytest.raises(ConfigError, match=r"soak.csv.m.json: cannot be written \(File exists\); name a folder"):
-        check_place(tmp_path / "soak.csv" / "m.json", [])
+        check_place(tmp_path / "soak.csv" / "m.json", [], "fit-map")
