@@ -80,7 +80,7 @@ def main() -> None:
         import driftlab.evaluation.overview as overview
         import driftlab.filtering.run as run
         import driftlab.filtering.tracker as tracker
-        import driftlab.storage.folders as folders
+        import driftlab.storage.ownership as ownership
         from driftlab.commands.console import keep_freed_memory
         from driftlab.config import load_config
         from driftlab.storage.hdf5 import GrowingFile
@@ -100,7 +100,7 @@ def main() -> None:
     ):
         for name in names:
             timed(owner, name, "report")
-    timed(folders, "digest", "digest")
+    timed(ownership, "digest", "digest")
     keep_freed_memory()
     begun = time.perf_counter()
     filtering.run(loaded, out=Path(out))

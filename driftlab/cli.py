@@ -9,6 +9,7 @@ import gc
 import io
 import os
 import re
+import signal
 import sys
 import traceback
 from contextlib import suppress
@@ -123,6 +124,7 @@ def main() -> None:
     from fusion_core.errors import ConfigError, FusionError, UnitError
 
     _open_streams()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what is temporary is removed
     # each handler ends the process while it still holds the error: what the error holds is not taken apart
     try:
         _run()
@@ -208,6 +210,8 @@ def _leave(text: str | None, status: int) -> NoReturn:
     After a failure the ends of the libraries themselves may crash (HDF5 on a full disk), or wait for a thread for ever
     that holds the lock of h5py.
     """
+    for folder in getattr(sys.modules.get("fusion_core.budget"), "FOLDERS", ()):
+        folder.cleanup()
     with suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
     with suppress(OSError, ValueError, AttributeError):

@@ -15,20 +15,17 @@ import stat
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol, Self
+from typing import IO, Any, BinaryIO, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from fusion_core.errors import UnreadableFile, Unwritable
-
-if TYPE_CHECKING:
-    from _typeshed import SupportsRead
 
 PIECE = 512_000_000  # bytes of a piece (row group, variable, index) that is held whole
 LISTED = 128_000_000  # bytes of a piece whose messages are listed one by one
@@ -48,6 +45,9 @@ DEEPEST = 32  # of them within one another
 UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
 NAME = 64  # characters of a channel, a kind, a unit
 TEXT = 100_000  # characters of another text in the record of a map
+
+
+T = TypeVar("T")
 
 
 class Decompressor(Protocol):
@@ -184,28 +184,43 @@ def unpacked_at_most(path: Path) -> int:
     return min(MAX_TEMPORARY, max(MIN_UNPACKED, RATIO * on_disk(path)))
 
 
-def keep(path: Path, stream: SupportsRead[bytes], to: IO[bytes], most: int = MAX_TEMPORARY) -> None:
-    """Copy what a stream gives into a temporary file.
+def keep(path: Path, data: bytes, to: IO[bytes], most: float = math.inf) -> None:
+    """Write the next bytes of what a stream gives into a temporary file, at its end.
 
     Raises
     ------
     UnreadableFile
-        If the stream is longer than `most` bytes.
+        If the stream is longer than `most` bytes, and than MAX_TEMPORARY.
     Unwritable
         If there is no room for the file.
     """
-    left = most
-    while data := stream.read(COPIED):
-        left -= len(data)
-        if left < 0:
-            raise UnreadableFile(
-                f"{path}: unpacks to more than {size_of(most)}, which is the limit; unpack it yourself, or split it"
-            )
-        try:
-            to.write(data)
-            to.flush()
-        except OSError as error:
-            raise no_room(path, error) from None
+    most = min(most, MAX_TEMPORARY)
+    if to.tell() + len(data) > most:
+        what = "standard input has" if path == Path("-") else "unpacks to"
+        raise UnreadableFile(
+            f"{path}: {what} more than {size_of(most)}, which is the limit; write it to a file yourself, or split it"
+        )
+    try:
+        to.write(data)
+        to.flush()
+    except OSError as error:
+        raise no_room(path, error) from None
+
+
+FOLDERS: list[tempfile.TemporaryDirectory[str]] = []  # for who ends the program at once, and a thread is in one
+
+
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Make a folder in TMPDIR for what a file unpacks to, and remove it; raises Unwritable where it cannot be made."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="driftlab-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise no_room(path, error) from None
+    FOLDERS.append(folder)
+    with folder as name:
+        yield Path(name)
+    FOLDERS.remove(folder)
 
 
 def no_room(path: Path, error: OSError) -> Unwritable:
@@ -222,7 +237,7 @@ class TimeBudget:
     """The time of a step that yields no rows, from when it is made; where it is entered, of what is done inside alone.
 
     The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came. Within
-    `of_all` a step ends with the clock of all steps too.
+    `of_all`, or `over` of another, a step ends with that clock too.
 
     Parameters
     ----------
@@ -230,12 +245,12 @@ class TimeBudget:
         The file.
     what : str
         What is done, as `63,000,000 lines of comments`.
-    seconds : float
-        Of the processor.
+    seconds, row : float
+        Of the processor, and those for a row.
     """
 
-    def __init__(self, path: Path, what: str, seconds: float = SECONDS) -> None:
-        self.path, self.what, self.seconds = path, what, seconds + on_disk(path) / PACE
+    def __init__(self, path: Path, what: str, seconds: float = SECONDS, row: float = ROW) -> None:
+        self.path, self.what, self.seconds, self.row = path, what, seconds + on_disk(path) / PACE, row
         self.begun, self.used, self.ticks = time.process_time(), 0.0, 0
         self.all = _ALL.get()
 
@@ -252,14 +267,28 @@ class TimeBudget:
 
     def check(self, rows: int = 0) -> None:
         """Raise UnreadableFile where the step has taken longer than it may, which is more by what `rows` may cost."""
-        self.seconds += rows * ROW
+        self.seconds += rows * self.row
         if self.all is not None:
-            self.all.check()
+            self.all.check(rows)
         if self.used + time.process_time() - self.begun > self.seconds:
             raise UnreadableFile(
                 f"{self.path}: {self.what} took more than {self.seconds:.0f} s of the processor, which is the limit; "
                 "write the recording anew"
             )
+
+    def over(self, items: Iterable[T]) -> Iterator[T]:
+        """Yield items; while each is made this is the clock of all steps, and what is done with them takes no time."""
+        iterator = iter(items)
+        while True:
+            token = _ALL.set(self)
+            try:
+                with self:
+                    item = next(iterator, None)
+            finally:
+                _ALL.reset(token)
+            if item is None:
+                return
+            yield item
 
     def tick(self) -> None:
         """Check at each 1024th call: of what is done for a few bytes."""
@@ -271,10 +300,13 @@ class TimeBudget:
 _ALL: ContextVar[TimeBudget | None] = ContextVar("of all attempts", default=None)
 
 
-def check_all() -> None:
-    """Raise UnreadableFile where all attempts within `of_all` together have taken longer than they may."""
+def check_all(rows: int = 0) -> None:
+    """Raise UnreadableFile where all steps within `of_all`, or of a reading, have taken longer than they may.
+
+    Of a reading that is more by what `rows` may cost.
+    """
     if (clock := _ALL.get()) is not None:
-        clock.check()
+        clock.check(rows)
 
 
 @contextmanager
@@ -284,7 +316,7 @@ def of_all(path: Path, what: str, seconds: float = SECONDS) -> Iterator[None]:
     A reader whose file is refused for one thing may be asked for another; where the time of all is over, each further
     attempt ends with that at its next check.
     """
-    token = _ALL.set(TimeBudget(path, what, seconds))
+    token = _ALL.set(TimeBudget(path, what, seconds, row=0.0))
     try:
         yield
     finally:

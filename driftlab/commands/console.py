@@ -167,7 +167,7 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 @cache
 def note_compiling() -> None:
-    """Announce once a process, on standard error, that loops are compiled: the first run, or another processor."""
+    """Announce once a process, on standard error, that loops are compiled: by a new installation or processor."""
     from numba.core import event
 
     console = terminal(stderr=True)

@@ -20,9 +20,10 @@ from driftlab.config import Config, load_config, understood
 from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import axes_of
 from driftlab.noise.innovations import SensorReadings, inflation
-from driftlab.storage.folders import check_writable
-from driftlab.storage.hdf5 import columns_of, reading, reason
+from driftlab.storage.folders import check_writable, refusals
+from driftlab.storage.hdf5 import columns_of, reading
 from driftlab.storage.json import plain, write_json
+from driftlab.storage.ownership import document, foreign, sign
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import (
@@ -39,7 +40,7 @@ from fusion_core.contracts import (
     ThermalMap,
 )
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, Unwritable, quote
+from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
@@ -211,9 +212,11 @@ def read_map(path: Path) -> FittedMap:
 
 def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Collection[Path]) -> Loss:
     """Write a calibration to `path`, whole or not at all, and its losses to `loss.json` beside it (in the folder)."""
-    _check(path, exporter.folder, force, read)
+    if exporter.folder and path.exists() and not path.is_dir():
+        raise ConfigError(f"--out {path}: is a file, a folder is written; name another")
     folder = path if exporter.folder else path.parent
-    try:
+    _check(exporter, path, folder, [] if exporter.folder else [key_of(path)], force, read)
+    with refusals(f"--out {path}", "make room, or name another file", usage=False):
         folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
         with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=folder) as temporary:
@@ -224,15 +227,13 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
-            for file in files:
-                _check(folder / file.name, False, force, read)
-            write_json(Path(temporary) / LOSS, _content(exporter, loss, path, _exports(folder / LOSS, path, force)))
-            for file in [*files, Path(temporary) / LOSS]:
+            before = _check(exporter, path, folder, [file.name for file in files], force, read)
+            write_json(files[0].parent / LOSS, _content(exporter, loss, path, before.get("exports", {})))
+            sign(files[0].parent, LOSS, [file.name for file in files], before.get("written"))
+            for file in files:  # gone before `loss.json` knows the new ones: whatever is there is known at any moment
+                (folder / file.name).unlink(missing_ok=True)
+            for file in [files[0].parent / LOSS, *files]:
                 os.replace(file, folder / file.name)
-    except OSError as error:
-        raise Unwritable(
-            f"--out {path}: cannot be written ({reason(error)}); make room, or name another file"
-        ) from None
     return loss
 
 
@@ -241,33 +242,32 @@ def key_of(path: Path) -> str:
     return Path(os.path.abspath(path)).name
 
 
-def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> None:
-    """Raise ConfigError where a file (or folder) is not to be written."""
-    if any(os.path.realpath(path) == os.path.realpath(other) for other in read):
-        raise ConfigError(f"--out {path}: is read here, and would be lost; name another file")
-    if folder:
-        if path.exists() and not path.is_dir():
-            raise ConfigError(f"--out {path}: is a file, a folder is written; name another")
-    elif path.is_dir() or (path.exists() and not force):
-        raise ConfigError(f"--out {path}: exists; name another file, or give --force to replace it")
-
-
-def _exports(beside: Path, path: Path, force: bool) -> dict[str, Any]:
-    """Return the exports in the `loss.json` that is there; raises ConfigError where it is somebody else's."""
-    try:
-        content = json.loads(read_whole(beside))
-        if content["schema"] == SCHEMA and isinstance(content["exports"], dict):
-            return dict(content["exports"])
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        pass
-    if not force:
+def _check(
+    exporter: Exporter, path: Path, folder: Path, names: list[str], force: bool, read: Collection[Path]
+) -> dict[str, Any]:
+    """Return the `loss.json` of earlier exports; raises ConfigError where a file is not to be written."""
+    if LOSS in names:
+        raise ConfigError(f"--out {path}: what is lost is written to {LOSS}; name another file")
+    for place in (folder / name for name in (LOSS, *names)):
+        if any(os.path.realpath(place) == os.path.realpath(other) for other in read):
+            raise ConfigError(f"--out {place}: is read here, and would be lost; name another file")
+        if place.is_dir():
+            raise ConfigError(f"--out {place}: is a folder; name another file")
+    there = [name for name in (LOSS, *names) if os.path.lexists(folder / name)]
+    if not force and (others := foreign(folder, LOSS, there)):
         raise ConfigError(
-            f"--out {path}: {beside} exists and is not of earlier exports; name another folder, or give --force to "
-            "replace it"
+            f"--out {path}: {', '.join(others[:5])} exists, and is not as `driftlab export` wrote it; name another "
+            "file, or give --force to replace it"
         )
-    return {}
+    before = document(folder / LOSS)
+    if before.get("schema") != SCHEMA or foreign(folder, LOSS, [LOSS]):
+        return {}
+    earlier = before["exports"].get(key_of(path), {}).get("kind", exporter.kind)
+    if earlier != exporter.kind and not force:
+        raise ConfigError(
+            f"--out {path}: is of `driftlab export {earlier}`; name another file, or give --force to replace it"
+        )
+    return before
 
 
 def _content(exporter: Exporter, loss: Loss, path: Path, known: dict[str, Any]) -> dict[str, Any]:

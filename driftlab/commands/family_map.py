@@ -96,8 +96,8 @@ class FamilyMapResult(Result):
     def save(self, out: str | PathLike[str]) -> None:
         """Write the map to the file `out`; raises ConfigError, Unwritable or MapError."""
         path = Path(out)
-        check_place(path, [])
-        save(self.map, path)
+        check_place(path, [], "fit-map")
+        save(self.map, path, "fit-map")
         self.written = (path,)
 
 
@@ -128,7 +128,7 @@ def fit_family_map(
     if config.filter is None:
         raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
     if out is not None:
-        check_place(out, [family, *config.files_to_fit(), *paths_of(recordings)])
+        check_place(out, [family, *config.files_to_fit(), *paths_of(recordings)], "fit-map")
     tracked, faults = config.filter.tracked, Faults()
     law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
     if lot and lot not in law.lots:

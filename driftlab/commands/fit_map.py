@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -30,20 +30,18 @@ from driftlab.reports.figures import svg
 from driftlab.reports.map import chart, page_of
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.soak.blocks import GrowingBlocks
-from driftlab.storage.json import plain, write_json
-from driftlab.storage.map_file import check_page, check_place, check_report, save, write_page
+from driftlab.storage.json import plain, text_of
+from driftlab.storage.map_file import check_file, check_place, save, write_text
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
-from fusion_core.errors import ConfigError, Unwritable
+from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 
-if TYPE_CHECKING:
-    pass
-
 F = TypeVar("F")
+COMMAND = "fit-map"  # by which its files are known
 MAX_BLOCKS = 4096  # of all recordings, where kinds are compared
 
 
@@ -119,12 +117,15 @@ class FitMapResult(Result):
 
     def write(self, path: Path, report: Path | None) -> None:
         """Write the files where nothing is in the way."""
-        save(self.map, path)
+        save(self.map, path, COMMAND)
         page = _page(path, report)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison))
-        more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
+        write_text(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison), COMMAND)
+        more = [] if self.selection is None else _selected(path, report)
+        if self.selection is not None:
+            write_text(more[0], text_of(map_selection.selection_document(self.selection, self.unit)), COMMAND)
+            write_text(more[1], svg(map_selection.figure(self.selection, self.unit)), COMMAND)
         self.written = (path, page, *more)
 
 
@@ -281,10 +282,9 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
 
 
 def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
-    check_place(path, read)
-    check_page(_page(path, report))
-    if selected:
-        check_report(_stem(path, report))
+    check_place(path, read, COMMAND)
+    for name in (_page(path, report), *(_selected(path, report) if selected else ())):
+        check_file(name, COMMAND, str(name), "name another folder with --report")
 
 
 def _page(path: Path, report: Path | None) -> Path:
@@ -292,20 +292,10 @@ def _page(path: Path, report: Path | None) -> Path:
     return path.with_name(f"{path.stem}.report.html") if report is None else report / "report.html"
 
 
-def _stem(path: Path, report: Path | None) -> Path:
-    """Return the name of the selection's files without its ending: in the folder, or beside the map under its name."""
-    return path.with_name(f"{path.stem}.select") if report is None else report / "select"
-
-
-def _write_selection(choice: Selection, unit: BiasUnit, stem: Path) -> list[Path]:
-    """Write select.json and select.svg."""
-    names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
-    try:
-        write_json(names[0], map_selection.selection_document(choice, unit))
-        names[1].write_text(svg(map_selection.figure(choice, unit)), encoding="utf-8")
-    except OSError as error:
-        raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
-    return names
+def _selected(path: Path, report: Path | None) -> list[Path]:
+    """Return the places of the selection's files: in the folder, or beside the map under its name."""
+    stem = path.with_name(f"{path.stem}.select") if report is None else report / "select"
+    return [stem.with_name(stem.name + end) for end in (".json", ".svg")]
 
 
 def with_family(family: F | None, lot: str | None, *, more: bool) -> TypeGuard[F]:

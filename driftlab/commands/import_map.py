@@ -83,7 +83,7 @@ def import_map(
     calibration = _of_channel(exporter.read(path), channel, path)
     model = installed(ThermalMap, map_kind, "--kind")
     order = {"order": calibration.order} if map_kind == ORDERED else {}
-    check_place(place, [path])
+    check_place(place, [path], "import")
     T = np.linspace(*calibration.domain, PLACES)
     bias = calibration.bias(T)
     provenance = {
@@ -103,7 +103,7 @@ def import_map(
             f"{path}: is of no sensor that can be named ({quote(error.errors()[0]['msg'], 120)}); mend its channel, "
             "unit and axes"
         ) from None
-    save(fitted, place)
+    save(fitted, place, "import")
     apart = np.max(np.abs(fitted.bias(T) - bias), axis=0)
     return Imported(calibration, fitted, tuple(apart.tolist()))
 

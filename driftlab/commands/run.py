@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -190,10 +190,12 @@ def run(
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
-        hashed, observed = beforehand(understood.source), None
+        hashed: Callable[[], None] | None = None
+        observed: OverviewAccumulator | None = None
         try:
             with closing(_segments(running, journal, progress)) as segments, aside() as do:
                 for segment in segments:
+                    hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                     kept = estimates.append(segment)
                     if before is None and not smooth:  # else what the file has by its end is looked at
                         observed = observed or _accumulator(understood, running.model, journal)
@@ -202,7 +204,8 @@ def run(
             estimates.close()
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
-        hashed()
+        if hashed is not None:
+            hashed()
         return finish(folder, understood, running.model, journal, Path(out), observed=observed)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from fusion_core.contracts import SimulatedSource
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.config import Document, validate
-
-if TYPE_CHECKING:
-    pass
 
 ROWS = 65_536  # of a chunk made at once
 

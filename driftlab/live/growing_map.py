@@ -122,7 +122,7 @@ class GrowingMap:
             raise EmptyRecording(f"map {self.path}: nothing was at rest for as long as an alignment; no map is written")
         fitted = self._fit()
         self._publish(fitted)
-        save(fitted, self.path)
+        save(fitted, self.path, "live")
         return fitted
 
     def _work(self) -> None:
@@ -262,7 +262,7 @@ def soaking(
     wanted = None if sigma is None else to_si(sigma, unit.si)
     if wanted is not None and not wanted > 0:
         raise ConfigError(f"--sigma '{sigma}': is not above zero; write one like '3 {unit.shown}'")
-    check_place(path, [*read, *config.files_to_fit()])
+    check_place(path, [*read, *config.files_to_fit()], "live")
     asked = None if span is None else read_range(span)
     if asked is not None and not asked[0] < asked[1]:
         raise ConfigError(f"--range {span}: is no range; write the lower temperature first")

@@ -32,6 +32,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, FileSource
 
 SEED = 20  # of the simulated noise, by which the map is smoothed
+MOST = 20_000  # means: those of a longer recording are longer than the loop's
 
 Body = Callable[[Array], Array]  # temperature (N,) in degC at t (N,) in s
 
@@ -46,7 +47,7 @@ def still_channels(config: Config) -> tuple[str, ...]:
 
 def planned(unit: UnitModel, body: Body, duration: float, rows: int | None = None) -> Search:
     """Return a search without effects on a simulated recording; `rows` are as many as the loop's by default."""
-    fine, interval = lengths(duration, max(1.0, unit.interval))
+    fine, interval = _lengths(duration, max(1.0, unit.interval))
     if rows is not None:
         fine = interval = duration / rows
     t = np.arange(1, int(duration / fine) + 1, dtype=np.float64) * fine
@@ -59,13 +60,19 @@ def planned(unit: UnitModel, body: Body, duration: float, rows: int | None = Non
 
 def measured(unit: UnitModel, recordings: Sequence[tuple[Array, Array]], dt: float) -> Search:
     """Return a search without effects on recordings: of each T (N,) in degC and bias (N, d), one each dt in s."""
-    fine, interval = lengths(max(len(T) for T, _ in recordings) * dt, dt)
+    fine, interval = _lengths(max(len(T) for T, _ in recordings) * dt, dt)
     many, means_of_each = round(fine / dt), []
     for T, bias in recordings:
         n = len(T) // many
         means = [x[: n * many].reshape(n, many, *x.shape[1:]).mean(axis=1) for x in (T, bias)]
         means_of_each.append((np.arange(1, n + 1, dtype=np.float64) * fine, *means))
     return _search(unit, means_of_each, interval)
+
+
+def _lengths(longest: float, least: float) -> tuple[float, float]:
+    """Return the lengths of means and rows in s, as the loop has them; of no more than MOST means."""
+    fine, interval = lengths(longest, least)
+    return (fine, interval) if longest <= MOST * fine else lengths(longest, least * np.ceil(longest / MOST / least))
 
 
 def _search(unit: UnitModel, recordings: Sequence[tuple[Array, Array, Array]], interval: float) -> Search:

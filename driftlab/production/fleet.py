@@ -18,14 +18,13 @@ from driftlab.family.parallel import serial
 from driftlab.production.family import analyse
 from driftlab.production.manifest import read_manifest
 from driftlab.production.progress import fleet_progress
-from driftlab.production.report import FAMILY, REPORT, TABLE, is_written, write_fleet
+from driftlab.production.report import is_written, write_fleet
 from driftlab.production.result import FleetResult
-from driftlab.production.store import MARK, UNITS, UnitStore, as_json, fleet_folder
+from driftlab.production.store import UNITS, UnitStore, fleet_folder
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
-from driftlab.storage.folders import digest
 from fusion_core.errors import ConfigError, DataError
 from fusion_core.host.provenance import participants
 
@@ -201,8 +200,4 @@ class _Command:
             **more,
         )
         content = summary.content()
-        if content["complete"]:
-            paths = (folder.path / name for name in (TABLE, FAMILY, REPORT))
-            content["written"] = {path.name: digest(path) for path in paths if path.is_file()}
-        folder.write(MARK, as_json(content))
-        return content
+        return folder.write_mark(content)

@@ -15,15 +15,13 @@ from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.shared_effect import SharedEffect, of_effect
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import NEW, UNITS, FleetFolder
+from driftlab.production.store import FAMILY, NEW, REPORT, TABLE, UNITS, FleetFolder
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.tables import Row, posteriors, rows_of, temperatures, write_table
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-
-TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"
 
 
 def is_written(folder: Path, *, family: bool) -> bool:

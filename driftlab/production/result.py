@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from driftlab.commands.result import Result
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.production.report import FAMILY, REPORT, TABLE
-from driftlab.production.store import UNITS, record_of
+from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, record_of
 from driftlab.production.tables import COLUMNS
 from fusion_core.errors import ConfigError
 

@@ -22,9 +22,10 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, digest, matches, refusals, remove
+from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, matches, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
+from driftlab.storage.ownership import digest, document, foreign, signed
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -57,18 +58,18 @@ class FleetFolder:
         self.mark = mark_of(self.path)
         if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
-        for name, said in dict(self.mark.get("written") or {}).items():
-            if (self.path / name).exists() and digest(self.path / name) != said:
-                raise ConfigError(
-                    f"--out {out}: holds {name}, which was changed since driftlab wrote it; move it away, or name "
-                    "another folder"
-                )
+        there = {TABLE, FAMILY, REPORT} & set(names) if self.mark.get("complete") else ()
+        if self.mark and (changed := foreign(self.path, MARK, [MARK, *there])):
+            raise ConfigError(
+                f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
+                "name another folder"
+            )
         (self.path / UNITS).mkdir(parents=True, exist_ok=True)
         check_writable(self.path)
         self.lock = Lock(self.path / LOCK, f"--out {out}")
         self.lock.sign()
         if not self.mark:
-            self.write(MARK, b'{"schema": 1, "program": "driftlab fleet", "complete": false}\n')
+            self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
         self._finish()
         self.stamps = dict(_stamps(self.path / STAMPS))
         self._records: dict[str, UnitRecord | None] = {}
@@ -91,7 +92,7 @@ class FleetFolder:
         """
         if self.mark.get("complete"):
             self.mark = {**self.mark, "complete": False}
-            self.write(MARK, as_json(self.mark))
+            self.write_mark(self.mark)
         self._made(f".{record.unit}{NEW}", {**files, "unit.json": _content(record)})
         self._replace(record.unit)
         self._records[record.unit] = record
@@ -129,6 +130,13 @@ class FleetFolder:
         new = path.with_name(f".{path.name}{NEW}")
         new.write_bytes(content)
         os.replace(new, path)
+
+    def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Write `fleet.json` and return its content: it knows itself and the files of all units."""
+        paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
+        known = {path.name: digest(path) for path in paths if path.is_file()}
+        self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
+        return {**content, "written": document(self.path / MARK)["written"]}
 
     def _replace(self, unit: str) -> None:
         place = self.unit(unit)
@@ -238,6 +246,7 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 
 MARK = "fleet.json"  # mark of a fleet's folder
+TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
 UNITS = "units"
 
 
@@ -310,11 +319,8 @@ def soaked_of(folder: Path) -> UnitInformation:
 
 def mark_of(folder: Path) -> dict[str, Any]:
     """Return the content of `fleet.json`; empty where there is none that can be read."""
-    try:
-        mark = json.loads(read_whole(folder / MARK, PIECE))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return mark if isinstance(mark, dict) and "schema" in mark else {}
+    mark = document(folder / MARK)
+    return mark if "schema" in mark else {}
 
 
 def _units_of(folder: Path) -> Iterator[tuple[str, str]]:

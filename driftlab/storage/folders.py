@@ -1,9 +1,10 @@
-"""Folders of results that are whole or not there; their ownership, and their locks.
+"""Folders of results that are whole or not there, and their locks.
 
 A command writes to `OUT.partial`, which it locks, and renames it to OUT when all files are whole. Three rules:
 
-- What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command and
-  nothing else; `OUT.partial` is used again only if its lock file says that driftlab made it.
+- What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command, as it
+  wrote them (`driftlab.storage.ownership`), and nothing else; `OUT.partial` is used again only if its lock file says
+  that driftlab made it.
 - Results that cannot be computed again (from a device, or from a recording that is not there any more) are replaced
   only on demand.
 - What would make the end fail is refused at the beginning.
@@ -19,8 +20,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
-import io
 import json
 import os
 import shutil
@@ -32,15 +31,11 @@ from contextlib import contextmanager
 from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from driftlab.storage.hdf5 import reading, reason, sync
-from fusion_core.budget import read_whole
+from driftlab.storage.ownership import document, foreign, sign
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
-from fusion_core.escaping import json_text
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}  # not a mistake of usage
 
@@ -59,7 +54,7 @@ class Folder:
     resume : bool
         Whether what an earlier run left in `.partial` stays there.
     force : bool
-        Whether results may be replaced that cannot be computed again.
+        Whether results may be replaced that cannot be computed again, or were edited.
     recording : Path or None
         The recording that a live run goes on with: results that stand on it may be replaced.
     """
@@ -110,17 +105,22 @@ class Folder:
         """Raise ConfigError where the folder must not be replaced."""
         if not self.folder.exists():
             return
-        names = self._names() if self.folder.is_dir() else [self.folder.name]
-        if names and not is_ours(self.folder / FILES[self.command][0]):
-            raise ConfigError(f"--out {self.out}: exists and is not the output of an earlier run; name another folder")
-        files = (*FILES[self.command], LOCK, BEFORE)
-        others = sorted(name for name in names if not matches(name, files))
+        names = set(self._names() if self.folder.is_dir() else [self.folder.name])
+        first, second = FILES[self.command][:2]
+        known = document(self.folder / first).get("written")
+        if names and not (isinstance(known, dict) and any(fnmatch(name, second) for name in known)):
+            raise ConfigError(
+                f"--out {self.out}: exists and is not the output of an earlier {self.command}, or of a version that "
+                "kept no SHA-256 of its files; name another folder"
+            )
+        names -= {LOCK, BEFORE}
+        others = sorted(name for name in names if not matches(name, FILES[self.command]))
         if others:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
                 "name another folder"
             )
-        others = [] if self.force else foreign(self.folder, FILES[self.command][0], set(names) - {LOCK, BEFORE})
+        others = [] if self.force else foreign(self.folder, first, names)
         if others:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
@@ -271,7 +271,8 @@ def output_folder(
     done = False
     try:
         yield held.shown
-        sign(held.partial, FILES[command][0])
+        first = FILES[command][0]
+        sign(held.partial, first, [n for n in os.listdir(held.partial) if n != first and not matches(n, WORKING)])
         if durable:
             for path in (*held.partial.iterdir(), held.partial):
                 sync(path)
@@ -296,113 +297,12 @@ FILES = {  # of each command; the first says that all are there
     "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
 }
 LOCK, BEFORE = "driftlab.lock", ".replaced"
-LARGE, BLOCK = 1 << 24, 1 << 18  # bytes of a file whose digest is one of sums, and of a block
-SUMS = "sums:"  # how such a digest begins
-LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
-MARKS = {  # how a file begins, and what stands near its beginning
-    ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
-    ".svg": (b"<svg", b"<dc:title>driftlab</dc:title>"),
-    ".csv": (b"time [s],temperature [degC]\n", b"\n"),
-}
 WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command is not done
 
 
 def matches(name: str, patterns: Collection[str]) -> bool:
     """Whether a name is one of the patterns."""
     return any(fnmatch(name, pattern) for pattern in patterns)
-
-
-def sign(folder: Path, first: str) -> None:
-    """Write the SHA-256 of all files of a folder of results into its first one, and of what that says beside."""
-    content = _document(folder / first)
-    if content:
-        others = (name for name in os.listdir(folder) if name != first and not matches(name, WORKING))
-        written = {name: digest(folder / name) for name in sorted(others)}
-        content["written"] = written | {first: _digest_of(content)}
-        (folder / first).write_text(json_text(content, 2) + "\n", encoding="utf-8")
-
-
-def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
-    """Return which files of a folder of results driftlab did not write, or not as they are; `first` has its mark."""
-    content = _document(folder / first)
-    known = content.pop("written", None)
-
-    whole = isinstance(known, dict) and first in known
-
-    def ours(name: str) -> bool:
-        path = folder / name
-        if name == first:
-            return is_ours(path) and (not whole or known[first] == _digest_of(content))
-        if isinstance(known, dict) and (whole or name in known):
-            wanted = known.get(name)
-            return wanted == digest(path, sums=str(wanted).startswith(SUMS))
-        # of a version before digests, or before those of all files
-        return is_ours(path) or (known is None and "verdict" in content and not name.endswith((".html", ".h5")))
-
-    return sorted(name for name in names if not ours(name))
-
-
-def _digest_of(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def is_ours(path: Path) -> bool:
-    """Whether driftlab wrote a file, by what it holds: each kind of file has its mark at a place of its own."""
-    if path.is_symlink() or not path.is_file():
-        return False
-    try:
-        if path.suffix == ".json":
-            content = _document(path)
-            result = isinstance(content.get("schema"), int) and isinstance(content.get("driftlab"), str)
-            return result or (isinstance(content.get("driftlab_map"), int) and isinstance(content.get("record"), dict))
-        if path.suffix == ".h5":
-            with reading(path) as file:
-                return "driftlab" in file.attrs
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except (OSError, UnreadableFile):
-        return False
-    mark = MARKS.get(path.suffix)
-    return mark is not None and head.startswith(mark[0]) and mark[1] in head
-
-
-def digest(path: Path, *, sums: bool | None = None) -> str:
-    """Return the SHA-256 of a file, of a large one that of sums (`_sums`), in a third of the time.
-
-    It is empty for a link, and for what cannot be read. Where `sums` is given it says which of both it is.
-    """
-    try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-            if os.fstat(file.fileno()).st_size < LARGE if sums is None else not sums:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-            return SUMS + _sums(file)
-    except OSError:
-        return ""
-
-
-def _sums(file: io.BufferedReader) -> str:
-    """Return the SHA-256 of a file's length and of a sum of each of its blocks, of words times odd numbers modulo 2^64.
-
-    Any change within a word changes the sum; one of several words leaves it as it is once in 2^63 times or so.
-    """
-    odd = np.arange(1, BLOCK // 8 + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    odd = (odd ^ odd >> np.uint64(31)) * np.uint64(0xBF58476D1CE4E5B9) | np.uint64(1)
-    block, whole, length = np.zeros(BLOCK // 8, dtype=np.uint64), hashlib.sha256(), 0
-    while count := file.readinto(block.data):
-        block.view(np.uint8)[count:] = 0
-        length += count
-        whole.update(int(np.dot(block, odd)).to_bytes(8, "little"))
-    whole.update(length.to_bytes(8, "little"))
-    return whole.hexdigest()
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """Return a file of JSON; nothing where it is none."""
-    try:
-        content = json.loads(read_whole(path, LARGEST))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def remove(path: Path) -> None:

@@ -12,7 +12,12 @@ from fusion_core.escaping import json_text
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with null in place of NaN."""
-    path.write_text(json_text(plain(content), 2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(text_of(content), encoding="utf-8")
+
+
+def text_of(content: Any) -> str:
+    """Return JSON with null in place of NaN."""
+    return json_text(plain(content), 2, allow_nan=False) + "\n"
 
 
 def plain(value: Any) -> Any:

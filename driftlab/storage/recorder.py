@@ -9,7 +9,6 @@ final name only when it is whole.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import time
@@ -24,7 +23,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.storage.folders import Lock, check_writable, refusals
 from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, sync
-from fusion_core.budget import COPIED
+from driftlab.storage.ownership import check_own, seal, seal_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Source, head
 from fusion_core.data_sets import attribute
@@ -220,9 +219,8 @@ def started_at(path: Path) -> float | None:
         return float(attribute(path, file, "started")) if known else None
 
 
-SIMULATED_MARK = "driftlab simulate"  # begins every file that may be replaced
+SIMULATED_MARK = "driftlab simulate"
 HEAD = 1 << 16  # bytes that its comments take at most
-SEAL, UNSEALED = re.compile(rb"sha256:([0-9a-f]{64})"), "sha256:" + 64 * "0"
 SIMULATED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
 
 
@@ -243,47 +241,12 @@ def recording_file(out: Path, settings: str) -> Iterator[Hdf5Writer | CsvWriter]
     kind = WRITERS.get(out.suffix.lower())
     if kind is None:
         raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
-    if out.exists() and not (out.is_file() and kind.ours(out)):
-        raise ConfigError(f"--out {out}: exists and is not a simulated recording; name another file, or remove it")
-    if out.exists() and not _as_written(out):
-        raise ConfigError(
-            f"--out {out}: is a simulated recording that was changed since; name another file, or remove it"
-        )
+    check_own(out, "simulate", f"--out {out}", "name another file")
     with _renamed(Path(os.path.realpath(out)), out) as partial:
         writer = kind(partial, settings)
         with closing(writer.file):  # also of a program that stops: rows that were written are whole
             yield writer
-        _seal(partial)
-
-
-def _seal(path: Path) -> None:
-    """Write the SHA-256 of a file into the place that it has for it."""
-    place, _, found = _digests(path)
-    with path.open("r+b") as file:
-        file.seek(place)
-        file.write(found)
-
-
-def _as_written(path: Path) -> bool:
-    """Whether a file has the SHA-256 that it says."""
-    try:
-        _, said, found = _digests(path)
-    except (OSError, UnreadableFile):
-        return False
-    return said == found
-
-
-def _digests(path: Path) -> tuple[int, bytes, bytes]:
-    """Return where a file says its SHA-256, what it says, and the one that it has with zeros in that place."""
-    with path.open("rb") as file:
-        first = file.read(HEAD)
-        place = SEAL.search(first)
-        if place is None:
-            raise UnreadableFile(f"{path}: says no SHA-256 of its own; simulate it again")
-        found = hashlib.sha256(first[: place.start(1)] + UNSEALED[-64:].encode() + first[place.end(1) :])
-        while piece := file.read(COPIED):
-            found.update(piece)
-    return place.start(1), place[1], found.hexdigest().encode()
+        seal(partial)
 
 
 @contextmanager
@@ -307,17 +270,8 @@ def _renamed(out: Path, named: Path) -> Iterator[Path]:
 class Hdf5Writer:
     """One data set a channel, each with its `unit`; time is the first axis."""
 
-    @staticmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-        try:
-            with reading(path) as file:
-                return _made_by(SIMULATED_MARK, path, file)
-        except UnreadableFile:
-            return False
-
     def __init__(self, path: Path, settings: str) -> None:
-        attributes = {"sha256": UNSEALED, "program": f"{SIMULATED_MARK} {__version__}", "settings": settings}
+        attributes = {"sha256": seal_of("simulate"), "program": f"{SIMULATED_MARK} {__version__}", "settings": settings}
         self.file = GrowingFile(path, attributes, {name: {"unit": unit} for name, unit in SIMULATED_UNITS.items()})
 
     def append(self, chunk: Chunk) -> None:
@@ -329,15 +283,6 @@ class CsvWriter:
     """One column an axis, below comments with the config that reads them."""
 
     axes: ClassVar[str] = "xyz"
-
-    @staticmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-        try:
-            with path.open("rb") as file:
-                return file.read(len(SIMULATED_MARK) + 2) == f"# {SIMULATED_MARK}".encode()
-        except OSError:
-            return False
 
     def __init__(self, path: Path, settings: str) -> None:
         self.settings, self.file = settings, path.open("wb")
@@ -365,7 +310,7 @@ class CsvWriter:
         return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
 
     def _comments(self, table: dict[str, list[str]]) -> str:
-        lines = [f"{SIMULATED_MARK} {__version__}, {UNSEALED}; to read it:", "source:", "  kind: csv", "  channels:"]
+        lines = [f"{seal_of('simulate')}; to read it:", "source:", "  kind: csv", "  channels:"]
         for name, columns in table.items():
             unit = f", unit: {SIMULATED_UNITS[name]}" if name in SIMULATED_UNITS else ""
             named = [yaml_text(column) for column in columns]

@@ -26,6 +26,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, field_serializer, model_validator
 from pydantic_core import PydanticCustomError
 
+from fusion_core.budget import TimeBudget, check_all, of_all
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import installed, kind_default
 from fusion_core.contracts.source import Source
@@ -108,7 +109,7 @@ class FileSource(Source):
         """Return the properties of a channel's device that the file holds."""
         if self.path is None or channel not in self.channels:
             return {}
-        with self.open(self.path, Faults()) as table:
+        with of_all(self.path, "looking for its devices"), self.open(self.path, Faults()) as table:
             return dict(table.about(self.channels[channel].paths[0]))
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
@@ -118,11 +119,15 @@ class FileSource(Source):
                 f"{self.kind}: no recording is named; write path: FILE under source, or give --input FILE"
             )
         self._check_range()
+        yield from TimeBudget(self.path, "what yields no row").over(self._chunks(self.path, size, faults))
+
+    def _chunks(self, path: Path, size: int, faults: Faults) -> Iterator[Chunk]:
         window, rows_read = Window(self.start, self.stop), 0
-        with self.open(self.path, faults) as table:
+        with self.open(path, faults) as table:
             units = {name: self._conversions(table, name) for name in self.channels}
             paths = list(dict.fromkeys(path for channel in self.channels.values() for path in channel.paths))
             for block in table.blocks(paths, size):
+                check_all(block.rows)
                 t = self._time(block, units, rows_read)
                 rows_read += block.rows
                 rows = window.cut(t)

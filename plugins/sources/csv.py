@@ -23,7 +23,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from fusion_core.budget import size_of
+from fusion_core.budget import TEXTS, size_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
@@ -34,7 +34,7 @@ from fusion_plugins.sources.unpacked import Stream, beginning, opened
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line
 COLUMNS = 10_000  # of a file
-SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file
+SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file; TEXTS of them before its first row
 SLOW = 40  # times as many for each line that is left out by itself
 COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
 FIRST = re.compile(rb"^(?!#)[^\S\n]*\S", re.M)  # of a line that is neither
@@ -67,7 +67,7 @@ class CsvLines(Table):
 
     def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:
         self.path, self.file, self.separator, self.faults = path, file, separator, faults
-        self.skipped = 0  # bytes of comments and blank lines
+        self.skipped, self.most = 0, TEXTS  # bytes of comments and blank lines, and how many there may be
         self.columns = [name.strip() for name in self._fields(self._header())]
         self._check_header()
 
@@ -91,7 +91,10 @@ class CsvLines(Table):
                 values = self._careful(block, cells, at, offset, final) if values is None else values
             rows = len(next(iter(values.values()), ()))
             if rows:
+                self.most = SKIPPED
                 yield Block(rows, values.__getitem__)
+            else:
+                self._skip(len(block))
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
@@ -123,10 +126,11 @@ class CsvLines(Table):
 
     def _skip(self, count: int) -> None:
         self.skipped += count
-        if self.skipped > SKIPPED:
+        if self.skipped > self.most:
+            where = " before its first row" if self.most < SKIPPED else ""
             raise UnreadableFile(
-                f"{self.path}: has more than {size_of(SKIPPED)} of comments and blank lines, which is the limit; "
-                "remove them"
+                f"{self.path}: has more than {size_of(self.most)} of comments and blank lines{where}, which is the "
+                "limit; remove them"
             )
 
     def _too_long(self) -> UnreadableFile:

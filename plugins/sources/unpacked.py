@@ -1,23 +1,25 @@
 """The bytes of a file, unpacked where they are a gzip archive; `-` is standard input.
 
-Standard input is kept in a temporary file, so that it can be read as often as a recording is: once for each config that
-is compared, again to find the number of a line that is wrong.
+Standard input is taken as it is asked for, and kept in a temporary file without a name, so that it can be read as often
+as a recording is: once for each config that is compared, again to find the number of a line that is wrong. What is no
+recording is refused by its beginning, and nothing is left behind however the program ends.
 """
 
 from __future__ import annotations
 
-import atexit
 import io
+import os
 import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO
+from threading import Lock
+from typing import IO, BinaryIO
 
-from fusion_core.budget import TimeBudget, keep, no_room
+from fusion_core.budget import TEXTS, check_all, keep, no_room, size_of
 from fusion_core.contracts import head
 from fusion_core.errors import UnreadableFile
 
@@ -26,7 +28,6 @@ GZIP = b"\x1f\x8b"
 WITH_HEADER = 31  # what zlib calls a member of a gzip archive
 READ = 1 << 16  # bytes of an archive at a time
 BUFFER = 1 << 17  # of what it holds
-SECONDS = 5e-8  # that an unpacked byte may cost: members may be empty, and padded without end
 Stream = io.BufferedReader
 
 
@@ -41,16 +42,17 @@ def opened(path: Path) -> Iterator[Stream]:
     Unwritable
         If standard input cannot be kept.
     """
-    where = _standard_input() if path == STANDARD_INPUT else path
-    if not head(where, path).startswith(GZIP):
-        with where.open("rb") as file:
-            yield file
-        return
-    try:
-        with where.open("rb") as file, io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
-            yield unpacked  # type: ignore[misc]
-    except (EOFError, zlib.error) as error:
-        raise damaged(path, str(error)) from None
+    if path != STANDARD_INPUT:
+        head(path)
+    with path.open("rb") if path != STANDARD_INPUT else io.BufferedReader(_StandardInput(), BUFFER) as file:
+        if not beginning(file, path).startswith(GZIP):  # type: ignore[arg-type]
+            yield file  # type: ignore[misc]
+            return
+        try:
+            with io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
+                yield unpacked  # type: ignore[misc]
+        except (EOFError, zlib.error) as error:
+            raise damaged(path, str(error)) from None
 
 
 def damaged(path: Path, reason: str) -> UnreadableFile:
@@ -63,54 +65,78 @@ def beginning(file: Stream, path: Path) -> bytes:
     first = file.read(4096)
     file.seek(0)
     if not first:
-        raise UnreadableFile(f"{path}: is empty (0 bytes when unpacked); nothing was written to it, or a copy failed")
+        none = "0 bytes" if path == STANDARD_INPUT else "0 bytes when unpacked"
+        raise UnreadableFile(f"{path}: is empty ({none}); nothing was written to it, or a copy failed")
     return first
 
 
 @cache
-def _standard_input() -> Path:
-    """Return a temporary file with all of standard input, which is removed at exit."""
+def _standard_input() -> tuple[io.BufferedReader, IO[bytes], Lock]:
+    """Return standard input, the file that keeps what came of it, and their lock: a thread may read ahead."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
+    stream = sys.stdin.buffer
+    with suppress(OSError, ValueError):
+        os.set_blocking(stream.fileno(), True)  # else nothing yet looks like the end
     try:
-        file = tempfile.NamedTemporaryFile(prefix="driftlab-")  # noqa: SIM115
-        atexit.register(file.close)
+        return stream, tempfile.TemporaryFile(), Lock()  # type: ignore[return-value]
     except OSError as error:
         raise no_room(STANDARD_INPUT, error) from None
-    try:
-        keep(STANDARD_INPUT, sys.stdin.buffer, file)
-    except BaseException:
-        file.close()
-        raise
-    return Path(file.name)
 
 
-class _Members(io.RawIOBase):
-    """The content of the members of a gzip archive, one after the other; zeros behind one are padding."""
+class _Seekable(io.RawIOBase):
+    """Bytes that are read from a place `at` on."""
 
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file = path, file
-        self.clock = TimeBudget(path, "what unpacks to next to nothing")
-        self._rewind()
-
-    def _rewind(self) -> None:
-        self.file.seek(0)
-        self.engine, self.left, self.at, self.inside = zlib.decompressobj(WITH_HEADER), b"", 0, False
+    at = 0
 
     def readable(self) -> bool:
         """Whether it can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Whether `seek` is possible, at the cost of unpacking what lies before."""
+        """Whether `seek` is possible."""
         return True
 
-    def tell(self) -> int:
-        """Return the place in the unpacked bytes."""
-        return self.at
+
+class _StandardInput(_Seekable):
+    """Standard input from its beginning."""
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place in the unpacked bytes."""
+        """Go to a place in what was read."""
+        if whence == io.SEEK_END:
+            raise io.UnsupportedOperation("the end is not known")
+        self.at = offset + (self.at if whence == io.SEEK_CUR else 0)
+        return self.at
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read into a buffer; return the number of bytes, 0 at the end."""
+        stream, file, lock = _standard_input()
+        with lock:
+            if self.at < file.seek(0, io.SEEK_END):
+                file.seek(self.at)
+                data = file.read(len(buffer))
+            else:
+                data = stream.read1(len(buffer))
+                keep(STANDARD_INPUT, data, file)
+        buffer[: len(data)] = data
+        self.at += len(data)
+        return len(data)
+
+
+class _Members(_Seekable):
+    """The content of the members of a gzip archive, one after the other; zeros behind one are padding."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self.file.seek(0)
+        self.engine, self.left, self.at, self.inside = zlib.decompressobj(WITH_HEADER), b"", 0, False
+        self.idle = 0  # bytes since some that held anything
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place in the unpacked bytes, at the cost of unpacking what lies before."""
         offset += self.at if whence == io.SEEK_CUR else 0
         if whence == io.SEEK_END:
             raise io.UnsupportedOperation("the end is not known")
@@ -122,19 +148,17 @@ class _Members(io.RawIOBase):
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         """Unpack into a buffer; return the number of bytes, 0 at the end."""
-        with self.clock:
-            data = self._next(len(buffer)) if len(buffer) else b""
-            self.clock.seconds += len(data) * SECONDS
+        data = self._next(len(buffer)) if len(buffer) else b""
         buffer[: len(data)] = data
         self.at += len(data)
         return len(data)
 
     def _next(self, most: int) -> bytes:
         while True:
-            self.clock.tick()
+            check_all()
             if self.engine.eof:
                 self.engine, self.left, self.inside = zlib.decompressobj(WITH_HEADER), self.engine.unused_data, False
-            packed = self.left or self.file.read(READ)
+            packed = self.left or self._packed()
             self.left = b""
             if not self.inside:
                 ended, packed = not packed, packed.lstrip(b"\0")
@@ -146,6 +170,15 @@ class _Members(io.RawIOBase):
             data = self.engine.decompress(packed, most)
             self.left = self.engine.unconsumed_tail
             if data:
+                self.idle = 0
                 return data
             if not packed and not self.engine.eof:
                 raise EOFError("Compressed file ended before the end-of-stream marker was reached")
+
+    def _packed(self) -> bytes:
+        self.idle += READ
+        if self.idle > TEXTS:
+            raise UnreadableFile(
+                f"{self.path}: has more than {size_of(TEXTS)} that unpack to nothing, which is the limit; pack it again"
+            )
+        return self.file.read(READ)

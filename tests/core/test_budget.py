@@ -2,13 +2,15 @@ import io
 import os
 import time
 import zipfile
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from fusion_core.budget import TimeBudget, check_all, next_array, of_all, opened, read_whole, rows_at_once
-from fusion_core.contracts import head
+from fusion_core.contracts import Block, Channel, FileSource, head
 from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.faults import Faults
 from fusion_core.host.document import parse
 
 
@@ -65,6 +67,55 @@ def test_attempts_at_one_file_have_one_clock(tmp_path):
             check_all()
     TimeBudget(tmp_path, "a step", 9.0).check()
     check_all()
+
+
+def spend(seconds):
+    begun = time.process_time()
+    while time.process_time() - begun < seconds:
+        pass
+
+
+class Slow(FileSource):
+    """A source that opens, and looks for rows in vain, for less than each may take."""
+
+    kind: str = "slow"
+
+    @contextmanager
+    def open(self, path, faults):
+        with TimeBudget(path, "opening", 0.3):
+            spend(0.2)
+        yield self
+
+    def has(self, path):
+        return True
+
+    def unit(self, path):
+        return "s"
+
+    def blocks(self, paths, size):
+        for _ in range(2):
+            with TimeBudget(self.path, "looking", 0.3):
+                spend(0.2)
+        yield Block(1, lambda path: np.zeros(1))
+
+
+def test_the_steps_of_a_reading_have_one_clock(tmp_path, monkeypatch):
+    source = Slow.model_construct(path=tmp_path, channels={"time": Channel(path="t", unit="s")})
+    assert sum(map(len, source.chunks(10, Faults()))) == 1
+    monkeypatch.setattr("fusion_core.budget.TimeBudget.__init__.__defaults__", (0.3, 0.0))
+    with pytest.raises(UnreadableFile, match="what yields no row took more than 0 s"):
+        list(source.chunks(10, Faults()))
+
+
+def test_what_is_done_with_rows_takes_no_time_of_their_reader(tmp_path):
+    clock = TimeBudget(tmp_path, "reading", 0.2, row=0.0)
+    for _ in clock.over(range(3)):
+        spend(0.1)
+    clock = TimeBudget(tmp_path, "reading", 0.0)
+    with pytest.raises(UnreadableFile, match="reading took"):
+        list(clock.over(spend(0.1) or k for k in range(3)))
+    clock = TimeBudget(tmp_path, "reading", 0.0)
+    assert len(list(clock.over(check_all(10_000_000) or k for k in range(3)))) == 3
 
 
 def test_an_array_that_declares_more_than_its_file_holds_makes_no_room(tmp_path):

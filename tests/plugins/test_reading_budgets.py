@@ -86,7 +86,7 @@ def test_an_archive_keeps_to_its_budget_and_a_full_disk_is_told_apart(tmp_path, 
             raise OSError(28, "No space left on device")
 
     with pytest.raises(Unwritable, match=r"No space left on device\) and there is no room in TMPDIR; make room"):
-        budget.keep(path, io.BytesIO(b"abc"), Full())
+        budget.keep(path, b"abc", Full())
 
 
 def test_messages_that_are_packed_one_by_one_have_a_budget_together(tmp_path):
@@ -143,13 +143,12 @@ def test_the_members_of_an_archive_are_those_of_gzip(tmp_path):
             assert len(file.read()) == size
 
 
-def test_padding_without_end_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("fusion_core.budget.TimeBudget.__init__.__defaults__", (0.5,))
+def test_padding_without_end_is_given_up(tmp_path):
     path = tmp_path / "a.gz"
     path.write_bytes(zlib.compress(b"abc", wbits=31))
     with path.open("r+b") as file:
         file.truncate(10**13)
-    with pytest.raises(UnreadableFile, match=r"took more than .* s of the processor"), unpacked.opened(path) as file:
+    with pytest.raises(UnreadableFile, match="more than 64 MB that unpack to nothing"), unpacked.opened(path) as file:
         file.read()
 
 

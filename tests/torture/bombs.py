@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torture import base, bombs_of_logs
+from torture import base, bombs_of_logs, bombs_of_pipes
 from torture.commands import MAIN
 from torture.outcome import Outcome, Said
 
@@ -29,7 +29,7 @@ RNG = np.random.Generator
 MEMORY, SECONDS = 1_500_000_000, 60.0  # the budget, over an ordinary run and what the rows cost
 ROW, ROW_SECONDS = 100, 2e-5  # bytes and s of the processor that a row may cost
 MOST, LONGEST = 12 << 30, 200  # bytes of addresses that a process may have, and s of the processor
-NAMES = ["torture.bombs_of_logs", "torture.bombs_of_columns", "torture.bombs_of_arrays"]
+NAMES = ["torture.bombs_of_logs", "torture.bombs_of_columns", "torture.bombs_of_arrays", "torture.bombs_of_pipes"]
 MODULES = [import_module(name) for name in NAMES if find_spec(name)]
 FORMATS: dict[str, Callable[[RNG, Path], None]] = {k: make for m in MODULES for k, make in m.FORMATS.items()}
 SUFFIXES: dict[str, str] = {k: suffix for m in MODULES for k, suffix in m.SUFFIXES.items()}
@@ -54,8 +54,8 @@ def prepare(folder: Path) -> None:
     (folder / "recording.csv").write_text(base.csv_text(base.recording(100)))
 
 
-def measured(folder: Path, *args: object) -> tuple[Said, Cost]:
-    """Run the program, and measure it."""
+def measured(folder: Path, *args: object, feeder: subprocess.Popen[bytes] | None = None) -> tuple[Said, Cost]:
+    """Run the program, on what `feeder` writes where there is one, and measure it."""
 
     def limits() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MOST, MOST))
@@ -67,9 +67,11 @@ def measured(folder: Path, *args: object) -> tuple[Said, Cost]:
     since = time.monotonic()
     with (folder / "out.txt").open("wb") as out, (folder / "err.txt").open("wb") as err:
         process = subprocess.Popen(
-            [sys.executable, "-c", MAIN, *map(str, args)], cwd=folder, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
-            env=environment, preexec_fn=limits,
+            [sys.executable, "-c", MAIN, *map(str, args)], cwd=folder, stdout=out, stderr=err,
+            stdin=feeder.stdout if feeder else subprocess.DEVNULL, env=environment, preexec_fn=limits,
         )  # fmt: skip
+        if feeder and feeder.stdout:
+            feeder.stdout.close()
         _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     said = [(folder / name).read_text(errors="replace") for name in ("out.txt", "err.txt")]
@@ -114,14 +116,17 @@ class Bench:
         kind = name.partition(" ")[0]
         path = folder / f"bomb{SUFFIXES.get(name) or SUFFIXES[kind]}"
         FORMATS[name](rng, path)
+        feeder = bombs_of_pipes.feed(path) if path.suffix == ".pipe" else None
         if kind == "config":
             command: list[object] = ["check", path]
-        elif kind not in MAPS and rng.integers(4) == 0:
+        elif feeder is None and kind not in MAPS and rng.integers(4) == 0:
             command = ["init", path, "--out", "made.yaml"]
         else:
             base.write_config(folder / "config.yaml", config(kind, path, self.folder / "recording.csv"))
-            command = ["run", "config.yaml", "--out", "out"]
-        said, cost = measured(folder, *command)
+            command = ["run", "config.yaml", "--out", "out", *(["--input", "-"] if feeder else [])]
+        said, cost = measured(folder, *command, feeder=feeder)
+        if feeder:
+            feeder.wait()
         return self.judged(name, said, cost, folder)
 
     def judged(self, name: str, said: Said, cost: Cost, folder: Path) -> Outcome:

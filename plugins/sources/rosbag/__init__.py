@@ -17,7 +17,6 @@ The files of a bag: one `.bag`, `.mcap` or `.db3`, or a folder of them in their 
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
@@ -28,7 +27,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import check_count, keep, no_room, unpacked_at_most
+from fusion_core.budget import COPIED, check_count, keep, temporary_folder, unpacked_at_most
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
@@ -418,13 +417,11 @@ def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
 
 def _whole(path: Path, stack: ExitStack) -> Path:
     """Return a temporary file with what a compressed one holds, as far as it is whole."""
-    try:
-        unpacked = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="driftlab-"))) / path.stem
-    except OSError as error:
-        raise no_room(path, error) from None
+    unpacked, most = stack.enter_context(temporary_folder(path)) / path.stem, unpacked_at_most(path)
     try:
         with zstd().open(path, "rb") as packed, unpacked.open("wb") as file:
-            keep(path, packed, file, unpacked_at_most(path))
+            while data := packed.read(COPIED):
+                keep(path, data, file, most)
     except (OSError, EOFError, zstd().ZstdError) as error:
         raise damaged(path, str(error)) from None
     return unpacked

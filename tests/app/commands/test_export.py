@@ -31,7 +31,7 @@ def test_what_is_there_is_replaced_only_when_asked(unit, tmp_path):
     out = tmp_path / "a.csv"
     out.write_text("mine")
     said = export("csv_table", unit, out).exception
-    assert "exists; name another file, or give --force to replace it" in str(said)
+    assert "a.csv exists, and is not as `driftlab export` wrote it; name another file, or give --force" in str(said)
     assert out.read_text() == "mine"
     assert export("csv_table", unit, out, "--force").exit_code == 0
     assert out.read_text().startswith("# spline of the gyro")

@@ -106,21 +106,21 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     assert out.read_bytes() != first
     edited = out.read_bytes()[:-100] + out.read_bytes()[-90:]
     out.write_bytes(edited)
-    with pytest.raises(ConfigError, match=r"changed since|is not a simulated recording"):
+    with pytest.raises(ConfigError, match="was changed since `driftlab simulate` wrote it; move it away"):
         simulate(config, out=out)
     assert out.read_bytes() == edited
     out.write_text("time,gx\n0,1\n")
-    with pytest.raises(ConfigError, match="is not a simulated recording; name another file, or remove it"):
+    with pytest.raises(ConfigError, match="exists, and has no SHA-256 by which `driftlab simulate` knows what"):
         simulate(config, out=out)
     assert out.read_text() == "time,gx\n0,1\n"
     simulate(config, out=tmp_path / "edited.h5")
     with h5py.File(tmp_path / "edited.h5", "r+") as file:
         file["gyro"][3] = 9.0
-    with pytest.raises(ConfigError, match="is a simulated recording that was changed since; name another file"):
+    with pytest.raises(ConfigError, match="was changed since `driftlab simulate` wrote it"):
         simulate(config, out=tmp_path / "edited.h5")
     with h5py.File(tmp_path / "measured.h5", "w") as file:
         file["gyro"] = [1.0]
-    with pytest.raises(ConfigError, match="is not a simulated recording"):
+    with pytest.raises(ConfigError, match="has no SHA-256"):
         simulate(config, out=tmp_path / "measured.h5")
 
 

@@ -122,3 +122,9 @@ def test_what_was_recorded_says_how_large_an_effect_may_be():
     assert np.mean([item.size for item in found]) == pytest.approx(size, rel=0.2)
     (none,) = effects_in(UNIT, [made_up(effect, 0.0, 0)[1]], 1.0, ["hysteresis"])
     assert not none.sure
+
+
+@pytest.mark.parametrize("hours", [56, 10_000])
+def test_the_means_of_a_long_plan_are_longer_and_no_more(hours):
+    search = planned(UNIT, lambda t: 20.0 + 30.0 * np.sin(t / 5000.0), hours * 3600.0)
+    assert 18_000 <= len(search.columns.evidence.chunks[0]) <= 20_000

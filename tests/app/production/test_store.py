@@ -47,14 +47,12 @@ def test_what_others_put_beside_the_files_of_a_unit_stays(tmp_path):
 def test_a_table_of_a_fleet_that_was_edited_is_not_replaced(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.write("report.html", b"a")
-        mark = json.loads((folder.path / "fleet.json").read_text())
-        said = "ca978112ca1bbdcafac231b39a23dc4da786eff8147c4e72b9807785afee48bb"  # of a
-        folder.write("fleet.json", json.dumps(mark | {"written": {"report.html": said}}).encode())
+        folder.write_mark({**json.loads((folder.path / "fleet.json").read_text()), "complete": True})
     with fleet_folder(tmp_path / "fleet"):
         pass
     (tmp_path / "fleet" / "report.html").write_text("b")
     with (
-        pytest.raises(ConfigError, match=r"holds report.html, which was changed since driftlab wrote it; move it away"),
+        pytest.raises(ConfigError, match=r"holds report.html, which driftlab did not write, or not so; move it away"),
         fleet_folder(tmp_path / "fleet"),
     ):
         pass

@@ -241,14 +241,20 @@ def test_what_an_archive_holds_is_checked(tmp_path, inside, message):
 
 @pytest.fixture
 def standard_input(tmp_path, monkeypatch):
-    """Return a function that puts bytes on standard input."""
+    """Return a function that puts bytes, or what comes of a stream, on standard input."""
+
+    def forget():
+        if unpacked._standard_input.cache_info().currsize:
+            unpacked._standard_input()[1].close()
+        unpacked._standard_input.cache_clear()
 
     def give(content):
-        unpacked._standard_input.cache_clear()
-        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
+        forget()
+        raw = io.BytesIO(content) if isinstance(content, bytes) else io.BufferedReader(content)
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(raw))
 
     yield give
-    unpacked._standard_input.cache_clear()
+    forget()
 
 
 @pytest.mark.parametrize("pack", [bytes, gzip.compress])
@@ -267,7 +273,7 @@ def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
         read(simple("-"))
     terminal, other = os.openpty()
     with os.fdopen(other) as screen:
-        unpacked._standard_input.cache_clear()
+        standard_input(b"")
         monkeypatch.setattr("sys.stdin", screen)
         with pytest.raises(UnreadableFile, match=r"-: standard input is a terminal, .*; pipe one in, or name a file"):
             read(simple("-"))
@@ -276,6 +282,59 @@ def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", "/dev/full")
     with pytest.raises(Unwritable, match=r"-: standard input cannot be kept in /dev/full"):
         read(simple("-"))
+
+
+class Endless(io.RawIOBase):
+    """One thing first and another again and again, of which no more than some is asked for."""
+
+    def __init__(self, first, again, most=100_000_000):
+        self.rest, self.again, self.most = first, again * (BLOCK // len(again) + 1), most
+
+    def readable(self):
+        return True
+
+    def readinto(self, buffer):
+        self.rest = self.rest or self.again
+        data, self.rest = self.rest[: len(buffer)], self.rest[len(buffer) :]
+        buffer[: len(data)] = data
+        self.most -= len(data)
+        assert self.most > 0, "more was read than tells that it is no recording"
+        return len(data)
+
+
+BLOCK = 1 << 16
+MEMBER = gzip.compress(b"", mtime=0)
+
+
+@pytest.mark.parametrize(
+    ("first", "again", "message"),
+    [
+        (b"", b"y\n", "has no column 't'"),
+        (b"", b"\0", "is not UTF-8 text"),
+        (b"", b"y", "a line of more than 1 MB"),
+        (b"", b"\n", "has more than 64 MB of comments and blank lines before its first row"),
+        (b"t,g,h\n", b"# a comment\n", "has more than 64 MB of comments and blank lines before its first row"),
+        (b"", gzip.compress(bytes(1 << 20)), "is not UTF-8 text"),
+        (b"", MEMBER, "has more than 64 MB that unpack to nothing"),
+        (MEMBER, b"\0", "has more than 64 MB that unpack to nothing"),
+    ],
+)
+def test_a_stream_without_end_that_is_no_recording_is_refused_by_its_beginning(
+    standard_input, monkeypatch, first, again, message
+):
+    standard_input(Endless(first, again))
+    with pytest.raises(UnreadableFile if "column" not in message else MissingChannel, match=f"-: .*{message}"):
+        read(simple("-"))
+
+
+def test_rows_without_end_are_read_as_far_as_the_limit(standard_input, monkeypatch, tmp_path):
+    """More than TMPDIR may hold: refused in one line, and the file that kept them has no name there."""
+    monkeypatch.setattr("fusion_core.budget.MAX_TEMPORARY", 3_000_000)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    standard_input(b"t,g,h\n" + b"0,1,2\n" * 1_000_000)
+    with pytest.raises(UnreadableFile, match="-: standard input has more than 3 MB, which is the limit; write it to"):
+        read(simple("-"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("block", [16, 64, 1 << 20])
@@ -297,7 +356,8 @@ def test_comments_before_the_header_are_passed_over_by_blocks(tmp_path, monkeypa
 @pytest.mark.parametrize("line", ["#\n", "\n", "# a comment\n", " \t\n"])
 @pytest.mark.parametrize("before", ["", GOOD])
 def test_comments_without_end(tmp_path, monkeypatch, line, before):
-    monkeypatch.setattr(csv_module, "SKIPPED", 10_000)
+    for limit in ("SKIPPED", "TEXTS"):
+        monkeypatch.setattr(csv_module, limit, 10_000)
     content = before + '3,"4",5\n' * bool(before) + line * 11_000 + GOOD.partition("\n")[2 if before else 0] + GOOD
     with pytest.raises(UnreadableFile, match="has more than 10 kB of comments and blank lines, which is the limit"):
         read(simple(text(tmp_path, content)))

@@ -1,0 +1,141 @@
+"""Ownership of files: each that driftlab wrote is known by its SHA-256, which one that was edited since has not.
+
+A file that stands alone (a map, its page, a simulated recording) says which command wrote it, and its SHA-256, made
+with zeros in that place. The first file of a folder has under `written` the SHA-256 of each that was written with it,
+and its own, made likewise.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Collection, Mapping
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftlab import __version__
+from fusion_core.budget import COPIED, read_whole
+from fusion_core.errors import ConfigError
+from fusion_core.escaping import json_text
+
+SEAL, ZEROS = re.compile(rb"driftlab ([a-z-]{1,20}) [!-~]{1,80}, sha256:([0-9a-f]{64})"), 64 * b"0"
+LONGEST = 200  # bytes of a seal, at least
+LARGE, BLOCK = 1 << 24, 1 << 18  # bytes of a file whose digest is one of sums, and of a block
+SUMS = "sums:"  # how such a digest begins
+LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
+
+
+def seal_of(command: str) -> str:
+    """Return the text by which a file is known, with zeros in the place of its SHA-256; `seal` writes that."""
+    return f"driftlab {command} {__version__}, sha256:{ZEROS.decode()}"
+
+
+def seal(path: Path) -> None:
+    """Write the SHA-256 of a file into the place that it has for it; one without a place stays as it is."""
+    place, _, _, found = _seal(path)
+    if place is not None:
+        with path.open("r+b") as file:
+            file.seek(place)
+            file.write(found)
+
+
+def check_own(path: Path, command: str, subject: str, remedy: str) -> None:
+    """Raise ConfigError where something else is at a path than what a command wrote there, as it wrote it."""
+    real = Path(os.path.realpath(path))
+    if not os.path.lexists(real):
+        return
+    _, by, said, found = _seal(real) if real.is_file() else (None, "", b"", b"")
+    if by != command:
+        has = f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote"
+    elif said != found:
+        has = f"was changed since `driftlab {command}` wrote it"
+    else:
+        return
+    raise ConfigError(f"{subject}: {has}; move it away, or {remedy}")
+
+
+def _seal(path: Path) -> tuple[int | None, str, bytes, bytes]:
+    """Return where a file says its SHA-256, of which command, what it says, and what it has with zeros there."""
+    sha256, place, by, said, data, passed = hashlib.sha256(), None, "", b"", b"", 0
+    with path.open("rb") as file:
+        while (piece := file.read(COPIED)) and (place is not None or passed < LARGEST):
+            data += piece
+            if place is None and (match := SEAL.search(data)):
+                place, by, said = passed + match.start(2), match[1].decode(), match[2]
+                data = data[: match.start(2)] + ZEROS + data[match.end(2) :]
+            done = len(data) if place is not None else max(len(data) - LONGEST, 0)
+            sha256.update(data[:done])
+            data, passed = data[done:], passed + done
+    sha256.update(data)
+    return place, by, said, sha256.hexdigest().encode()
+
+
+def sign(folder: Path, first: str, names: Collection[str], known: Mapping[str, str] | None = None) -> None:
+    """Write the SHA-256 of files of a folder into its first one, with those that are known, and its own."""
+    if content := document(folder / first):
+        digests = {**(known or {}), **{name: digest(folder / name) for name in sorted(names)}}
+        (folder / first).write_text(signed(content, first, digests), encoding="utf-8")
+
+
+def signed(content: dict[str, Any], first: str, digests: Mapping[str, str]) -> str:
+    """Return the text of the first file of a folder, with the SHA-256 of files and its own, made with zeros there."""
+    rest = {key: value for key, value in content.items() if key != "written"}
+    text = json_text({**rest, "written": {**digests, first: ZEROS.decode()}}, 2, allow_nan=False) + "\n"
+    before, _, after = text.rpartition(ZEROS.decode())
+    return before + hashlib.sha256(text.encode()).hexdigest() + after
+
+
+def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
+    """Return which files of a folder driftlab did not write, or not as they are."""
+    known = document(folder / first).get("written")
+    known = known if isinstance(known, dict) else {}
+    said = {name: str(known.get(name)) for name in names}
+    found = {n: digest(folder / n, said[n] if n == first else "", said[n].startswith(SUMS)) for n in names}
+    return sorted(name for name in names if not found[name] or found[name] != known.get(name))
+
+
+def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
+    """Return the SHA-256 of a file, with zeros where it says its own; empty where it is a link or cannot be read.
+
+    Of a large file it is that of sums, which takes a third of the time; `sums` says whether, where that is known.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            if sums or (sums is None and os.fstat(file.fileno()).st_size >= LARGE):
+                return SUMS + _sums(file)
+            if not own:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+            before, _, after = file.read(LARGEST).rpartition(own.encode())
+            return hashlib.sha256(before + ZEROS + after).hexdigest()
+    except OSError:
+        return ""
+
+
+def _sums(file: BufferedReader) -> str:
+    """Return the SHA-256 of a file's length and of a sum of each of its blocks, of words times odd numbers modulo 2^64.
+
+    Any change within a word changes the sum; one of several words leaves it as it is once in 2^63 times or so.
+    """
+    odd = np.arange(1, BLOCK // 8 + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    odd = (odd ^ odd >> np.uint64(31)) * np.uint64(0xBF58476D1CE4E5B9) | np.uint64(1)
+    block, whole, length = np.zeros(BLOCK // 8, dtype=np.uint64), hashlib.sha256(), 0
+    while count := file.readinto(block.data):
+        block.view(np.uint8)[count:] = 0
+        length += count
+        whole.update(int(np.dot(block, odd)).to_bytes(8, "little"))
+    whole.update(length.to_bytes(8, "little"))
+    return whole.hexdigest()
+
+
+def document(path: Path) -> dict[str, Any]:
+    """Return a file of JSON; nothing where it is none."""
+    try:
+        content = json.loads(read_whole(path, LARGEST))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
