@@ -11,7 +11,7 @@ middle: a line through them reaches as far as the errors do. N rows, d axes, K s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
-BINS = 250  # stretches over which the nis is averaged for its figure, to twice as many
-STRETCHES = 500  # stretches of the errors, to twice as many: two points each
+STRETCHES = 400  # of which the figures show errors, two points each, and mean nis; up to twice as many
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
@@ -67,7 +66,7 @@ class Overview:
     errors : dict of str to array
         `t`, and the error of `bias` and `coast`, with every spike of it.
     nis_curve : (K, 3) array
-        Time in s, mean nis and number of updates of up to 2 BINS stretches.
+        Time in s, mean nis and number of updates of up to 2 STRETCHES stretches.
     nis_highest : float
         Largest nis of one update among them.
     swing : float
@@ -112,8 +111,8 @@ class OverviewAccumulator:
         self.averages, self.names = averages, NAMES if averages is None else (*NAMES, "calibration")
         self.count = self.used = 0
         self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
-        self._scores, self._whiteness, self._nis = ScoreAccumulator(d), Whiteness(model.m), _NisSums()
-        self._curves, self._envelope, self._last = _Thinned(), Envelope(d), Columns()
+        self._scores, self._whiteness, self._envelope = ScoreAccumulator(d), Whiteness(model.m), Envelope(d)
+        self._curves, self._last = _Thinned(), Columns()
         self._parts: list[Mapping[str, Array]] = []  # of the next block
         self._waiting: list[Columns] = []  # blocks whose reference is not known yet
         self._before: list[Columns] = []  # the half window before those
@@ -153,17 +152,17 @@ class OverviewAccumulator:
         self._last = _rows(block, len(used) - 1, None)
         self._scores.add(block, block["reference"])
         self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
-        self._nis.add(block, after)
-        for observer in (self._curves, self._envelope, self.averages):
-            if observer is not None:
-                observer.add(block)
+        self._envelope.add(block, after)
+        self._curves.add(block)
+        if self.averages is not None:
+            self.averages.add(block)
 
     def overview(self, first_row: float | None = None) -> Overview:
         """Return the overview of all rows; `first_row` is the time of the recording's first row, s, where known."""
         if self._parts:
             self._gather()
         self._gather()  # what still waits has nothing after it
-        model, nis, drawn = self.model, self._nis, self._curves.curves(self._last)
+        model, found = self.model, self._envelope
         up = self.alignment.up if model.tracked.integral else None
         return Overview(
             count=self.count,
@@ -174,12 +173,12 @@ class OverviewAccumulator:
             bias=self._last["bias"][-1],
             sigma=self._last["bias_sigma"][-1],
             yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
-            nis=nis_test_of(nis.total, nis.count, model.m),
+            nis=nis_test_of(found.nis_total, int(np.sum(found.sums[:, 0])), model.m),
             whiteness_p=self._whiteness.p(),
-            curves=drawn,
-            errors=self._envelope.curves(),
-            nis_curve=nis.curve(),
-            nis_highest=nis.highest,
+            curves=self._curves.curves(self._last),
+            errors=found.curves(),
+            nis_curve=found.nis_curve(),
+            nis_highest=found.nis_highest,
             swing=max(self._warmest - self._coldest, 0.0),
         )
 
@@ -206,58 +205,6 @@ class _Thinned:
         if (self.at - 1) % self.stride:
             self.parts.append({name: last[name] for name in self.parts[0]})
         return _joined(self.parts, self.parts[0])
-
-
-class _Stretches:
-    """Stretches of rows that are all as long, K to 2 K of them: with twice as many, two and two are made one."""
-
-    def __init__(self, K: int) -> None:
-        self.K, self.at, self.length = K, 0, 1
-
-    def next(self, rows: int, merge: Callable[[], None]) -> tuple[int, int]:
-        """Return the number of the next row and the length of a stretch, after `merge` where that has doubled."""
-        while self.at + rows > 2 * self.K * self.length:
-            merge()
-            self.length *= 2
-        self.at += rows
-        return self.at - rows, self.length
-
-
-class _NisSums:
-    """The nis of the updates that count, block after block: their sum, and means of stretches."""
-
-    def __init__(self) -> None:
-        self.stretches = _Stretches(BINS)
-        self.sums = np.zeros((2 * BINS, 3))  # number, sum of t, sum of nis
-        self.count, self.total, self.highest = 0, 0.0, 0.0
-
-    def add(self, block: Columns, counts: Flags) -> None:
-        """Take the next block, of which the rows count that `counts` says."""
-        where = self.stretches.next(len(counts), self._merge)
-        total, highest = _sum_nis(block["t"], block["nis"], counts, *where, self.sums)
-        self.count, self.total = self.count + int(np.count_nonzero(counts)), self.total + total
-        self.highest = max(self.highest, highest)
-
-    def _merge(self) -> None:
-        self.sums = np.concatenate([self.sums[::2] + self.sums[1::2], np.zeros((BINS, 3))])
-
-    def curve(self) -> Array:
-        """Return mean time, mean nis and number of updates (K, 3) of the stretches in which any update counts."""
-        number, t, nis = self.sums[self.sums[:, 0] > 0].T
-        return np.column_stack([t / number, nis / number, number])
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _sum_nis(t: Array, nis: Array, counts: Flags, at: int, length: int, sums: Array) -> tuple[float, float]:
-    total = highest = 0.0
-    for k in range(len(t)):
-        if counts[k]:
-            row = (at + k) // length
-            total, highest = total + nis[k], max(highest, nis[k])
-            sums[row, 0] += 1.0
-            sums[row, 1] += t[k]
-            sums[row, 2] += nis[k]
-    return total, highest
 
 
 def thin(N: int) -> Array:
@@ -302,48 +249,66 @@ def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
 
 
 class Envelope:
-    """Smallest and largest error of the estimate and of the coast, block after block."""
+    """Smallest and largest error of estimate and coast, and the nis, of STRETCHES to twice as many stretches of rows.
+
+    All are as long; with one more than that, two and two become one.
+    """
 
     def __init__(self, d: int) -> None:
-        self.stretches, K = _Stretches(STRETCHES), 2 * STRETCHES
-        self.t = np.full((K, 2), np.nan)  # first and last
-        self.low, self.high = np.full((K, 2 * d), np.inf), np.full((K, 2 * d), -np.inf)
+        self.at, self.length, K = 0, 1, 2 * STRETCHES
+        self.low, self.high = np.full((K, 1 + 2 * d), np.inf), np.full((K, 1 + 2 * d), -np.inf)  # of t and the errors
+        self.sums = np.zeros((K, 3))  # of the updates that count: their number, sum of t, sum of nis
+        self.nis_total = self.nis_highest = 0.0
 
-    def add(self, block: Mapping[str, Array]) -> None:
-        """Take the next block, with its `reference`; an error is not known where the reference is not."""
-        where = self.stretches.next(len(block["t"]), self._merge)
-        error = errors_of(block["bias"], block["coast"], block["coast"], block["reference"])
-        _extremes(block["t"], error, *where, self.t, self.low, self.high)
-
-    def _merge(self) -> None:
-        last = np.fmax(self.t[::2, 1], self.t[1::2, 1])  # of the last pair the second may not have begun
-        self.t = np.concatenate([np.column_stack([self.t[::2, 0], last]), np.full((STRETCHES, 2), np.nan)])
-        low, high = np.minimum(self.low[::2], self.low[1::2]), np.maximum(self.high[::2], self.high[1::2])
-        none = np.full_like(low, np.inf)
-        self.low, self.high = np.concatenate([low, none]), np.concatenate([high, -none])
+    def add(self, block: Mapping[str, Array], counts: Flags) -> None:
+        """Take the next block with its `reference`, without which no error is known; `counts` says whose nis does."""
+        errors = errors_of(*(block[name] for name in ("bias", "coast", "coast", "reference")))
+        while self.at + len(counts) > len(self.sums) * self.length:
+            self.length *= 2
+            for table, merged, empty in (
+                (self.low, np.minimum, np.inf), (self.high, np.maximum, -np.inf), (self.sums, np.add, 0.0),
+            ):  # fmt: skip
+                table[:STRETCHES], table[STRETCHES:] = merged(table[::2], table[1::2]), empty
+        tables = self.low, self.high, self.sums
+        total, highest = _take(block["t"], errors, block["nis"], counts, self.at, self.length, *tables)
+        self.nis_total, self.nis_highest = self.nis_total + total, max(self.nis_highest, highest)
+        self.at += len(counts)
 
     def curves(self) -> Columns:
         """Return `t` (2 K,) in s and the errors `bias` and `coast` (2 K, d) in SI, smallest and largest in turn."""
-        K = -(-self.stretches.at // self.stretches.length)
-        (first, last), low, high = self.t[:K].T, self.low[:K], self.high[:K]
-        quarter, known = (last - first) / 4, low <= high
+        low, high = (table[: -(-self.at // self.length)] for table in (self.low, self.high))
+        quarter, known = (high[:, 0] - low[:, 0]) / 4, low <= high
         error = _in_turn(np.where(known, low, np.nan), np.where(known, high, np.nan))
-        bias, coast = np.split(error, 2, axis=1)
-        return {"t": _in_turn(first + quarter, last - quarter), "bias": bias, "coast": coast}
+        bias, coast = np.split(error[:, 1:], 2, axis=1)
+        return {"t": _in_turn(low[:, 0] + quarter, high[:, 0] - quarter), "bias": bias, "coast": coast}
+
+    def nis_curve(self) -> Array:
+        """Return mean time, mean nis and number of updates (K, 3) of the stretches in which any update counts."""
+        number, t, nis = self.sums[self.sums[:, 0] > 0].T
+        return np.column_stack([t / number, nis / number, number])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _extremes(t: Array, error: Array, at: int, length: int, times: Array, low: Array, high: Array) -> None:
+def _take(
+    t: Array, errors: Array, nis: Array, counts: Flags, at: int, length: int, low: Array, high: Array, sums: Array
+) -> tuple[float, float]:
+    """Take rows into the tables of `Envelope`; return the sum and the largest of the nis that count."""
+    total = highest = 0.0
     for k in range(len(t)):
         row = (at + k) // length
-        if row * length == at + k:
-            times[row, 0] = t[k]
-        times[row, 1] = t[k]
-        for j in range(low.shape[1]):  # NaN is neither
-            if error[k, j] < low[row, j]:
-                low[row, j] = error[k, j]
-            if error[k, j] > high[row, j]:
-                high[row, j] = error[k, j]
+        low[row, 0], high[row, 0] = min(low[row, 0], t[k]), max(high[row, 0], t[k])
+        for j in range(1, low.shape[1]):
+            error = errors[k, j - 1]  # NaN is neither
+            if error < low[row, j]:
+                low[row, j] = error
+            if error > high[row, j]:
+                high[row, j] = error
+        if counts[k]:
+            total, highest = total + nis[k], max(highest, nis[k])
+            sums[row, 0] += 1.0
+            sums[row, 1] += t[k]
+            sums[row, 2] += nis[k]
+    return total, highest
 
 
 def _in_turn(first: Array, second: Array) -> Array:

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import cache, lru_cache
 from importlib.resources import files
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,21 +30,13 @@ _THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count
 @cache
 def registry() -> pint.UnitRegistry[float]:
     """Return the unit registry of the program: pint, with the definitions of `units.txt`."""
-    pint = _pint()
+    hidden = sys.modules.setdefault("dask", None) is None  # type: ignore[arg-type]
+    import pint  # which else imports dask, to know its arrays: that takes longer than all of pint
+
+    if hidden:
+        del sys.modules["dask"]
     definitions = str(files(__package__).joinpath("units.txt"))
     return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
-
-
-@cache
-def _pint() -> ModuleType:
-    """Return pint; dask is hidden from it, which it would import to know its arrays by, longer than itself."""
-    hidden = sys.modules.setdefault("dask", None) is None  # type: ignore[arg-type]
-    try:
-        import pint
-    finally:
-        if hidden:
-            del sys.modules["dask"]
-    return pint
 
 
 def to_si(text: str, unit: str) -> float:
@@ -155,11 +146,9 @@ def unit_of_density(text: str) -> tuple[str, str]:
 def _named(unit: str) -> str:
     """Return an SI unit by its symbols: one where it has one (V), or those that a map of a triad has too (m/s^2)."""
     simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
-    return simple.get(unit) or next((n for n in PRODUCTS if si_unit_of(n) == unit), _symbols(unit))
-
-
-def _symbols(unit: str) -> str:
-    return f"{registry().Unit(unit):~C}".replace("**", "^")
+    return simple.get(unit) or next(
+        (n for n in PRODUCTS if si_unit_of(n) == unit), f"{registry().Unit(unit):~C}".replace("**", "^")
+    )
 
 
 def same_dimension(unit: str, other: str) -> bool:
@@ -194,9 +183,11 @@ def of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
 
 def _canonical(name: str, text: str) -> str:
     """Return pint's name of a unit; nothing but a single name is ever given to pint."""
-    pint = _pint()
+    known = registry()
+    import pint
+
     try:
-        return str(registry().get_name(unicodedata.normalize("NFKC", name)))
+        return str(known.get_name(unicodedata.normalize("NFKC", name)))
     except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
         part = "" if name == text else f"'{quote(text)}': "
         raise UnitError(f"{part}unknown unit '{quote(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None

@@ -9,14 +9,15 @@ from driftlab.evaluation.overview import STRETCHES, Envelope
 def rows(N, seed=0):
     rng = np.random.default_rng(seed)
     block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "reference")}
-    return {"t": np.arange(N) / 10.0, **block}
+    return {"t": np.arange(N) / 10.0, "nis": np.ones(N), **block}
 
 
 def of(block, size):
     N = len(block["t"])
     found = Envelope(2)
     for start in range(0, N, size):
-        found.add({name: values[start : start + size] for name, values in block.items()})
+        part = {name: values[start : start + size] for name, values in block.items()}
+        found.add(part, part["nis"] > 0)
     return found.curves()
 
 
