@@ -137,26 +137,26 @@ class GrowingFile:
         start = written // PIECE * PIECE
         for name, data in self._data.items():
             begun = [self._begun[name]] if name in self._begun else []
-            # row by row in memory, whatever the order of what was given
-            values = np.ascontiguousarray(np.concatenate([*begun, *(part[name] for part in parts)], dtype=data.dtype))
+            values = _one_by_one([*begun, *(part[name] for part in parts)], data.dtype)
             data.resize(end, axis=0)
             for at in range(start, end, PIECE):
                 new = at >= written  # a piece that is there in part keeps its place
                 self._put(name, at, values[at - start : min(at + PIECE, end) - start], new=new)
-            self._begun[name] = values[end // PIECE * PIECE - start :].copy()
+            left = values[end // PIECE * PIECE - start :]
+            self._begun[name] = left.copy() if values.strides[0] else left
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
         data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
         if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if name in self._settling and new and full and np.all(piece == piece[0]):
+        if name in self._settling and new and full and (piece.strides[0] == 0 or np.all(piece == piece[0])):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
                 self._packed[name] = row, packed
             data.id.write_direct_chunk(place, packed)
         else:  # as it is: rows that were safe before are written again, byte by byte the same
-            data.id.write_direct_chunk(place, piece, AS_IT_IS if name in self._settling else 0)
+            data.id.write_direct_chunk(place, np.ascontiguousarray(piece), AS_IT_IS if name in self._settling else 0)
 
     def close(self) -> None:
         """Write the rest and close the file, which then reads like any other; without a row it is removed."""
@@ -193,6 +193,15 @@ class GrowingFile:
             )  # fmt: skip
             self._data[name].attrs.update(self._column_attributes.get(name, {}))
         self._file.swmr_mode = True
+
+
+def _one_by_one(parts: list[NDArray[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return rows joined, row by row in memory; where one row stands for all of them, as one that does."""
+    parts = [part for part in parts if len(part)]
+    if not any(part.strides[0] or np.any(part[0] != parts[0][0]) for part in parts):
+        row = parts[0][0].astype(dtype)
+        return np.broadcast_to(row, (sum(map(len, parts)), *row.shape))
+    return np.ascontiguousarray(np.concatenate(parts, dtype=dtype))
 
 
 def beside(path: Path) -> Path:
