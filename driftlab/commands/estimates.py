@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
+from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.segment import TEMPERATURES, RunLog, RunSegment
 from driftlab.filtering.smoothing import Spool
@@ -154,6 +155,7 @@ class EstimatesWriter:
     more: Callable[[], dict[str, Any]] = dict
     checkpoint: dict[str, Any] | None = None  # of an earlier run
     spool: Spool | None = None
+    observed: OverviewAccumulator | None = None  # of all rows, where they were looked at as they came
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
     possible: bool = True

@@ -183,7 +183,7 @@ def run(
             raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
-        gathered = _accumulator(understood, running.model, journal).read(columns)
+        gathered = accumulator(understood, running.model, journal).read(columns)
         return RunResult(understood, running.model, journal, gathered, columns)
     with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
         estimates = EstimatesWriter(folder, understood, journal, smooth=smooth)
@@ -191,22 +191,21 @@ def run(
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
         hashed: Callable[[], None] | None = None
-        observed: OverviewAccumulator | None = None
         try:
             with closing(_segments(running, journal, progress)) as segments, aside() as do:
                 for segment in segments:
                     hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                     kept = estimates.append(segment)
                     if before is None and not smooth:  # else what the file has by its end is looked at
-                        observed = observed or _accumulator(understood, running.model, journal)
-                        do(observed.add, kept)
+                        estimates.observed = estimates.observed or accumulator(understood, running.model, journal)
+                        do(estimates.observed.add, kept)
         finally:
             estimates.close()
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
         if hashed is not None:
             hashed()
-        return finish(folder, understood, running.model, journal, Path(out), observed=observed)
+        return finish(estimates, running.model, Path(out))
 
 
 def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Generator[RunSegment]:
@@ -220,30 +219,23 @@ def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Gener
                 progress(journal.faults.since(float(segment.epochs.t[-1])), count)
 
 
-def _accumulator(config: Config, model: MeasurementModel, journal: RunLog) -> OverviewAccumulator:
+def accumulator(config: Config, model: MeasurementModel, journal: RunLog) -> OverviewAccumulator:
+    """Return the accumulator of a run's overview, and of the averages that the config's limits need."""
     first = journal.alignments[0]
     return OverviewAccumulator(model, first, averages_of(config, first))
 
 
-def finish(
-    folder: Path,
-    config: Config,
-    model: MeasurementModel,
-    journal: RunLog,
-    out: Path,
-    recorded: Path | None = None,
-    observed: OverviewAccumulator | None = None,
-) -> RunResult:
-    """Write `summary.json` and `report.html` of the estimates in the folder, which will be called `out`.
+def finish(estimates: EstimatesWriter, model: MeasurementModel, out: Path, recorded: Path | None = None) -> RunResult:
+    """Write `summary.json` and `report.html` of the estimates into their folder, which will be called `out`.
 
     `recorded` is the file in which a live run has kept what came. The estimates are read back where they were not
-    `observed` while they were made.
+    observed while they were made.
     """
-    estimates = folder / "estimates.h5"
-    note_first_row(estimates, journal.faults.first_row)
+    folder, config, journal, observed = estimates.folder, estimates.config, estimates.journal, estimates.observed
+    note_first_row(folder / "estimates.h5", journal.faults.first_row)
     if observed is None:
-        with reading(estimates) as file:
-            observed = _accumulator(config, model, journal).read(file)
+        with reading(folder / "estimates.h5") as file:
+            observed = accumulator(config, model, journal).read(file)
     result = RunResult(config, model, journal, observed, Stored(out / "estimates.h5"), recorded)
     result._write(folder)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more

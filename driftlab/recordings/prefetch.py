@@ -72,14 +72,13 @@ def _make(items: Iterable[Any], queue: Queue[tuple[bool, Any]], left: threading.
 @contextmanager
 def aside() -> Iterator[Callable[[Callable[[Item], object], Item], None]]:
     """Give a callable that has another thread do `function(item)`, after the one before, whose error it raises."""
-    under_way: list[Future[object]] = []
-
-    def do(function: Callable[[Item], object], item: Item) -> None:
-        if under_way:
-            under_way.pop().result()
-        under_way.append(thread.submit(function, item))
-
     with ThreadPoolExecutor(1) as thread:
+        under_way: Future[object] = thread.submit(int)
+
+        def do(function: Callable[[Item], object], item: Item) -> None:
+            nonlocal under_way
+            under_way.result()
+            under_way = thread.submit(function, item)
+
         yield do
-        if under_way:
-            under_way.pop().result()
+        under_way.result()
