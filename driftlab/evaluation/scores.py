@@ -247,17 +247,9 @@ class Integral:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _integrate(
-    t: Array,
-    tau: Array,
-    error: Array,
-    known: Flags,
-    start: float,
-    end: float,
-    last: Array,
-    squares: Array,
-    total: Array,
-    times: Array,
-) -> None:
+    t: Array, tau: Array, error: Array, known: Flags, start: float, end: float,
+    last: Array, squares: Array, total: Array, times: Array,
+) -> None:  # fmt: skip
     d = error.shape[1]
     for k in range(len(t)):
         if not known[k]:

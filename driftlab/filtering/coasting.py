@@ -336,14 +336,15 @@ class Prediction:
         error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
         return State(state.x + error, state.P)
 
-    def look(
-        self, done: Chunk, estimates: Estimates, step: Transition, alignment: Alignment, calibration: Array
-    ) -> BiasOutput:
-        """Return the bias over the next epochs, whose block went by `step`; `calibration` (N, d) was subtracted."""
+    def look(self, done: Chunk, estimates: Estimates, step: Transition, tilt: Array, calibration: Array) -> BiasOutput:
+        """Return the bias over the next epochs, whose block went by `step`; `calibration` (N, d) was subtracted.
+
+        `tilt` (d,) is the deviation that the vertical leaves.
+        """
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(estimates, self.block, step.C)
-        sigma = self.uncertainty.of_estimate(variance, done["tau"] * estimates.used, T, error, alignment.unsure)
+        sigma = self.uncertainty.of_estimate(variance, done["tau"] * estimates.used, T, error, tilt)
         x = self.extrapolation.look(done)
         left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
         sigma = sigma if left is None else np.hypot(sigma, left)

@@ -184,14 +184,11 @@ class Tracker:
     ) -> RunSegment:
         channel = self.model.tracked.channel
         still = self.watch.look(done, estimates)
-        output = self.prediction.look(done, estimates, step, self.alignment, calibration)
+        output = self.prediction.look(done, estimates, step, self.alignment.unsure, calibration)
         return RunSegment(
             epochs=done,
             rate=done[channel] - self.model.known(done, self.alignment),
-            bias=output.bias,
-            sigma=output.sigma,
-            coast=output.coast,
-            coast_sigma=output.coast_sigma,
+            **output._asdict(),
             calibration=calibration,
             still=still,
             estimates=estimates,
