@@ -118,14 +118,17 @@ def with_rate(
 
         steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known[0])
         # q^2 / 12, or less with noise before the rounding, that lasts for a sixth of the time of a step
-        left = np.where(steps == known[0], known[1], steps**2 / 12)
-        density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
+        if np.any(density := steps):
+            left = np.where(steps == known[0], known[1], steps**2 / 12)
+            density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
         smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
-    low = np.minimum(np.minimum.accumulate(T), memory.range[0])
-    high = np.maximum(np.maximum.accumulate(T), memory.range[1])
-    smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
+    low, high = memory.range
+    if np.min(smooth) < domain[0] or np.max(smooth) > domain[1]:
+        lows, highs = np.minimum(np.minimum.accumulate(T), low), np.maximum(np.maximum.accumulate(T), high)
+        smooth = np.clip(smooth, np.minimum(lows, domain[0]), np.maximum(highs, domain[1]))
+    measured = min(low, float(np.min(T))), max(high, float(np.max(T)))
     conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
-    return conditioned, RateMemory(numbers, (float(low[-1]), float(high[-1])), value)
+    return conditioned, RateMemory(numbers, measured, value)
 
 
 def _first(T: float) -> Array:
