@@ -191,16 +191,13 @@ def run(
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
         hashed: Callable[[], None] | None = None
-        try:
-            with closing(_segments(running, journal, progress)) as segments, aside() as do:
-                for segment in segments:
-                    hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
-                    kept = estimates.append(segment)
-                    if before is None and not smooth:  # else what the file has by its end is looked at
-                        estimates.observed = estimates.observed or accumulator(understood, running.model, journal)
-                        do(estimates.observed.add, kept)
-        finally:
-            estimates.close()
+        with closing(estimates), closing(_segments(running, journal, progress)) as segments, aside() as do:
+            for segment in segments:
+                hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
+                kept = estimates.append(segment)
+                if before is None and not smooth:  # else what the file has by its end is looked at
+                    estimates.observed = estimates.observed or accumulator(understood, running.model, journal)
+                    do(estimates.observed.add, kept)
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
         if hashed is not None:

@@ -110,25 +110,22 @@ def with_rate(
         return chunk, memory
     T = chunk["temperature"]
     memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), _first(T[0])) if memory is None else memory
-    dt, value = np.full(T.shape, chunk.dt), memory.value
+    dt, value, windows = np.full(T.shape, chunk.dt), memory.value, np.full(T.shape, estimator.memory_s)
     smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
-    windows = np.full(T.shape, estimator.memory_s)
     if isinstance(estimator, Regression):
         from fusion_core.recursions import regression_value
 
         steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known[0])
         # q^2 / 12, or less with noise before the rounding, that lasts for a sixth of the time of a step
-        if np.any(density := steps):
-            left = np.where(steps == known[0], known[1], steps**2 / 12)
-            density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
+        left = np.where(steps == known[0], known[1], steps**2 / 12)
+        density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
         smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
     low, high = memory.range
     if np.min(smooth) < domain[0] or np.max(smooth) > domain[1]:
         lows, highs = np.minimum(np.minimum.accumulate(T), low), np.maximum(np.maximum.accumulate(T), high)
         smooth = np.clip(smooth, np.minimum(lows, domain[0]), np.maximum(highs, domain[1]))
-    measured = min(low, float(np.min(T))), max(high, float(np.max(T)))
     conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
-    return conditioned, RateMemory(numbers, measured, value)
+    return conditioned, RateMemory(numbers, (min(low, float(np.min(T))), max(high, float(np.max(T)))), value)
 
 
 def _first(T: float) -> Array:
