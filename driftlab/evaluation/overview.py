@@ -109,7 +109,7 @@ class OverviewAccumulator:
     ) -> None:
         self.model, self.alignment, self.rows, d = model, alignment, rows, len(model.tracked.axes)
         self.averages, self.names = averages, NAMES if averages is None else (*NAMES, "calibration")
-        self.count = self.used = 0
+        self.count = self.used = self._pending = 0
         self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
         self._scores, self._whiteness, self._envelope = ScoreAccumulator(d), Whiteness(model.m), Envelope(d)
         self._curves, self._last = _Thinned(), Columns()
@@ -120,7 +120,8 @@ class OverviewAccumulator:
     def add(self, columns: Mapping[str, Array]) -> None:
         """Take the next rows of a run."""
         self._parts.append(columns)
-        if sum(len(part["t"]) for part in self._parts) >= self.rows:
+        self._pending += len(columns["t"])
+        if self._pending >= self.rows:
             self._gather()
 
     def read(self, columns: Mapping[str, Array]) -> OverviewAccumulator:
@@ -133,7 +134,7 @@ class OverviewAccumulator:
         """Look at the block that has come together, and at those that waited for it."""
         names = [name for name in self.names if self._parts and name in self._parts[0]]
         block = {n: np.concatenate([part[n] for part in self._parts], dtype=np.float64) for n in names}
-        self._parts.clear()
+        self._parts, self._pending = [], 0
         if block:
             self._waiting.append(block)
         while self._waiting and (not block or block["t"][-1] > self._waiting[0]["t"][-1] + WINDOW / 2):
