@@ -91,3 +91,23 @@ def test_survey_keeps_the_reference_and_few_rows_for_the_figures(finished):
     assert found.used == np.sum(whole["used"])
     used = whole["used"] & (whole["t"] > journal.alignments[0].t)
     assert np.sum(found.nis_curve[:, 1]) / len(found.nis_curve) == pytest.approx(np.mean(whole["nis"][used]), rel=0.02)
+
+
+def test_what_goes_by_in_pieces_of_any_size_gives_what_is_read_back(finished):
+    model, journal, whole, path = finished
+    gathered, at, sizes = OverviewAccumulator(model, journal.alignments[0], rows=1000), 0, (1, 16, 333, 2000)
+    while at < len(whole["t"]):
+        size = sizes[at % len(sizes)]
+        gathered.add({name: values[at : at + size] for name, values in whole.items()})
+        at += size
+    found, read = gathered.overview(), survey(path, model, journal.alignments[0], 65_536)
+    assert (found.count, found.used, found.start, found.end) == (read.count, read.used, read.start, read.end)
+    for name in ("coast", "coast_sigma"):
+        for horizon, value in getattr(read.yardsticks, name).items():
+            np.testing.assert_allclose(getattr(found.yardsticks, name)[horizon], value, rtol=1e-9)
+    for name in ("curves", "errors"):
+        for column, values in getattr(read, name).items():
+            np.testing.assert_allclose(getattr(found, name)[column], values, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found.nis_curve, read.nis_curve, rtol=1e-12)
+    np.testing.assert_allclose(found.whiteness_p, read.whiteness_p, rtol=1e-6)
+    assert found.swing == read.swing == np.ptp(whole["temperature"])
