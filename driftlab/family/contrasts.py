@@ -207,7 +207,7 @@ class UnitRows:
         white = []
         for axis, noise in enumerate(zip(self.soaked.white, self.soaked.walk, strict=True)):
             blocks = [
-                rows.whitened(np.column_stack([*same, own[:, axis]]), *noise, free=k > 0)[0]
+                rows.whitened(np.column_stack([*same, own[:, axis]]), *noise, free=k > 0)
                 for k, (rows, (own, *same)) in enumerate(short)
             ]
             white.append(np.concatenate(blocks))

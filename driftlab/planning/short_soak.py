@@ -145,7 +145,7 @@ def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) ->
     x, inside = (grid - middle) / half, (np.clip(grid, low, high) - middle) / half
     for order in ORDERS:
         V = np.polynomial.chebyshev.chebvander((rows.T - middle) / half, order)
-        X, _ = rows.whitened(np.column_stack([V, seen]), soaked.white[axis], soaked.walk[axis], free=False)
+        X = rows.whitened(np.column_stack([V, seen]), soaked.white[axis], soaked.walk[axis], free=False)
         own, rest = X[:, : order + 1], X[:, order + 1 :]
         K = np.linalg.pinv(own)
         slopes = np.polynomial.chebyshev.chebder(np.eye(order + 1), axis=0)
