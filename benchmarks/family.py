@@ -21,8 +21,9 @@ from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, s
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.posterior_map import sigma, unit_posterior
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
+from driftlab.soak.blocks import SoakRows
 
 UNITS, NEW, STEP = 200, 100, 2.5
 AXES = ("x", "y", "z")

@@ -13,72 +13,16 @@ q coefficients, d axes.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
-from driftlab.noise.local_level import whitened
+from driftlab.soak.blocks import SoakRows
 from fusion_core.budget import opened
 from fusion_core.chunk import Array
-
-
-@dataclass(frozen=True, eq=False)
-class SoakRows:
-    """Means of one recording at rest, in the order of time.
-
-    Attributes
-    ----------
-    t : (R,) array
-        Their middles, s.
-    T : (R,) array
-        Temperature as measured, degC.
-    bias : (R, d) array
-        Of the tracked sensor, SI.
-    span : (R,) array
-        How long each was measured, s.
-    channels : mapping of str to (R,) or (R, k) array
-        What else was recorded, for effects.
-    """
-
-    t: Array
-    T: Array
-    bias: Array
-    span: Array
-    channels: Mapping[str, Array]
-
-    def part(self, where: NDArray[np.bool_]) -> SoakRows:
-        """Return the rows of which `where` (R,) is true."""
-        channels = {name: values[where] for name, values in self.channels.items()}
-        return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
-
-    def within(self, low: float, high: float) -> NDArray[np.bool_]:
-        """Whether each row (R,) is at a temperature from low to high, degC."""
-        temperature = self.T
-        return (temperature >= low) & (temperature <= high)
-
-    def steps(self, *, free: bool, start: float | None = None) -> Array:
-        """Return the time (R,) that the walk to each row takes, s.
-
-        The level at `start`, by default the first row, is that of the curve; or it is `free`: nothing is known of it,
-        as of a further recording of the same unit, and the first time is infinite.
-        """
-        dt = np.diff(self.t, prepend=self.t[0] if start is None else start)
-        dt[0] = np.inf if free else dt[0]
-        return dt
-
-    def whitened(self, columns: Array, white: float, walk: float, *, free: bool, start: float | None = None) -> Array:
-        """Return columns (R, m) over the rows as normalised innovations.
-
-        `white` and `walk` are the densities of their noise, SI/sqrt(Hz) and SI/sqrt(s); the level is that of `steps`.
-        """
-        noise = np.maximum(white**2 / self.span, np.finfo(float).tiny)
-        steps = self.steps(free=free, start=start)
-        steps[1 if free else 0 :] *= walk**2
-        innovations: Array = whitened(np.ascontiguousarray(columns), noise, steps)[0]
-        return innovations
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +42,7 @@ class UnitInformation:
         Rows in all.
     white, walk : (d,) arrays
         Densities of the noise that J and h stand on, SI/sqrt(Hz) and SI/sqrt(s).
-    recordings : tuple of Rows
+    recordings : tuple of SoakRows
         The first one's level is the map's, each further one has a level of its own.
     """
 

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows
+from driftlab.family.basis import STEP, SplineBasis
+from driftlab.family.unit_information import UnitInformation
 from driftlab.noise.local_level import LevelLikelihood
+from driftlab.soak.blocks import SoakRows
 from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
 
@@ -60,6 +61,18 @@ class Densities:
     walk: Array
     walk_sigma: Array
     likely: Array
+
+
+def soaked_of(
+    unit: str, axes: tuple[str, ...], rows: tuple[SoakRows, ...], step: float = STEP
+) -> tuple[UnitInformation, Densities]:
+    """Return the information of rows on a unit under its own noise, and the densities of that.
+
+    The walk is the likely one, or the larger one that repeated sweeps need.
+    """
+    noise = densities_of(rows, step)
+    walk = walk_from_repeated_sweeps(rows, noise.white, noise.likely, step)
+    return UnitInformation.of(unit, axes, rows, noise.white, walk, step), noise
 
 
 def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from driftlab.config import Config, with_recording
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
-from driftlab.soak.blocks import SoakSummary, brief
+from driftlab.soak.blocks import SoakRows, SoakSummary, brief
 from driftlab.soak.placements import Index, Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import of_thermometer, soak_temperatures
@@ -193,6 +194,14 @@ class GatheredSoak:
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""
         return brief(self.T, self.bias, self.starts, self.interval)
+
+    def rows(self, channel: str) -> tuple[SoakRows, ...]:
+        """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
+        rows, ends = [], np.cumsum([len(window) for window in self.windows])
+        for start, stop in pairwise([*self.starts, len(self.T)]):
+            own = slice(int(np.searchsorted(ends, start, "right")), int(np.searchsorted(ends, stop, "left")) + 1)
+            rows.append(SoakRows.of_windows(self.windows[own], self.T[start:stop], self.bias[start:stop], channel))
+        return tuple(rows)
 
 
 def gather(

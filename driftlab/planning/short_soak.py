@@ -19,9 +19,10 @@ import numpy as np
 
 from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import band_of, sigma
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.search import RatedProfile
+from driftlab.soak.blocks import SoakRows
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 

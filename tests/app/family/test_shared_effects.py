@@ -15,7 +15,8 @@ from driftlab.family.basis import SplineBasis
 from driftlab.family.contrasts import UnitRows, without_noise
 from driftlab.family.shared_effect_search import Offer, between, contrasts_of, gains, mean_of, of_size
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows
 from driftlab.units import BiasUnit
 
 PLAY = effect_of("hysteresis", width=6.0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows
 
 AXES, WHITE, WALK = ("x",), np.array([2.0]), np.array([0.05])
 

@@ -6,8 +6,9 @@ import pytest
 from scipy.optimize import minimize
 
 from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import common_walk, densities_of, walk_from_repeated_sweeps
+from driftlab.soak.blocks import SoakRows
 
 STEP = 2.5
 
