@@ -36,7 +36,8 @@ LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them a
 def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
     """Return the begins (K,) of runs of n of `count` values; no run is of two recordings, which begin at `starts`.
 
-    What is over at a recording's end belongs to its last run.
+    All are of equal length, as the laws of a soak's noise have them; what is over at a recording's end belongs to its
+    last run.
     """
     parts = [np.arange(start, max(stop - n, start) + 1, n) for start, stop in pairwise([*starts, count])]
     return np.concatenate(parts).astype(np.int64)

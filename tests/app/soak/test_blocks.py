@@ -68,6 +68,8 @@ def test_white_noise_is_told_from_a_curve_and_a_walk():
 def test_a_run_is_of_one_recording_and_what_is_over_belongs_to_the_last():
     assert runs([0, 7, 9], 16, 3).tolist() == [0, 3, 7, 9, 12]
     assert runs([0], 5, 10).tolist() == [0]
+    lengths = np.diff(runs([0], 1000, 7), append=1000)
+    assert lengths.tolist() == [7] * 141 + [13]
 
 
 def test_rows_of_rows_are_the_means_of_the_samples():
