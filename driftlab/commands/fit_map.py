@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -40,9 +40,6 @@ from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
-
-if TYPE_CHECKING:
-    pass
 
 F = TypeVar("F")
 MAX_BLOCKS = 4096  # of all recordings, where kinds are compared
@@ -271,17 +268,14 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
 
     The coldest and the warmest block stand at the lowest and the highest temperature of the recording.
     """
-    n = 1
-    while len(soak.T) > n * MAX_BLOCKS:
-        n *= 2
+    n = 2 ** max(int(np.ceil(np.log2(len(soak.T) / MAX_BLOCKS))), 0)
     T, bias = [], []
     for start, stop in pairwise([*soak.starts, len(soak.T)]):
-        own = slice(start, stop)
-        cuts = runs([0], stop - start, n)
-        T.append(means(soak.T[own], cuts))
-        bias.append(means(soak.bias[own], cuts))
+        own_T, cuts = soak.T[start:stop], runs([0], stop - start, n)
+        T.append(means(own_T, cuts))
+        bias.append(means(soak.bias[start:stop], cuts))
         if len(cuts) > 1:
-            T[-1][[np.argmin(T[-1]), np.argmax(T[-1])]] = np.min(soak.T[own]), np.max(soak.T[own])
+            T[-1][[np.argmin(T[-1]), np.argmax(T[-1])]] = np.min(own_T), np.max(own_T)
     return T, bias
 
 

@@ -21,7 +21,7 @@ R rows, d axes, K columns of all effects on one axis, J placebos.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -258,7 +258,7 @@ def without_noise(T: Array) -> Array:
 def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:
     """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most."""
     starts = runs([0], len(rows.t), -(-len(rows.t) // ROWS))
-    return rows.coarsened(starts), [means(values, starts, rows.span) for values in columns]
+    return replace(rows, channels={}).coarsened(starts), [means(values, starts, rows.span) for values in columns]
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:

@@ -2,7 +2,7 @@
 
 The rows of a soak are a curve of the family's basis, a walk and white noise (`driftlab.family.unit_information`). With
 the densities s of the white noise and k of the walk, r = k^2 / s^2 is found beside the curve
-(`driftlab.noise.local_level`) on a grid in its logarithm that is made finer where it is likely. Deviations are those of
+(`driftlab.noise.local_level`) on a grid in its logarithm, of which the likelihood is smooth. Deviations are those of
 the logarithms, from the curvature of the likelihood at its maximum. d axes, q coefficients.
 
 A real unit's slow noise is more than its fast walk lets expect: it lags, it wanders where the temperature does, and
@@ -29,9 +29,7 @@ from driftlab.soak.blocks import SoakRows
 from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
 
-WIDE = np.arange(-14.0, 14.1, 2.0)  # of log (walk over the whole soak / white noise of a row), its variance
-FINE = 0.4  # step of the logarithm where it is likely
-REACH = 10.0  # of - 2 log likelihood, within which the grid is finer
+GRID = np.linspace(-18.0, 14.0, 44)  # of log (walk over the whole soak / white noise of a row), its variance
 GAIN = 2.71  # of - 2 log likelihood: a walk that gains less does not show, 95 % on one side
 RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
 MIN_FREEDOM = 8  # rows more than coefficients, for a walk
@@ -78,18 +76,10 @@ def soaked_of(
 def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     """Return the densities of the noise in rows about a curve with knots `step` K apart."""
     likelihood, unit = _likelihood(recordings, step)
-    costs, scales = likelihood.over(np.exp(WIDE) * unit)
-    near = [WIDE[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
-    fine = np.arange(min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0, FINE)
-    grid = np.concatenate([WIDE, fine])
-    order = np.argsort(grid, kind="stable")
-    order = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
-    both = zip((costs, scales), likelihood.over(np.exp(fine) * unit), strict=True)
-    costs, scales = (np.concatenate(pair)[order] for pair in both)
-    none, scale, nu = likelihood.at(0.0)
-    columns = zip(costs.T, scales.T, none, scale, strict=True)
-    of_axes = [_axis(grid[order], cost, s2, n, s2_none, nu) for cost, s2, n, s2_none in columns]
-    white, white_sigma, walk, walk_sigma, likely = np.array(of_axes).T
+    costs, scales = likelihood.over(np.exp(GRID) * unit)
+    none, s2_none, nu = likelihood.at(0.0)
+    columns = zip(costs.T, scales.T, none, s2_none, strict=True)
+    white, white_sigma, walk, walk_sigma, likely = np.array([_axis(*column, nu) for column in columns]).T
     root = np.sqrt(unit)  # from the ratio of the grid to that of the densities
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
@@ -101,14 +91,22 @@ def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> Array:
     """
     likelihoods, own = zip(*(_likelihood(recordings, step) for recordings in units), strict=True)
     shift = float(np.median(np.log(own)))
-    grid = np.arange(WIDE[0] - 4.0, WIDE[-1] + 0.1, 1.0)
-    costs = np.sum([likelihood.over(np.exp(grid + shift))[0] for likelihood in likelihoods], axis=0)
-    at = np.linspace(grid[0], grid[-1], 1801)
+    costs = np.sum([likelihood.over(np.exp(GRID + shift))[0] for likelihood in likelihoods], axis=0)
+    return np.asarray(np.sqrt([_mean(*_fine(cost)) * np.exp(shift) for cost in costs.T]))
+
+
+def _fine(cost: Array) -> tuple[Array, Array]:
+    """Return log ratios (G,) and - 2 log likelihood there, from that on the grid."""
     from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(grid, costs)(at)
-    weight = np.exp(-(curve - curve.min(axis=0)) / 2 + at[:, None] / 2)  # even in the walk, as that of a unit
-    return np.asarray(np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0)))
+    at = np.linspace(GRID[0], GRID[-1], 12801)
+    return at, CubicSpline(GRID, cost)(at)
+
+
+def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
+    """Return the mean of the walk's variance under the likelihood, even in the walk; `scale` is that of white noise."""
+    weight = np.exp(-(cost - cost.min()) / 2 + at / 2)
+    return float(np.sum(weight * scale * np.exp(at)) / np.sum(weight))
 
 
 def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
@@ -128,29 +126,21 @@ def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikel
     return LevelLikelihood([(X, *noise) for X, noise in zip(columns, noises, strict=True)], U.shape[1]), unit
 
 
-def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
+def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
     """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
     from scipy.interpolate import CubicSpline
 
-    curve, scale = CubicSpline(grid, cost), CubicSpline(grid, np.log(s2))
-    k = int(np.argmin(cost))
-    at = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 201)
-    values = curve(at)
-    best = float(at[int(np.argmin(values))])
-    least = min(float(values.min()), none)
-    fine = np.linspace(grid[0], grid[-1], 2001)
-    weight = np.exp(-(curve(fine) - least) / 2 + fine / 2)  # even in the walk's density
-    variance = np.exp(scale(fine) + fine)
-    likely = np.sqrt(float(np.sum(weight * variance) / np.sum(weight)))
+    scale, (at, curve) = CubicSpline(GRID, np.log(s2)), _fine(cost)
+    likely = np.sqrt(_mean(at, curve, np.exp(scale(at))))
+    k = int(np.argmin(curve))
     if nu < MIN_FREEDOM:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
-    if none - float(values.min()) < GAIN:
+    if none - curve[k] < GAIN:
         return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
-    bend = max(float(curve(best, 2)), 1e-3)
-    slope = float(scale(best, 1))
+    bend, slope = max(float(CubicSpline(GRID, cost)(at[k], 2)), 1e-3), float(scale(at[k], 1))
     of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
     of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
-    white, walk = np.exp(scale(best) / 2), np.exp((scale(best) + best) / 2)
+    white, walk = np.exp(scale(at[k]) / 2), np.exp((scale(at[k]) + at[k]) / 2)
     return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
 
 

@@ -24,13 +24,10 @@ from numpy.typing import NDArray
 
 from driftlab.noise.local_level import whitened
 from driftlab.soak.sweeps import Index, directions
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array
 from fusion_core.contracts import SLAB
 
 MAX_BLOCKS = 8192  # half as many, at least, once there are as many samples
-ROW = 10.0  # s, of a row with all channels
-MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
-LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
 
 
 def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
@@ -77,18 +74,6 @@ class SoakRows:
     span: Array
     channels: Mapping[str, Array] = field(default_factory=dict)
 
-    @classmethod
-    def of_windows(cls, windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> SoakRows:
-        """Return rows of ROW seconds of epochs, their temperatures T (N,) and bias (N, d), of the sensor's channel."""
-        t = np.concatenate([window.t for window in windows])
-        tau = np.concatenate([window["tau"] for window in windows])
-        length = max(ROW, float(t[-1] - t[0]) / MAX_ROWS)
-        starts = np.flatnonzero(np.diff(np.floor((t - t[0]) / length + 1e-6), prepend=-1.0))
-        names = [name for name in windows[0].channels if name not in (*LEFT_OUT, channel)]
-        channels = {name: means(np.concatenate([window[name] for window in windows]), starts, tau) for name in names}
-        t, T, bias = (means(values, starts, tau) for values in (t - tau / 2, T, bias))
-        return cls(t, T, bias, np.add.reduceat(tau, starts), channels)
-
     def part(self, where: NDArray[np.bool_]) -> SoakRows:
         """Return the rows of which `where` (R,) is true."""
         channels = {name: values[where] for name, values in self.channels.items()}
@@ -102,8 +87,7 @@ class SoakRows:
 
     def within(self, low: float, high: float) -> NDArray[np.bool_]:
         """Whether each row (R,) is at a temperature from low to high, degC."""
-        temperature = self.T
-        return (temperature >= low) & (temperature <= high)
+        return np.asarray((low <= self.T) & (high >= self.T))
 
     def steps(self, *, free: bool, start: float | None = None) -> Array:
         """Return the time (R,) that the walk to each row takes, s.
@@ -133,8 +117,9 @@ class GrowingSoak:
     def __init__(self, most: int = MAX_BLOCKS) -> None:
         self.most, self.n, self.samples = most, 1, 0
         self.ends = np.inf, -np.inf  # lowest and highest temperature, degC
-        self._sums = self._rest = np.empty((0, 0))  # (k, 3 d + 3) of rows and of samples that make no row yet:
-        self._shift = np.empty(0)  # of T, bias, squares and products, and t; (d + 2,): squares of the rest lose nothing
+        self._sums = self._rest = np.empty((0, 0))  # (k, 3 d + 3) of rows, and of samples that make no row yet: of T,
+        # bias, their squares and products, and t, less `_shift` (d + 2,): squares would lose digits to a large constant
+        self._shift = np.empty(0)
 
     def add(self, t: Array, T: Array, bias: Array) -> None:
         """Add samples at t (N,) of T (N,) and bias (N, d), later than those before."""

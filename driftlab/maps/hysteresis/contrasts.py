@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
+from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about
 MIN_CONTRASTS = 24  # with which slow noise can be told from white noise
@@ -77,18 +78,11 @@ def laws_of(blocks: SoakRows, recording: Index) -> list[Array]:
     apart = np.abs(blocks.t[:, None] - blocks.t)
     together = recording[:, None] == recording
     cascade = lasted * CASCADE ** np.arange(np.log(WALK * whole / lasted) / np.log(CASCADE))
-    flicker = np.mean([_gauss_markov(apart, lasted, tau) for tau in cascade], axis=0)
-    wandering = [*(_gauss_markov(apart, lasted, share * whole) for share in SPANS), flicker]
+    flicker = np.mean([gauss_markov(apart, lasted, tau) for tau in cascade], axis=0)
+    wandering = [*(gauss_markov(apart, lasted, share * whole) for share in SPANS), flicker]
     t = (blocks.t - np.mean(blocks.t)) / np.ptp(blocks.t)
     drift = np.outer(t, t)
     return [*(C * together + 2 * (C[0, 0] - C[0, -1]) * drift for C in wandering), drift]
-
-
-def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
-    x = span / tau
-    own = 2 * (x + np.expm1(-x)) / x**2
-    beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - span, 0.0) / tau)
-    return np.asarray(np.where(apart < span / 2, own, beside))
 
 
 @dataclass(frozen=True, eq=False)
