@@ -58,6 +58,23 @@ def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() 
     )
 
 
+@pytest.mark.parametrize("walk", [0.0, 0.02, 0.5])
+def test_the_likely_walk_is_the_mean_under_the_dense_restricted_likelihood(walk) -> None:
+    own = rows(6, R=80, walk=walk)
+    U, s, _ = np.linalg.svd(SplineBasis.covering(own.T.min(), own.T.max(), STEP).values(own.T), full_matrices=False)
+    U, y, nu = U[:, s > 1e-5 * s[0]], own.bias[:, 0], 80 - int(np.sum(s > 1e-5 * s[0]))
+    at, costs, white = np.arange(-18.0, 14.01, 0.2), [], []  # of the variances of walk and of white noise in a row
+    logs = (at - np.log(10.0 * np.ptp(own.t))) / 2  # of the densities
+    for log in logs:
+        inverse = np.linalg.inv(dense(own, 1.0, np.exp(log)))
+        A, b = U.T @ inverse @ U, U.T @ inverse @ y
+        white.append((y @ inverse @ y - b @ np.linalg.solve(A, b)) / nu)
+        costs.append(nu * np.log(white[-1]) - np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(A)[1])
+    weight = np.exp(-(np.array(costs) - np.min(costs)) / 2 + logs)  # even in the walk
+    mean = np.trapezoid(weight * np.array(white) * np.exp(2 * logs)) / np.trapezoid(weight)
+    assert densities_of([own], STEP).likely[0] == pytest.approx(np.sqrt(mean), rel=2e-3)
+
+
 def test_the_densities_of_a_family_are_within_their_deviations() -> None:
     white, walk = [], []
     for seed in range(60):

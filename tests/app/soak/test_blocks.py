@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.soak.blocks import CELLS, SoakRows, brief, means, runs
+from driftlab.soak.blocks import CELLS, GrowingSoak, SoakRows, brief, means, runs
 
 
 def made(turns, N=20_000, noise=1.0, seed=0, start=0.0):
@@ -82,3 +82,28 @@ def test_rows_of_rows_are_the_means_of_the_samples():
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-12)
     np.testing.assert_allclose(whole.bias[1], np.average(fine.bias[10:20], axis=0, weights=span[10:20]), rtol=1e-12)
     np.testing.assert_allclose(found.channels["force"], means(fine.channels["force"], once, span), rtol=1e-12)
+
+
+@pytest.mark.parametrize("N", [5, 64, 1000, 4097])
+def test_rows_of_a_soak_that_goes_on_are_means_of_all_samples_in_equal_numbers(N):
+    rng = np.random.default_rng(0)
+    T, bias = rng.normal(size=N), 5 + rng.normal(size=(N, 2))
+    growing = GrowingSoak(most=64)
+    at = 0
+    while at < N:
+        size = int(rng.integers(1, 90))
+        growing.add(np.arange(at, at + size)[: N - at] * 1.0, T[at : at + size], bias[at : at + size])
+        at += size
+    found = growing.rows(0.5)
+    assert growing.samples == N
+    assert len(found.T) <= 64
+    n = growing.n
+    np.testing.assert_array_equal(found.span, 0.5 * n)
+    whole = N // n
+    assert len(found.T) in (whole, whole + 1)
+    np.testing.assert_allclose(found.bias[:whole], bias[: whole * n].reshape(whole, n, 2).mean(axis=1), rtol=1e-12)
+    assert (found.T.min(), found.T.max()) == (T.min(), T.max())
+    # the spread about a straight line through the means is what the samples have about it in their blocks
+    slope = np.full((len(found.T), 2), 0.3)
+    left = (bias - 0.3 * T[:, None])[: whole * n].reshape(whole, n, 2)
+    np.testing.assert_allclose(growing.within(slope)[0], left.var(axis=1).mean(axis=0)[0], rtol=0.1, atol=1e-12)
