@@ -111,8 +111,10 @@ def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
 
 def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
     """Return the likelihood of the walk beside the curve, all axes at once, and the ratio that is 1 on the grids."""
-    T = np.concatenate([rows.T for rows in recordings])
-    B = SplineBasis.over(T, step).values(T)
+    knots = SplineBasis.over(np.concatenate([rows.T for rows in recordings]), step)
+    first, *others = [knots.values(rows.T) for rows in recordings]
+    # a curve that the levels of further recordings can make is theirs
+    B = np.concatenate([first, *(values - values.mean(axis=0) for values in others)])
     own, V = np.linalg.eigh(B.T @ B)
     seen = own > RANK * own[-1]
     U = B @ (V[:, seen] / np.sqrt(own[seen]))

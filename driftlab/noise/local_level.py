@@ -79,7 +79,7 @@ class LevelLikelihood:
     parts : sequence of (R, q + d), (R,) and (R,) arrays
         X and y, w and dt of each recording; w is infinite where a row was not read, dt where the level is unknown.
     q : int
-        Number of columns X, which are independent.
+        Number of columns X, which are independent of one another and of the unknown levels.
     """
 
     def __init__(self, parts: Sequence[tuple[Array, Array, Array]], q: int = 0) -> None:

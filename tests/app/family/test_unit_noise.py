@@ -1,9 +1,13 @@
 """White noise and walk about a free curve: against the dense likelihood, and against what was planted."""
 
+from dataclasses import replace
+
 import family
 import numpy as np
 import pytest
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.unit_information import UnitInformation
@@ -56,6 +60,23 @@ def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() 
     np.testing.assert_allclose(
         [found.white_sigma[0] / found.white[0], found.walk_sigma[0] / found.walk[0]], deviations, rtol=0.05
     )
+
+
+def test_a_curve_that_levels_can_make_is_theirs():
+    """The second recording shares no temperature with the first: how far apart their curves are, nobody knows."""
+    first, other = rows(4, R=120, swing=15.0), rows(5, R=120, swing=15.0, start=1e5)
+    own = [first, replace(other, T=other.T + 45)]
+    T, y = np.concatenate([part.T for part in own]), np.concatenate([part.bias[:, 0] for part in own])
+    level = np.repeat([0.0, 1.0], 120)[:, None]
+    K = null_space(np.hstack([SplineBasis.over(T, STEP).values(T), level]).T, rcond=1e-5)
+
+    def cost(logs):
+        S = K.T @ block_diag(*(dense(part, *np.exp(logs)) for part in own)) @ K
+        return -multivariate_normal.logpdf(K.T @ y, cov=(S + S.T) / 2)
+
+    found = densities_of(own, STEP)
+    best = minimize(cost, np.log([2.0, 0.02]), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9})
+    np.testing.assert_allclose([found.white[0], found.walk[0]], np.exp(best.x), rtol=3e-3)
 
 
 @pytest.mark.parametrize("walk", [0.0, 0.02, 0.5])
