@@ -244,7 +244,7 @@ BUDGET = {
     "driftlab": 579,
     "driftlab/commands": 2769,
     "driftlab/evaluation": 1256,
-    "driftlab/family": 2754,
+    "driftlab/family": 2755,
     "driftlab/filtering": 1191,
     "driftlab/identification": 2196,
     "driftlab/live": 777,
