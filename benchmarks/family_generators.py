@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.unit_information import SoakRows
+from driftlab.soak.blocks import SoakRows
 
 DEG_H = np.deg2rad(1 / 3600)  # rad/s
 SPAN = 10.0  # s of a row

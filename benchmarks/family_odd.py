@@ -30,9 +30,10 @@ from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import FALSE, Outlier, find_outliers
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
-from driftlab.family.rows import soaked_of
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.family.unit_noise import soaked_of
 from driftlab.production.unit_map import figure
+from driftlab.soak.blocks import SoakRows
 
 AXES, STEP, DRAWN = ("x", "y", "z"), 2.5, 20_000
 SAID = {

@@ -186,32 +186,31 @@ def _without(soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect])
     spread = np.concatenate([np.zeros((d, 0)), *(law.spread for law in laws)], axis=1)
     Z = columns_of([one.effect for one in coefficient], soaked, chunks_of(soaked))
     T = seen_temperatures(soaked, [effect.effect for effect in effects])
-    J, h, squares, log_det = soaked.J.copy(), soaked.h.copy(), soaked.squares.copy(), soaked.log_det.copy()
+    J, h = soaked.J.copy(), soaked.h.copy()
     bias = [rows.bias.copy() for rows in soaked.recordings]
     for axis in range(d):
-        N, log_det[axis] = _products(soaked, axis, T, [z[:, axis] for z in Z], mean[axis], spread[axis])
+        N = _products(soaked, axis, T, [z[:, axis] for z in Z], mean[axis], spread[axis])
         V = N[q + 1 :, q + 1 :] + np.eye(mean.shape[1])
         S = N[: q + 1, : q + 1] - N[: q + 1, q + 1 :] @ np.linalg.solve(V, N[q + 1 :, : q + 1])
-        J[axis], h[axis], squares[axis] = S[:q, :q], S[:q, q], S[q, q]
-        log_det[axis] += float(np.linalg.slogdet(V)[1])
+        J[axis], h[axis] = S[:q, :q], S[:q, q]
         curve = np.linalg.lstsq(J[axis], h[axis], rcond=1e-10)[0]
         beyond = np.linalg.solve(V, N[q + 1 :, q] - N[q + 1 :, :q] @ curve)
         for one, z in zip(bias, Z, strict=True):
             one[:, axis] -= z[:, axis] @ (mean[axis] + spread[axis] * beyond)
     rows = tuple(replace(one, T=t, bias=y) for one, t, y in zip(soaked.recordings, T, bias, strict=True))
-    return replace(soaked, J=J, h=h, squares=squares, log_det=log_det, recordings=rows)
+    return replace(soaked, J=J, h=h, recordings=rows)
 
 
 def _products(
     soaked: UnitInformation, axis: int, T: Sequence[Array], Z: Sequence[Array], mean: Array, spread: Array
-) -> tuple[Array, float]:
-    """Return the products of splines, bias less effects at their means, and effects a spread each; and log det S."""
-    total, log_det = np.zeros(()), 0.0
+) -> Array:
+    """Return the products of splines, bias less effects at their means, and effects a spread each."""
+    total = np.zeros(())
     for k, (rows, t, z) in enumerate(zip(soaked.recordings, T, Z, strict=True)):
         columns = np.column_stack([soaked.knots.values(t), rows.bias[:, axis] - z @ mean, z * spread])
-        X, own = rows.whitened(columns, soaked.white[axis], soaked.walk[axis], free=k > 0)
-        total, log_det = total + X.T @ X, log_det + own
-    return total, log_det
+        X = rows.whitened(columns, soaked.white[axis], soaked.walk[axis], free=k > 0)
+        total = total + X.T @ X
+    return total
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
+from driftlab.soak.blocks import means
 from driftlab.soak.sweeps import one_way, ways
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
@@ -69,9 +70,7 @@ class Record:
 
     def rows(self, values: Array) -> Array:
         """Return the means (n, ...) over rows of values (N, ...)."""
-        sizes = np.diff(np.append(self.starts, len(self.chunk)))
-        total = np.add.reduceat(values, self.starts, axis=0)
-        return np.asarray(total / sizes.reshape(-1, *[1] * (values.ndim - 1)))
+        return means(values, self.starts)
 
     @cached_property
     def t(self) -> Array:

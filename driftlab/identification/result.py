@@ -25,6 +25,7 @@ from driftlab.identification.records import Evidence, Progress, missing_excitati
 from driftlab.identification.search import search
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.noise.local_level import falling
+from driftlab.soak.blocks import means, runs
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
@@ -199,10 +200,7 @@ def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
 
 def _means(values: Array) -> Array:
     """Return values (N, d) as at most `MAX_MEANS` means."""
-    length = max(1, -(-len(values) // MAX_MEANS))
-    starts = np.arange(0, len(values), length)
-    sizes = np.diff(np.append(starts, len(values)))
-    return np.asarray(np.add.reduceat(values, starts, axis=0) / sizes[:, None]) if len(values) else values
+    return means(values, runs([0], len(values), -(-len(values) // MAX_MEANS))) if len(values) else values
 
 
 def _variance(e: Array, s: Array) -> float:

@@ -177,7 +177,7 @@ class _MemoryTest:
         total = self.evidence.total
         seen = total > SEEN
         unseen = self._larger()
-        reach = np.ptp(self.contrasts.blocks.means(self.soak.bias), axis=0)
+        reach = np.ptp(self.contrasts.blocks.bias, axis=0)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         sized = self if total <= HINT else self._following()
         noise = np.argmax(self.evidence.noises, axis=0)

@@ -130,7 +130,7 @@ def _recordings(soak: SoakSummary, *, backward: bool = False) -> list[Chunk]:
     chunks = []
     for number in np.unique(soak.recording):
         own = soak.recording == number
-        t, T = soak.t[own] * soak.interval, soak.T[own][::step]
+        t, T = soak.t[own], soak.T[own][::step]
         chunks.append(Chunk(t, {SUBJECT: T, "residual": np.zeros((len(T), 1))}))
     return chunks
 

@@ -15,7 +15,8 @@ from driftlab.errors import ConfigError
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 CONFIG = Path(example.__file__).with_name("family.yaml").read_text()
