@@ -72,7 +72,7 @@ class Config(Settings):
 
     @property
     def name(self) -> str:
-        """What its file is called; empty where it was made otherwise."""
+        """Name of its file; empty where it was made otherwise."""
         return self._name
 
     @property
@@ -82,7 +82,7 @@ class Config(Settings):
 
     @property
     def recording(self) -> str:
-        """What its recording is called; empty where it has none."""
+        """Name of its recording; empty where it has none."""
         return "" if self.source is None else self.source.name
 
     def as_yaml(self) -> str:
@@ -111,7 +111,7 @@ class Config(Settings):
 
     @property
     def site(self) -> Site:
-        """Where the sensors are."""
+        """Site of the sensors."""
         return Site(self.latitude, self.heading)
 
     def maps(self) -> list[ThermalMap]:
@@ -256,7 +256,7 @@ Bias = Annotated[float, Unit("bias", positive=True, example="5 deg/h")]
 
 
 class Limits(Settings):
-    """What the worst axis of the tracked sensor may have at most."""
+    """Upper limits of acceptance for the worst axis of the tracked sensor."""
 
     bias_instability: Bias | None = None
     """Floor of the Allan deviation, the coefficient B of IEEE Std 952."""

@@ -26,7 +26,7 @@ class BiasUnit:
 
     @cached_property
     def factor(self) -> float:
-        """What a bias in SI is multiplied by to be shown."""
+        """Factor from a bias in SI to the shown unit."""
         return 1.0 / float(convert(1.0, self.shown, self.si))
 
     @property
@@ -62,7 +62,7 @@ class BiasUnit:
 
     @property
     def note(self) -> dict[str, str]:
-        """What stands in JSON beside names that say no unit."""
+        """Note in JSON beside names that say no unit."""
         return {} if self.si == "rad/s" else {"unit": self.si}
 
 
@@ -85,7 +85,7 @@ def tracked_unit(model: MeasurementModel | None) -> BiasUnit:
 
 
 def axis_name(channel: str, axis: str) -> str:
-    """Return what an axis is called in a sentence: `gyro x`, or as the channel where it has no name of its own."""
+    """Return the name of an axis in a sentence: `gyro x`, or the channel where the axis has none of its own."""
     return channel if axis == axis_of(channel) else f"{channel} {axis}"
 
 

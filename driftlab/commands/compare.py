@@ -40,7 +40,7 @@ class CompareResult(Result):
         return self.found[name]
 
     def lines(self) -> list[str]:
-        """Return who coasts best, and the notes on the runs, a sentence each."""
+        """Return the ranking by coast, and the notes on the runs, a sentence each."""
         limits = [f"{name}: {line}" for name, line in comparison.limit_lines(self.found).items()]
         return [self.summary["verdict"], *limits, *comparison.notes(self.found)]
 

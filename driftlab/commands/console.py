@@ -167,7 +167,7 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 @cache
 def note_compiling() -> None:
-    """Announce once in a process, on standard error, that loops are compiled: for an installation, or another processor."""
+    """Announce once in a process, on standard error, that loops are compiled for an installation or a processor."""
     from numba.core import event
 
     console = terminal(stderr=True)

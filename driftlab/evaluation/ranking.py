@@ -136,7 +136,7 @@ def _sigma(ranked: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
 
 
 def _agree(ranked: Ranking) -> str:
-    """Return whether the axes rank the best as their rms does, and whether it is as good as its sigma."""
+    """Return the remarks on axes that rank the best otherwise than their rms, and on its sigma."""
     first, rival = list(ranked.errors)[:2]
     parts, axes = [], ranked.axes
     if axes is not None:
@@ -159,7 +159,7 @@ def _disagree(ranked: Ranking) -> str:
 
 
 def _shorter(runs: Mapping[str, Scores], ranked: Ranking, span: float) -> str:
-    """Return whether ten minutes give the same ranking, where they are not the whole."""
+    """Return the ranking over ten minutes beside that over the whole; empty where they are the whole."""
     short = ranking(runs, [OFTEN]) if ranked.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
     if short is None:
         return ""

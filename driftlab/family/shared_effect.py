@@ -94,7 +94,7 @@ class LotEffects:
     differs: float = 1.0
 
     def has(self, lot: str) -> bool:
-        """Whether the units of a lot have the effect."""
+        """Return True if the units of a lot have the effect."""
         return self.others is None or any(one.lot == lot and one.has for one in self.lots)
 
     def law_of(self, lot: str) -> EffectDistribution:

@@ -62,7 +62,7 @@ class SoakRows:
         return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
 
     def within(self, low: float, high: float) -> NDArray[np.bool_]:
-        """Whether each row (R,) is at a temperature from low to high, degC."""
+        """Return True where a row (R,) is at a temperature from low to high, degC."""
         temperature = self.T
         return (temperature >= low) & (temperature <= high)
 

@@ -61,17 +61,17 @@ class Identification:
 
     @property
     def anything(self) -> bool:
-        """Whether anything was added to the declared model."""
+        """True if anything was added to the declared model."""
         return self.search.model != self.search.declared
 
     @property
     def refuted(self) -> bool:
-        """Whether the holdout is predicted worse beyond chance: then the declared config stays."""
+        """True if the holdout is predicted worse beyond chance: then the declared config stays."""
         return self.verdict.word == "refuted"
 
     @property
     def worse(self) -> bool:
-        """Whether the holdout is predicted worse with the effects, by chance or beyond it."""
+        """True if the holdout is predicted worse with the effects, by chance or beyond it."""
         return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
 
 
@@ -147,7 +147,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ErrorChange:
-    """How the error of the prediction changes over all holdout recordings: its rms before and after, SI.
+    """Change of the prediction error over all holdout recordings: its rms before and after, SI.
 
     `sigma` is by how many deviations of chance the sum of its squares grows.
     """
@@ -158,7 +158,7 @@ class ErrorChange:
 
     @property
     def worse(self) -> bool:
-        """Whether it grows beyond chance."""
+        """True if it grows beyond chance."""
         return self.after > self.before and self.sigma > SURE
 
 

@@ -219,7 +219,7 @@ def _clock(runs: Runs) -> Clock:
 
 
 def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
-    """Return where the unit moved, and where the filter of a config refused one that stood still.
+    """Return the spans in which the unit moved, or a config's filter refused one that stood still.
 
     Motion is told from the sensors alone: it is shown once where all configs have the same.
     """

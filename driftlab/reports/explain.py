@@ -202,7 +202,7 @@ def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
 
 
 def _shades(summary: dict[str, Any], clock: Clock) -> tuple[Shade, ...]:
-    """Return where the unit moved, and where the filter refused what it measured with the new config."""
+    """Return the spans in which the unit moved, or the filter of the new config refused measurements."""
     dt = summary.get("updates", {}).get("interval_s", 0.0)
     return (
         *charts.span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),

@@ -91,7 +91,7 @@ def _target(plan: SearchResult) -> list[str]:
 
 
 def _limits(plan: SearchResult) -> list[str]:
-    """Return where the kind of map, and not the soak, is what limits."""
+    """Return the temperatures at which the kind of map, and not the soak, limits the sigma."""
     best, unit = plan.chosen, plan.subject.unit
     if plan.subject.shape is None or best.alone > NOTEWORTHY * best.score:
         return []

@@ -303,7 +303,7 @@ WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command
 
 
 def matches(name: str, patterns: Collection[str]) -> bool:
-    """Whether a name is one of the patterns."""
+    """Return True if a name is one of the patterns."""
     return any(fnmatch(name, pattern) for pattern in patterns)
 
 
@@ -318,7 +318,7 @@ def sign(folder: Path, first: str) -> None:
 
 
 def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
-    """Return which files of a folder of results driftlab did not write, or not as they are; `first` has its mark."""
+    """Return the files of a folder of results that driftlab did not write as they are; `first` has its mark."""
     content = _document(folder / first)
     known = content.pop("written", None)
 
@@ -341,7 +341,7 @@ def _digest_of(content: dict[str, Any]) -> str:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether driftlab wrote a file, by what it holds: each kind of file has its mark at a place of its own."""
+    """Return True if driftlab wrote a file, by what it holds: each kind of file has its mark at a place of its own."""
     if path.is_symlink() or not path.is_file():
         return False
     try:
@@ -387,7 +387,7 @@ def remove(path: Path) -> None:
 
 
 def cannot_be_renamed(folder: Path) -> bool:
-    """Whether a folder is where a file system (or part of one) is mounted, or the working directory."""
+    """Return True if a folder is where a file system (or part of one) is mounted, or the working directory."""
     if os.path.ismount(folder) or folder == Path.cwd():
         return True
     try:

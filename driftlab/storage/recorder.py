@@ -265,7 +265,7 @@ def _seal(path: Path) -> None:
 
 
 def _as_written(path: Path) -> bool:
-    """Whether a file has the SHA-256 that it says."""
+    """Return True if a file has the SHA-256 that it says."""
     try:
         _, said, found = _digests(path)
     except (OSError, UnreadableFile):
@@ -274,7 +274,7 @@ def _as_written(path: Path) -> bool:
 
 
 def _digests(path: Path) -> tuple[int, bytes, bytes]:
-    """Return where a file says its SHA-256, what it says, and the one that it has with zeros in that place."""
+    """Return the place of a file's SHA-256, its value there, and that of the file with zeros in that place."""
     with path.open("rb") as file:
         first = file.read(HEAD)
         place = SEAL.search(first)
@@ -309,7 +309,7 @@ class Hdf5Writer:
 
     @staticmethod
     def ours(path: Path) -> bool:
-        """Whether the file was written here."""
+        """Return True if the file was written here."""
         try:
             with reading(path) as file:
                 return _made_by(SIMULATED_MARK, path, file)
@@ -332,7 +332,7 @@ class CsvWriter:
 
     @staticmethod
     def ours(path: Path) -> bool:
-        """Whether the file was written here."""
+        """Return True if the file was written here."""
         try:
             with path.open("rb") as file:
                 return file.read(len(SIMULATED_MARK) + 2) == f"# {SIMULATED_MARK}".encode()

@@ -231,7 +231,7 @@ def kinds_of(first: bytes) -> list[str]:
 
 
 def recognised(first: bytes) -> bool:
-    """Whether the format of a file that begins so is known."""
+    """Return True if the format of a file that begins so is known."""
     return any(map(first.startswith, FORMATS)) or bool(kinds_of(first))
 
 

@@ -76,7 +76,7 @@ class MeasurementModel(Plugin):
 
     @abstractmethod
     def still(self, window: Chunk) -> bool:
-        """Whether the sensors are at their known input over the epochs of a window, all of it."""
+        """Return True if the sensors are at their known input over the epochs of a window, all of it."""
 
     @abstractmethod
     def aligned(self, window: Chunk, site: Site) -> Alignment:

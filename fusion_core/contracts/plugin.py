@@ -79,7 +79,7 @@ def origin_of(cls: type) -> Origin | None:
 
 
 def built_in(plugin: Any) -> bool:
-    """Whether a plugin's class came with driftlab."""
+    """Return True if a plugin's class came with driftlab."""
     origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
     return origin is not None and origin.distribution == HOME
 

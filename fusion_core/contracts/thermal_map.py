@@ -123,7 +123,7 @@ class ThermalMap(Plugin):
 
     @property
     def has_map(self) -> bool:
-        """Whether there is a map to load: in memory, or in a file that is named."""
+        """True if there is a map to load: in memory, or in a file that is named."""
         return self._held is not None or self.path is not None
 
     def load(self) -> FittedMap:

@@ -46,7 +46,7 @@ class Checksum(Settings):
     byte_order: Literal["big", "little"] | None = None
     """Byte order of the checksum; that of the frame where nothing is said."""
     complement: bool = False
-    """Whether what is sent is the two's complement, so that all bytes add up to zero."""
+    """True if what is sent is the two's complement, so that all bytes add up to zero."""
 
     @model_validator(mode="after")
     def _known(self) -> Self:

@@ -182,7 +182,7 @@ class Held(contracts.MeasurementModel):
         return quantities.along_axes(0.0 if self.reference is None else self.reference, len(self.tracked.axes))
 
     def still(self, window: Chunk) -> bool:
-        """Whether nothing moves: always."""
+        """Return True: nothing ever moves."""
         return True
 
     def aligned(self, window: Chunk, site: contracts.Site) -> contracts.Alignment:

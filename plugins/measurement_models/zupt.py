@@ -217,7 +217,7 @@ class Zupt(contracts.MeasurementModel):
         return self._motion.white(chunk)
 
     def still(self, window: Chunk) -> bool:
-        """Whether no epoch stands out, and the scatter is not far beyond the declared noise."""
+        """Return True if no epoch stands out, and the scatter is not far beyond the declared noise."""
         return at_rest(window, self._watched)
 
     def check(self, window: Chunk, site: contracts.Site) -> None:

@@ -246,7 +246,7 @@ class CsvLines(Table):
         return row
 
     def _torn(self, line: str, at: dict[str, int], *, closed: bool) -> bool:
-        """Whether the last line of the file was not written to its end."""
+        """Return True if the last line of the file was not written to its end."""
         fields, n = self._fields(line), len(self.columns)
         if len(fields) < n or closed:
             return len(fields) < n

@@ -98,11 +98,11 @@ class _Members(io.RawIOBase):
         self.engine, self.left, self.at, self.inside = zlib.decompressobj(WITH_HEADER), b"", 0, False
 
     def readable(self) -> bool:
-        """Whether it can be read."""
+        """Return True if it can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Whether `seek` is possible, at the cost of unpacking what lies before."""
+        """Return True if `seek` is possible, at the cost of unpacking what lies before."""
         return True
 
     def tell(self) -> int:

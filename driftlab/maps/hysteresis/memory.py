@@ -90,7 +90,7 @@ class MemoryVerdict:
 
     @property
     def probability(self) -> float:
-        """How probable a memory is, where as much spoke for one beforehand as against; 0 where it is unknown."""
+        """Posterior probability of a memory, from equal prior odds; 0 where it is unknown."""
         return float(1 / (1 + np.exp(-np.clip(self.evidence, -500, 500)))) if np.isfinite(self.evidence) else 0.0
 
     @property
@@ -207,7 +207,7 @@ class _MemoryTest:
 
     @property
     def _divided(self) -> bool:
-        """Whether each recording goes one way only."""
+        """True if each recording goes one way only."""
         ways, recordings = self.soak.way, self.soak.recording
         return all(len(np.unique(ways[(recordings == k) & (ways != 0)])) < 2 for k in np.unique(recordings))
 

@@ -71,7 +71,7 @@ class Program:
 
     @property
     def remembers(self) -> bool:
-        """Whether there is anything but tables of the temperature."""
+        """True if there is anything but tables of the temperature."""
         return bool(self.signals) or any(table.of != TEMPERATURE for table in self.tables)
 
     def limits(self, reading: Reading) -> tuple[np.float32, np.float32, np.float32]:

@@ -52,7 +52,7 @@ class ChamberSoak(_Profile):
     ramp: Annotated[float, Rate, default("2 K/min")]
     """How fast it goes from one to the next."""
     down: bool = False
-    """Whether it comes back by the same steps."""
+    """True if it comes back by the same steps."""
 
     def plateaus(self) -> Array:
         """Return their temperatures (M,) in degC, in order."""
