@@ -165,7 +165,7 @@ def main():
                 work += [(case, one.effect, one.found_from * case.times) for case in cases]
     with ProcessPoolExecutor(given.jobs) as pool:
         found = list(pool.map(asked, work))
-    print("| profile | effect | found from [deg/h] | found at 2 x | another named | at half | plan: not told from |")
+    print("| profile | effect | found from [deg/h] | found at 2 x | another named | at half | plan: confused with |")
     print("|---|---|---|---|---|---|---|")
     for (profile, kind), one in said.items():
         own = {t: [a for c, a in found if (c.profile, c.kind, c.times) == (profile, kind, t)] for t in (2.0, 0.5)}

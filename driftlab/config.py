@@ -64,11 +64,11 @@ class Config(Settings):
     """Heading of the x axis, from north, clockwise."""
     # one made in memory is none of the union
     source: Annotated[Source, Installed(), SerializeAsAny()] | None = None
-    """How the recording is read."""
+    """Source that reads the recording."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_default_kind)] = None
     """The filter: its sensors, and how their biases move."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
-    """What the unit may have at most; the pages say whether it passes."""
+    """Upper limits of acceptance; the pages say whether the unit passes."""
 
     @property
     def name(self) -> str:

@@ -321,7 +321,7 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 
 def show(result: PlanResult, given: Mapping[str, Any]) -> None:
-    """Print the plan; of effects that were named, which are told apart."""
+    """Print the plan; of effects that were named, which are distinguished."""
     console = terminal()
     console.print(result.headline, soft_wrap=True)
     console.print(result.table())

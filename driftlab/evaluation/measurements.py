@@ -88,7 +88,7 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
         return Measured(none, axes, missing=text)
     size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
     if memory["answer"] == "undecided":
-        why = memory["why"] or "it cannot be told on this soak"
+        why = memory["why"] or "it is not known from this soak"
         looked_for = memory.get("log_evidence") is not None
         return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
     if memory["answer"] == "none":
@@ -132,7 +132,7 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     """Return the coast of a run: the rms of its error over 10 minutes after an alignment, in the mean over the run.
 
     `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into coasts of 10
-    minutes, each as if aligned right before it (`yardsticks.coasts`). What so many of them have in the mean is told by
+    minutes, each as if aligned right before it (`yardsticks.coasts`). The mean of so many is computed by
     `fusion_core.wandering`, of the error e of the prediction over the whole run: white noise w in each cell of it,
     and what wanders by the law W::
 

@@ -97,7 +97,7 @@ def verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
     """
     ranked = ranking(runs)
     if ranked is None:
-        return "Which config coasts best is not known: too little of the recording is at rest after the alignment."
+        return "The config that coasts best is not known: too little of the recording is at rest after the alignment."
     text = _single(ranked, unit) if len(runs) == 1 else _several(ranked, unit)
     text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
     return text + _shorter(runs, ranked, span)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from fusion_core.contracts import ThermalBias
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.evaluation.overview import Overview
-    from fusion_core.chunk import Array
     from fusion_core.contracts import Alignment, FittedMap
 
 
@@ -37,11 +35,7 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     if fitted is None:
         return Averages(alignment.dt, sensor.axes)
     clamped = replace(fitted, outside="clamp")  # the run has refused already what is to be refused
-
-    def explained(block: Mapping[str, Array]) -> Array:
-        return clamped.bias(block["temperature"])
-
-    return Averages(alignment.dt, sensor.axes, explained)
+    return Averages(alignment.dt, sensor.axes, lambda block: clamped.bias(block["temperature"]))
 
 
 def check_run_limits(

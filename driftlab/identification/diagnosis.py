@@ -1,4 +1,4 @@
-"""Diagnosis of a search: effects with their evidence, explanations that cannot be told apart, and the verdict.
+"""Diagnosis of a search: effects with their evidence, explanations that cannot be distinguished, and the verdict.
 
 The residual when nothing is added any more, and whether it is noise.
 
@@ -37,7 +37,7 @@ PROMISING = 0.8  # left-out ratio of a candidate that another recording may well
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect of the model: its trial, its place in the model, its final form, and what cannot be told from it.
+    """An effect of the model: its trial, its place in the model, its final form, and its rivals.
 
     `rivals` are of other physics, the best of each name, `alike` are other names of the same.
     """

@@ -293,8 +293,8 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
         r = _correlation(np.concatenate(T), np.concatenate([chunk[name] for chunk in chunks]))
         if abs(r) > TOGETHER:
             yield (
-                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): what one does cannot "
-                "be told from what the other does; move one of them by itself"
+                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): their "
+                "effects cannot be distinguished; move one of them by itself"
             )
 
 

@@ -190,10 +190,10 @@ def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
     unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
     figures = f"{change.before * unit.factor:.3g} -> {change.after * unit.factor:.3g} {unit.shown}"
     if not change.worse:
-        return f"{names}: predicted worse with what was found ({figures}), though by no more than chance may do"
+        return f"{names}: predicted worse with the identified effects ({figures}), but not beyond chance"
     return (
-        f"{names}: predicted worse with what was found than without ({figures}; {change.sigma:.1f} sigma): "
-        "explained.yaml is the declared config, and candidate.yaml has what was found"
+        f"{names}: predicted worse with the identified effects than without ({figures}; {change.sigma:.1f} "
+        "sigma): explained.yaml is the declared config, and candidate.yaml has the effects"
     )
 
 
@@ -370,7 +370,7 @@ def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
     if finding.alike:
         lines.append(f"{name}: here the same as {', '.join(finding.alike)}")
     if finding.names:
-        lines.append(f"{name}: cannot be told from {', '.join(finding.names)} on these recordings")
+        lines.append(f"{name}: cannot be distinguished from {', '.join(finding.names)} on these recordings")
     return lines
 
 

@@ -34,7 +34,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
-TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be told apart
+TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be distinguished
 ALIKE = 0.2  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
 OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters, for the smallest size
 REALISATIONS = 7  # of the noise

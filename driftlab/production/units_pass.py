@@ -22,7 +22,7 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
-from driftlab.evaluation.limits import worst
+from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.record import UnitRecord
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
@@ -311,6 +311,11 @@ class FleetStatus:
     def limits(self) -> dict[str, int]:
         """Units by the verdict on the limits of the config; empty where it has none."""
         return dict(Counter(verdict for record in self.done if (verdict := worst(record.limits)) is not None))
+
+    @property
+    def acceptance(self) -> str:
+        """The units by verdict, and the limits that decide; empty where the config has none."""
+        return verdict_of_units(record.limits for record in self.done)
 
     @property
     def beside(self) -> int:

@@ -37,11 +37,11 @@ OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unkno
            "refuted": "fail"}  # fmt: skip
 WORSE = "But the error on the test recording grows, though by no more than chance may do: record another before use."
 MEANING = {
-    "explained": "What the declared model lacks has been found and added.",
+    "explained": "Effects that the declared model lacks are added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
     "unexplained": "Something significant is left that no installed effect explains.",
-    "refuted": "What was found predicts the test recording worse than the declared model: that stays as it is, "
-    "and candidate.yaml has what was found.",
+    "refuted": "The identified effects predict the test recording worse than the declared model: that stays as it "
+    "is, and candidate.yaml has them.",
     "ambiguous": "These recordings cannot tell some explanations apart.",
 }
 

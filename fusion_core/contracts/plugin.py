@@ -44,7 +44,7 @@ class Plugin(Settings, ABC):
     contract: ClassVar[int] = 1  # version of the family's contract that the class was written for
 
     kind: str
-    """Which plugin of the family it is."""
+    """Name of the plugin in its family."""
 
     @classmethod
     def examples(cls) -> Iterable[Self]:

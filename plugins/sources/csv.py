@@ -48,7 +48,7 @@ class Csv(FileSource):
 
     kind: Literal["csv"] = "csv"
     separator: Literal[",", ";", "\t"] = ","
-    """What stands between the cells of a line."""
+    """Separator of the cells of a line."""
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:

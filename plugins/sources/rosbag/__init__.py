@@ -53,7 +53,7 @@ class Rosbag(FileSource):
 
     kind: Literal["rosbag"] = "rosbag"
     stamp: Literal["header", "log"] = "header"
-    """Whose time: of the stamps in the messages' headers, or of when they were recorded."""
+    """Clock: the stamps in the messages' headers, or the times of recording."""
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:

@@ -96,7 +96,7 @@ def test_a_horizon_that_one_run_has_no_score_for_decides_nothing():
     assert found is not None
     assert found.horizon == "5 min"
     nothing = replace(a, coast=dict.fromkeys(HORIZONS, none))
-    assert of({"a": nothing, "b": b}).startswith("Which config coasts best is not known")
+    assert of({"a": nothing, "b": b}).startswith("The config that coasts best is not known")
 
 
 def test_one_axis_has_no_axes_to_agree():
