@@ -370,6 +370,11 @@ def test_every_module_is_in_the_glossary():
     assert written.endswith(script("make_names").lines()), "run python docs/reference/make_names.py"
 
 
+def test_the_python_api_is_that_of_the_source():
+    written = (ROOT / "docs" / "reference" / "python_api.md").read_text()
+    assert written.endswith(script("make_python_api").lines()), "run python docs/reference/make_python_api.py"
+
+
 def test_what_moved_is_where_the_page_says():
     moved = script("make_moved")
     assert (ROOT / "docs" / "reference" / "moved.md").read_text() == moved.text(), "run docs/reference/make_moved.py"

@@ -123,7 +123,7 @@ def explain(
     calibration : as `data` of `run`, or a list of them
         The soak; may be repeated.
         All recordings are at rest. What is in memory is distinguished by the hash of its samples; parts that overlap
-        are not.
+        are not recognised.
     train : as `calibration`
         To find effects on; may be repeated.
     holdout : as `calibration`

@@ -1,4 +1,4 @@
-"""The chamber profile that tells most, before anything is recorded or after it: `driftlab plan`."""
+"""The chamber profile of the smallest map uncertainty, before anything is recorded or after it: `driftlab plan`."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def plan(
     out: Place | None = None,
     progress: Progress | None = None,
 ) -> PlanResult:
-    """Find the chamber profile that tells most, or the shortest.
+    """Find the chamber profile of the smallest map uncertainty, or the shortest.
 
     Parameters
     ----------
@@ -156,9 +156,9 @@ def plan(
     kind : str, optional
         Kind of map, instead of the config's.
     effects : sequence of str
-        Effects that the profile is to tell apart.
-        As `("hysteresis", "thermal_lag")`, in place of all that are installed; the profile is then the one that tells
-        them best among those whose sigma is nearly the best.
+        Effects that the profile is to distinguish.
+        As `("hysteresis", "thermal_lag")`, in place of all that are installed; the profile is then the one that
+        distinguishes them best among those whose sigma is nearly the best.
     channel : as that of `run`
     after : as `data` of `run`, or a list of them, optional
         What was recorded already; may be repeated.

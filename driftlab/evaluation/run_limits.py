@@ -24,7 +24,10 @@ def map_of(config: Config) -> FittedMap | None:
 
 
 def averages_of(config: Config, alignment: Alignment) -> Averages | None:
-    """Return the averages that the limits of a config need of a run; None where none of them does."""
+    """Return the averages that the limits of a config need of a run; None where none of them does.
+
+    They are of the calibrated rate, or of the rate less the map's bias.
+    """
     limits = config.limits
     if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
         return None
@@ -41,7 +44,11 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
 def check_run_limits(
     config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
 ) -> list[LimitResult]:
-    """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
+    """Judge a run by the limits of its config.
+
+    The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
+    survey has filled; residual, swing and hysteresis are of the map.
+    """
     if config.limits is None or config.filter is None:
         return []
     align = config.filter.align
