@@ -239,7 +239,7 @@ LONGEST = 64  # characters of a serial number
 
 
 def _serial(value: Any) -> Any:
-    """Return a serial number as text; of a number with a point nobody knows any more how it was written."""
+    """Return a serial number as text; a number with a point has lost its spelling."""
     if isinstance(value, float):
         raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
     if isinstance(value, int) and not isinstance(value, bool):

@@ -80,7 +80,7 @@ def unit_of(sensor: Sensor) -> BiasUnit:
 
 
 def tracked_unit(model: MeasurementModel | None) -> BiasUnit:
-    """Return the unit of the bias that a config's product is about; that of a gyro where nothing is said."""
+    """Return the unit of the bias that a config's product is about; that of a gyro by default."""
     return RATE if model is None else unit_of(model.tracked)
 
 
@@ -92,7 +92,7 @@ def axis_name(channel: str, axis: str) -> str:
 def number(value: float, *, zeros: bool = False, missing: str = "") -> str:
     """Return a value with three digits, from 1000 on without decimals.
 
-    `zeros` keeps those at its end; `missing` is said of what is not finite.
+    `zeros` keeps those at its end; `missing` stands for values that are not finite.
     """
     if missing and not math.isfinite(value):
         return missing

@@ -95,7 +95,7 @@ class PlanResult(Result):
         self.summary = plain(presentation.document)
 
     def lines(self) -> list[str]:
-        """Return why this profile, what is known so far, and on what the plan stands, a sentence each."""
+        """Return the reasons for this profile, the knowledge so far, and the basis of the plan, a sentence each."""
         return self._presentation.lines
 
     def table(self) -> Table:

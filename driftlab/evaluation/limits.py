@@ -76,7 +76,7 @@ class Measured:
     otherwise : str
         What would decide where time does not.
     beside : str
-        What is said beside the verdict where no limit is set for it.
+        Remark beside the verdict where no limit is set for it.
     """
 
     values: Array
@@ -114,7 +114,7 @@ class LimitResult:
     more : float
         Time that would, beside what was measured, s; NaN where none would, or that is not known.
     beside : str
-        What is said beside the verdict on all limits, since none is set for it; the first row has it.
+        Remark beside the verdict on all limits, since none is set for it; the first row has it.
     """
 
     name: str

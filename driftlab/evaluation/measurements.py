@@ -39,7 +39,7 @@ def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
 
     The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
     its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
-    the curve's change between the two temperatures. A hysteresis is said in `unit` where no limit is set for it.
+    the curve's change between the two temperatures. A hysteresis is noted in `unit` where no limit is set for it.
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
@@ -165,7 +165,7 @@ def _drifted(covariance: Array, m: int) -> float:
 
 
 def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]:
-    """Return why a coast over a horizon is not to be judged, empty where it is, and how much of it was at rest."""
+    """Return the reason not to judge a coast over a horizon, empty where there is none, and its share at rest."""
     ends, share = HORIZONS[horizon], yardsticks.share[horizon]
     first = f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
     at_rest = f"{100 * share:.0f} % at rest"

@@ -3,8 +3,8 @@
 A bias that moves over minutes is as well seen in means of seconds as in the updates themselves. Effects are computed
 on means of at most 10 s, so that their memories are as they run; regressions are made on rows of one or more of these.
 
-Missing excitation, in sentences that one understands at the bench: a temperature that only goes one way, and a channel
-that moves with it, keep recordings from telling explanations apart.
+Missing excitation, in sentences for the test engineer: a temperature that only goes one way, and a channel
+that moves with it, keep recordings from distinguishing explanations.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Predictions of a holdout recording, to which nothing was fitted, by the declared
 
 `loop.json`: the verdict for programs.
 
-The verdict in sentences that one understands at the bench.
+The verdict in sentences for the test engineer.
 """
 
 from __future__ import annotations

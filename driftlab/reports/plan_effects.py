@@ -18,7 +18,7 @@ HEADING = "Effects that it would identify"  # on a page
 
 
 def cells(outlook: DetectabilityReport) -> list[list[str]]:
-    """Return the rows of the table, what is found at the smallest size first."""
+    """Return the rows of the table, in the order of the smallest size that is identified."""
     silent = [[name, "not seen", "", "0", ""] for name in outlook.silent]
     return [*(_row(outlook, item) for item in outlook.effects), *silent]
 

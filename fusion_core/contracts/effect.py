@@ -155,12 +155,12 @@ class Effect(Plugin):
     def realisation(self) -> tuple[Signal, ...] | None:
         """Return the signals that are the regressors of one axis, in the order of `terms`; each axis has the same.
 
-        For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
+        For firmware, which has no NumPy; the law: they are the signature. None, the default: not known.
         """
         return None
 
     def realised_input(self, temperature: Signal) -> Signal | None:
-        """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
+        """Return the temperature that the map sees, made of the thermometer's; None: not known."""
         return None if self.acts_on_input else temperature
 
     # text: names and units in configs and reports

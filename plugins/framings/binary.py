@@ -44,7 +44,7 @@ class Checksum(Settings):
     start: Annotated[int, Field(ge=0, le=1 << 16)] = 0
     """First byte that is covered; the frame's first is 0."""
     byte_order: Literal["big", "little"] | None = None
-    """Byte order of the checksum; that of the frame where nothing is said."""
+    """Byte order of the checksum; that of the frame by default."""
     complement: bool = False
     """True if what is sent is the two's complement, so that all bytes add up to zero."""
 

@@ -145,7 +145,7 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
         return ()
     each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
     return (
-        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical is one with "
+        f"{accel.section}.bias.sigma_0: is missing, and an accelerometer's bias across the vertical is one with "
         f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
         f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
     )
