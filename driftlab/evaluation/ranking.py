@@ -118,9 +118,9 @@ def _several(ranked: Ranking, unit: BiasUnit) -> str:
     if len(best) == 1:
         return (
             f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
-            f"{', '.join(others)}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
+            f"{', '.join(others)} {unit.shown}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
         )
-    worse = f"; worse: {', '.join(others)}" if others else ""
+    worse = f"; worse: {', '.join(others)} {unit.shown}" if others else ""
     return (
         f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
         f"{listed([values[n] for n in best])} {unit.shown}{over}, "
@@ -132,7 +132,7 @@ def _sigma(ranked: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
     """Return the sigma that the configs of these names differ by less or more than."""
     largest = max(names, key=ranked.sigmas.__getitem__)
     whose = f" of {largest}" if len({unit.number(ranked.sigmas[name]) for name in names}) > 1 else ""
-    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])})"
+    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])} {unit.shown})"
 
 
 def _agree(ranked: Ranking) -> str:
