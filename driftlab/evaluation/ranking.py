@@ -114,13 +114,13 @@ def _several(ranked: Ranking, unit: BiasUnit) -> str:
     best = ranked.best
     over = "" if ranked.axes is None else " rms over the axes"
     values = {name: unit.number(value) for name, value in ranked.errors.items()}
-    others = [f"{name} {value}" for name, value in values.items() if name not in best]
+    others = ", ".join(f"{name} {value}" for name, value in values.items() if name not in best) + f" {unit.shown}"
     if len(best) == 1:
         return (
             f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
-            f"{', '.join(others)} {unit.shown}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
+            f"{others}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
         )
-    worse = f"; worse: {', '.join(others)} {unit.shown}" if others else ""
+    worse = f"; worse: {others}" if len(best) < len(values) else ""
     return (
         f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
         f"{listed([values[n] for n in best])} {unit.shown}{over}, "
