@@ -131,7 +131,9 @@ def plan(
     out: Place | None = None,
     progress: Progress | None = None,
 ) -> PlanResult:
-    """Find the chamber profile of the smallest map uncertainty, or the shortest.
+    """Find the chamber profile of least map uncertainty.
+
+    With a sigma to reach, the shortest one that reaches it.
 
     Parameters
     ----------
