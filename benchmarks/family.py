@@ -1,4 +1,4 @@
-"""What a family is worth to a unit that is soaked short, on made-up families whose law is not Gaussian.
+"""Gain of a family for a unit that is soaked short, on made-up families whose law is not Gaussian.
 
     python benchmarks/family.py [check] [--seed N] [KIND...]
 

@@ -145,7 +145,7 @@ def _law_of_drawn(law: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def soaked(unit: Dealt) -> tuple[UnitInformation, UnitRecord]:
-    """Return what a unit's soaks say, and its record."""
+    """Return the information of a unit's soaks, and its record."""
     found, noise = soaked_of(unit.name, AXES, unit.rows, STEP)
     figures = {
         "noise": figure(noise.white, noise.white_sigma), "walk": figure(noise.walk, noise.walk_sigma),

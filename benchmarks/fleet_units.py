@@ -1,4 +1,4 @@
-"""What workers do in the benchmark of fleets, and a cluster on this machine: importable, as their functions must be."""
+"""Functions of workers in the benchmark of fleets, and a cluster on this machine: importable, as they must be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the kind of map that `fit-map --compare` takes is a good one, on soaks whose curve is known.
+"""Quality of the kind of map that `fit-map --compare` takes, on soaks whose curve is known.
 
     python benchmarks/map_kinds.py [SEEDS] [FIRST] [SHAPE...]
 

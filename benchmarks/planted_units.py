@@ -56,7 +56,7 @@ class Planted:
 
 
 def played(T: np.ndarray) -> np.ndarray:
-    """Return what follows T (R,) with play."""
+    """Return the response to T (R,) with play."""
     follows, y = np.empty(len(T)), T[0]
     for k, own in enumerate(T):
         y = min(max(y, own - PLAY), own + PLAY)

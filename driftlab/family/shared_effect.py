@@ -28,7 +28,7 @@ from fusion_core.host.registry import Installed
 if TYPE_CHECKING:
     from driftlab.units import BiasUnit
 
-DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
+DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished
 HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 MIN_UNITS = 2  # of a lot, for a law of its own
 NAMED = 6  # lots that are named one by one
@@ -94,7 +94,7 @@ class LotEffects:
     differs: float = 1.0
 
     def has(self, lot: str) -> bool:
-        """Whether the units of a lot have the effect."""
+        """Return True if the units of a lot have the effect."""
         return self.others is None or any(one.lot == lot and one.has for one in self.lots)
 
     def law_of(self, lot: str) -> EffectDistribution:
@@ -384,7 +384,7 @@ def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     if effect.others is not None:
         lines.append(f"{name}: in the other lots {_sizes(effect, effect.others, unit, axes)}.")
     if effect.indistinguishable_from:
-        lines.append(f"{name}: cannot be told from {', '.join(effect.indistinguishable_from)} on these soaks.")
+        lines.append(f"{name}: cannot be distinguished from {', '.join(effect.indistinguishable_from)} on these soaks.")
     return lines
 
 
@@ -410,6 +410,6 @@ def _sizes(effect: SharedEffect, law: EffectDistribution, unit: BiasUnit, axes: 
             mean, sigma, spread = (float(v[axis, k]) * unit.factor for v in (law.mean, law.sigma, law.spread))
             term = effect.effect.terms[k]
             about = f"{name} {term}".strip()
-            lines.append(f"{about} {mean:.2g} +- {sigma:.1g} {units[place]} (units spread {spread:.1g})")
+            lines.append(f"{about} {mean:.2g} ± {sigma:.1g} {units[place]} (units spread {spread:.1g})")
     signs = bool(np.all(law.spread > SIGNS * np.abs(law.mean)))
     return ("of either sign, " if signs else "") + ", ".join(lines)

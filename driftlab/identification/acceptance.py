@@ -73,7 +73,7 @@ class CandidateEvidence:
 
     @property
     def better(self) -> bool:
-        """Whether left-out parts are predicted better: in all, and part by part (one sigma)."""
+        """True if left-out parts are predicted better: in all, and part by part (one sigma)."""
         return self._better(0.8413)
 
     @property
@@ -87,13 +87,13 @@ class CandidateEvidence:
 
     @property
     def fast(self) -> bool:
-        """Whether evidence at short times is enough."""
+        """True if evidence at short times is enough."""
         strong = self.chance > self.price + CHANCE and self.gain > GAIN
         return strong and self.better
 
     @property
     def slow(self) -> bool:
-        """Whether what is predicted of left-out parts is enough by itself."""
+        """True if what is predicted of left-out parts is enough by itself."""
         return self.surely_better and self.left_out > CHANCE and self.ratio < SLOW
 
     def reason(self) -> str:

@@ -3,8 +3,8 @@
 A bias that moves over minutes is as well seen in means of seconds as in the updates themselves. Effects are computed
 on means of at most 10 s, so that their memories are as they run; regressions are made on rows of one or more of these.
 
-Missing excitation, in sentences that one understands at the bench: a temperature that only goes one way, and a channel
-that moves with it, keep recordings from telling explanations apart.
+Missing excitation, in sentences for the test engineer: a temperature that only goes one way, and a channel
+that moves with it, keep recordings from distinguishing explanations.
 """
 
 from __future__ import annotations
@@ -292,8 +292,8 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
         r = _correlation(np.concatenate(T), np.concatenate([chunk[name] for chunk in chunks]))
         if abs(r) > TOGETHER:
             yield (
-                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): what one does cannot "
-                "be told from what the other does; move one of them by itself"
+                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): their "
+                "effects cannot be distinguished; move one of them by itself"
             )
 
 

@@ -256,7 +256,7 @@ def soaking(
         If a text cannot be read, one is missing, or the file cannot be written.
     """
     if until_reached and (sigma is None or span is None):
-        raise ConfigError("--until-reached: what is to be reached is not said; give --sigma and --range")
+        raise ConfigError("--until-reached: has no target, a sigma over a range was expected; give --sigma and --range")
     settings = map_settings(config, kind)
     unit = tracked_unit(config.filter)
     wanted = None if sigma is None else to_si(sigma, unit.si)

@@ -90,7 +90,7 @@ class RecordedSoak(SigmaCurve):
 
     @property
     def whole(self) -> bool:
-        """Whether the range was seen from end to end."""
+        """True if the range was seen from end to end."""
         low, high = self.seen
         near = EDGE * self.chamber.swing
         return low <= self.chamber.low + near and high >= self.chamber.high - near

@@ -84,7 +84,7 @@ class Blocks:
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
-"""How a kind of map answers to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
+"""Response of a kind of map to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
 
 
 def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:

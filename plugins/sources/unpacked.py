@@ -90,7 +90,7 @@ class _Seekable(io.RawIOBase):
     at = 0
 
     def readable(self) -> bool:
-        """Whether it can be read."""
+        """Return True if it can be read."""
         return True
 
     def seekable(self) -> bool:
