@@ -86,7 +86,7 @@ class SoakRows:
         return SoakRows(t, T, bias, np.add.reduceat(self.span, starts), channels)
 
     def within(self, low: float, high: float) -> NDArray[np.bool_]:
-        """Whether each row (R,) is at a temperature from low to high, degC."""
+        """Return True for each row (R,) at a temperature from low to high, degC."""
         return np.asarray((low <= self.T) & (high >= self.T))
 
     def steps(self, *, free: bool, start: float | None = None) -> Array:

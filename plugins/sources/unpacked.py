@@ -94,7 +94,7 @@ class _Seekable(io.RawIOBase):
         return True
 
     def seekable(self) -> bool:
-        """Whether `seek` is possible."""
+        """Return True, since `seek` is possible."""
         return True
 
 
