@@ -20,9 +20,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
-from scipy.stats import chi2
-from scipy.stats import t as student
+from scipy.special import chdtrc, gammaln, stdtrit
 
 from driftlab.identification.least_squares import LeastSquares, Model, Term
 from driftlab.noise.local_level import LocalLevel, one_step
@@ -82,7 +80,7 @@ class CandidateEvidence:
         return self._better(0.95)
 
     def _better(self, probability: float) -> bool:
-        quantile = -float(student.ppf(probability, max(self.parts - 1, 1)))
+        quantile = -float(stdtrit(max(self.parts - 1, 1), probability))
         return self.ratio < self.needed and self.steady < quantile and self.poorest < WORSE and self.left_out > 0
 
     @property
@@ -189,5 +187,6 @@ def matched(e: Array, Z: Array) -> tuple[float, float, int]:
 
 def nats_of(wald: float, dof: int) -> float:
     """Return minus the log of the chance that a chi-square is this large, also where that underflows."""
-    nats, half = -float(chi2.logsf(wald, dof)), 0.5 * dof
+    with np.errstate(divide="ignore"):
+        nats, half = -float(np.log(chdtrc(dof, wald))), 0.5 * dof
     return nats if np.isfinite(nats) else 0.5 * wald - (half - 1) * float(np.log(0.5 * wald)) + float(gammaln(half))

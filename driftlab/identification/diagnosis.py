@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from driftlab.identification.acceptance import CHANCE, GAIN
+from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, span, with_residual
 from driftlab.identification.experiment_design import Experiment, Question, propose
 from driftlab.identification.least_squares import Term
@@ -233,7 +233,7 @@ def structures(search: Search, error: Array) -> list[Structure]:
 
     `error` (d,) is that of the model on left-out parts, SI.
     """
-    from scipy.stats import chi2, norm
+    from scipy.special import log_ndtr
 
     columns, evidence = search.columns, search.evidence
     left = np.stack(search.residuals(search.model), axis=1)
@@ -247,10 +247,10 @@ def structures(search: Search, error: Array) -> list[Structure]:
     wanders = f"what is left, {size:.3g} {unit.shown} rms, stays for about {span(stays)}, and not as noise does"
     varying, outlying = [], []
     for W, z in scales:
-        p = float(chi2.logsf(float(np.sum(z**2)), z.size))
-        varying.append(Structure("time", stays, wanders, min(-p, MAX_NATS), limit))
+        nats = nats_of(float(np.sum(z**2)), z.size)
+        varying.append(Structure("time", stays, wanders, min(nats, MAX_NATS), limit))
         largest, length = float(np.max(np.abs(z))), W * evidence.interval
-        p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
+        p = float(log_ndtr(-largest)) + float(np.log(2 * z.size))
         text = f"what is left jumps within {span(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.gain) for each in (varying, outlying)]

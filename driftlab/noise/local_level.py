@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.signal import lfilter
 
 from fusion_core.chunk import Array
 from fusion_core.thermal.soak_noise import minimum_near
@@ -143,10 +142,18 @@ class LocalLevel:
 
 def one_step(parts: Sequence[Array], gain: float) -> list[Array]:
     """Return the one-step errors (n - 1, ...) of signals (n, ...) predicted by an exponential average of their past."""
-    errors = []
-    for x in parts:
-        before = lfilter([gain], [1.0, gain - 1.0], x - x[:1], axis=0)
-        errors.append(x[1:] - x[:1] - before[:-1])
+    return [_one_step(np.atleast_2d(x.T).T, gain).reshape(len(x) - 1, *x.shape[1:]) for x in parts]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _one_step(x: Array, gain: float) -> Array:
+    """Return the errors (n - 1, d) of the signals (n, d)."""
+    n, d = x.shape
+    errors, level = np.empty((n - 1, d)), np.zeros(d)  # the level over the first row
+    for k in range(1, n):
+        for j in range(d):
+            errors[k - 1, j] = x[k, j] - x[0, j] - level[j]
+            level[j] = gain * (x[k, j] - x[0, j]) - (gain - 1.0) * level[j]
     return errors
 
 
