@@ -1,4 +1,4 @@
-"""How long a frame of a device takes from a file: VectorNav, Xsens and a counter's frames, and the copy of the bytes.
+"""Reading time of a device's frame from a file: VectorNav, Xsens and a counter's frames, and the copy of the bytes.
 
 Each is read from a file of half a million frames, the best of three runs; beside it, what Python needs to look at every
 frame once (`struct.unpack_from` in a loop), which decides nothing and checks no sum.

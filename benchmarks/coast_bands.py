@@ -49,7 +49,7 @@ FOG = Kind("FOG", 0.72 * DEG_H, 3e-3 * DEG_H, 2 * DEG_H, 3.3e-4, 0.01, "0.012 de
 
 @dataclass(frozen=True)
 class Case:
-    """What is varied: seconds of an update, kelvin of a thermometer's step, gaps, and the map that is declared."""
+    """Varied conditions: seconds of an update, kelvin of a thermometer's step, gaps, and the map that is declared."""
 
     name: str
     kind: Kind
@@ -62,7 +62,7 @@ class Case:
 
 
 def cases() -> list[Case]:
-    """Return what is shown: one thing after another varied, for each kind of unit."""
+    """Return the cases: one condition after another varied, for each kind of unit."""
     found = []
     for kind in (MEMS, FOG):
         base = Case(f"{kind.name}", kind)

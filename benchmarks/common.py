@@ -1,4 +1,4 @@
-"""What the benchmarks share: models, timing, and the table.
+"""Models, timing and the table of all benchmarks.
 
 A benchmark is a function that returns rows. Ratios are measured side by side: both sides in one process, in turns,
 the fastest of several turns each, so that what else the machine does falls on both.
@@ -69,7 +69,7 @@ def show(title: str, rows: list[Row]) -> None:
 
 
 def machine() -> str:
-    """Return what the figures were measured on, in a line."""
+    """Return the machine of the measurements, in a line."""
     with open("/proc/cpuinfo", encoding="utf-8") as file:
         text = file.read()
     flags = next((line.split() for line in text.splitlines() if line.startswith("flags")), [])

@@ -1,4 +1,4 @@
-"""What `driftlab explain` costs: 5.6 + 4 + 4 h at 10 Hz with every effect installed, and how the cost grows."""
+"""Cost of `driftlab explain`: 5.6 + 4 + 4 h at 10 Hz with every effect installed, and its growth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a family is worth to a unit that is soaked short, on made-up families whose law is not Gaussian.
+"""Gain of a family for a unit that is soaked short, on made-up families whose law is not Gaussian.
 
     python benchmarks/family.py [check] [--seed N] [KIND...]
 
@@ -21,9 +21,9 @@ from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, s
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.posterior_map import sigma, unit_posterior
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
-from driftlab.noise.local_level import whitened
+from driftlab.soak.blocks import SoakRows
 
 UNITS, NEW, STEP = 200, 100, 2.5
 AXES = ("x", "y", "z")
@@ -72,7 +72,7 @@ def _spline(found: UnitInformation, axis: int) -> np.ndarray:
 def _solved(found: UnitInformation, rows: SoakRows, V: np.ndarray, axis: int, *, weighted: bool) -> np.ndarray:
     X = np.column_stack([V, rows.bias[:, axis]])
     if weighted:
-        X = whitened(X, *rows.variances(found.white[axis], found.walk[axis], free=False))
+        X = rows.whitened(X, found.white[axis], found.walk[axis], free=False)
     return np.asarray(np.linalg.lstsq(X[:, :-1], X[:, -1], rcond=None)[0])
 
 

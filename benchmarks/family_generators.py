@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.unit_information import SoakRows
+from driftlab.soak.blocks import SoakRows
 
 DEG_H = np.deg2rad(1 / 3600)  # rad/s
 SPAN = 10.0  # s of a row
@@ -106,7 +106,7 @@ def _kinks(rng: np.random.Generator) -> tuple[Curve, float, float]:
 
 
 def _exponentials(rng: np.random.Generator) -> tuple[Curve, float, float]:
-    """What grows faster and faster with temperature, by log-normal laws, the axes together."""
+    """Curves exponential in temperature, by log-normal laws, the axes together."""
     size = np.exp(rng.normal(3.0, 0.5) + 0.3 * rng.normal(size=3))
     scale, line = 25 * np.exp(0.2 * rng.normal(size=3)), rng.normal(0, 1.0, (2, 3)) * [[40], [0.5]]
     return lambda T: size * np.exp(T[:, None] / scale - 1) + line[0] + np.outer(T, line[1]), 4.0, 0.03

@@ -38,7 +38,7 @@ PLANTED = {
 
 
 def named(found: SharedEffects) -> str:
-    """Return the effects, and what they cannot be told from."""
+    """Return the effects, and what they cannot be distinguished from."""
     said = []
     for effect in found.effects:
         values = ", ".join(f"{value:.3g}" for value in effect.effect.hyper_parameters.values())

@@ -30,9 +30,10 @@ from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import FALSE, Outlier, find_outliers
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
-from driftlab.family.rows import soaked_of
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.family.unit_noise import soaked_of
 from driftlab.production.unit_map import figure
+from driftlab.soak.blocks import SoakRows
 
 AXES, STEP, DRAWN = ("x", "y", "z"), 2.5, 20_000
 SAID = {
@@ -144,7 +145,7 @@ def _law_of_drawn(law: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def soaked(unit: Dealt) -> tuple[UnitInformation, UnitRecord]:
-    """Return what a unit's soaks say, and its record."""
+    """Return the information of a unit's soaks, and its record."""
     found, noise = soaked_of(unit.name, AXES, unit.rows, STEP)
     figures = {
         "noise": figure(noise.white, noise.white_sigma), "walk": figure(noise.walk, noise.walk_sigma),

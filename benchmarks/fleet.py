@@ -54,7 +54,7 @@ def one_core(folder: Path, count: int) -> tuple[Row, float]:
 
 
 def beside(workers: Workers, count: int, turns: int) -> tuple[float, float, float]:
-    """Return what workers add to `count` items of UNIT s, as a share of the bare loop, the fastest of several turns.
+    """Return the overhead of workers on `count` items of UNIT s, as a share of the bare loop, fastest of several turns.
 
     And seconds of this process's processor an item, and seconds an item where nothing is done but to send 100 kB.
     """
@@ -78,7 +78,7 @@ def beside(workers: Workers, count: int, turns: int) -> tuple[float, float, floa
 
 
 def overheads(folder: Path, count: int, turns: int) -> tuple[list[Row], dict[str, float]]:
-    """Return what the pool and Dask cost beside the work."""
+    """Return the overheads of the pool and of Dask."""
     with Pool(1) as pool:
         share, own, empty = beside(pool, count, turns)
     rows = [
@@ -107,7 +107,7 @@ class Lightly(FleetOptions):
     real: Path = Path()
 
     def crew(self) -> Workers:
-        """Return who does the work."""
+        """Return the pool of workers."""
         return Light(pickle.loads(self.real.read_bytes()))
 
 
@@ -143,7 +143,7 @@ def light(folder: Path, count: int) -> None:
 
 
 def growth(folder: Path, sizes: tuple[int, ...]) -> tuple[list[Row], dict[str, float]]:
-    """Return how seconds and memory of all but the units' work grow; each size in a process of its own."""
+    """Return the growth of seconds and memory of all but the units' work; each size in a process of its own."""
     found = []
     for count in sizes:
         command = [sys.executable, __file__, "--light", str(count), "--folder", str(folder)]
@@ -182,7 +182,7 @@ def full(folder: Path, count: int) -> list[Row]:
 
 
 def plan(unit: float, constants: dict[str, float], units: int = 1_000_000) -> list[Row]:
-    """Return what a million units cost, by the constants above."""
+    """Return the cost of a million units, by the constants above."""
     rows = [
         Row(f"{units:,} units: processors of workers", f"{units * unit / 3600:,.0f} h"),
         Row("disk of the folders", f"{units * constants['kB'] / 1024**2:,.0f} GB"),

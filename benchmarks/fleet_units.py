@@ -1,4 +1,4 @@
-"""What workers do in the benchmark of fleets, and a cluster on this machine: importable, as their functions must be."""
+"""Functions of workers in the benchmark of fleets, and a cluster on this machine: importable, as they must be."""
 
 from __future__ import annotations
 
@@ -111,8 +111,7 @@ def shifted(done: UnitResult, task: Task, rng: np.random.Generator) -> UnitResul
     c = 0.3 * scale * rng.normal(size=(len(soaked.axes), 4)) @ smooth
     rows = tuple(replace(r, bias=r.bias + soaked.knots.values(r.T) @ c.T) for r in soaked.recordings)
     h = soaked.h + np.einsum("dij,dj->di", soaked.J, c)
-    squares = soaked.squares + 2 * np.einsum("di,di->d", soaked.h, c) + np.einsum("di,dij,dj->d", c, soaked.J, c)
-    other = replace(soaked, unit=task.unit, h=h, squares=squares, recordings=rows)
+    other = replace(soaked, unit=task.unit, h=h, recordings=rows)
     figures = {
         name: figure.model_copy(update={"value": tuple(v and v * np.exp(0.05 * rng.normal()) for v in figure.value)})
         for name, figure in done.record.figures.items()

@@ -65,7 +65,7 @@ class Line:
 
     @property
     def odd(self) -> dict[str, str]:
-        """What was planted: name of the unit, and what is odd in it."""
+        """Planted faults, by the name of the unit."""
         return {u.name: u.odd for u in self.units if u.odd}
 
 
@@ -124,7 +124,7 @@ def _law(law: str) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
 
 
 def _deviation(law: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return what one unit's shape (141, 3) and level (3,) differ by from the line's [rad/s]."""
+    """Return the deviation of one unit's shape (141, 3) and level (3,) from the line's [rad/s]."""
     mean, scale, _, _ = _law(law)
     shape, level = _raw(law, rng)
     return scale * (shape - mean), LEVEL * level
@@ -259,7 +259,7 @@ def draw(
 def campaign(
     lines: int = 6, count: int = 100, odd: tuple[str, ...] = ODD, times: float = 6.0, seed: int = 0
 ) -> list[Callable[[], Line]]:
-    """Return how to draw `lines` lines of every law, each with all that is odd: call each for its line."""
+    """Return functions that draw `lines` lines of every law, each with all kinds of odd units."""
 
     def one(law: str, k: int) -> Callable[[], Line]:
         return lambda: draw(seed * 10_000 + k, law, count, odd, times)

@@ -94,7 +94,7 @@ def true_temperature(profile: str, t: np.ndarray, rng: np.random.Generator) -> n
 def read(
     T: np.ndarray, step: float, noise: float, rng: np.random.Generator, averaged: int = 1, held: int = 1
 ) -> np.ndarray:
-    """Return what the thermometer says of T (N,) [degC].
+    """Return the reading of the thermometer at T (N,) [degC].
 
     Parameters
     ----------

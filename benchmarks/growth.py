@@ -1,4 +1,4 @@
-"""How the time grows with the number of samples: the exponent p of a + b N^p, which is 1 where it is linear."""
+"""Growth of the time with the number of samples: the exponent p of a + b N^p, which is 1 where it is linear."""
 
 from __future__ import annotations
 

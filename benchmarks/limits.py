@@ -1,4 +1,4 @@
-"""How many units beyond a limit pass: the risk of each limit, on twins whose truth is known, drawn with NumPy alone.
+"""Consumer's risk of each limit: the share of units beyond it that pass, on twins drawn with NumPy alone.
 
 A cell is a quantity, a law of the noise and a program of temperatures. Its units are measured as driftlab measures
 them, each axis is held against limits that are set by the truth: at the truth itself, where the risk is greatest and
@@ -187,7 +187,7 @@ def decided(units: list[Unit], name: str, times: float) -> list[str]:
 
 
 def risk(passed: int, n: int) -> str:
-    """Return how many percent pass, with the binomial limits of 95 %."""
+    """Return the percentage that passes, with the binomial limits of 95 %."""
     from scipy.stats import binomtest
 
     low, high = binomtest(passed, n).proportion_ci(0.95)

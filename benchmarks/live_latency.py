@@ -100,7 +100,7 @@ while True:
 
 
 def watched(open: ExitStack) -> LiveHistory:
-    """Return what a page shows, served, and looked at by other processes."""
+    """Return the status of a page that is served to, and read by, other processes."""
     watch = LiveHistory("xyz")
     for history in watch.histories.values():
         t = -np.arange(history.capacity, 0.0, -1.0) * history.width

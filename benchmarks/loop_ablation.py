@@ -1,4 +1,4 @@
-"""What each part of the loop's method buys: cases of `benchmarks/loop.py` with one part taken out at a time.
+"""Ablation of the identification: cases of `benchmarks/loop.py` with one part taken out at a time.
 
 `python benchmarks/loop_ablation.py [--jobs N] [--only TEXT ...]`
 

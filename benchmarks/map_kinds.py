@@ -1,4 +1,4 @@
-"""Whether the kind of map that `fit-map --compare` takes is a good one, on soaks whose curve is known.
+"""Quality of the kind of map that `fit-map --compare` takes, on soaks whose curve is known.
 
     python benchmarks/map_kinds.py [SEEDS] [FIRST] [SHAPE...]
 
@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from driftlab.maps.kind_selection import KindComparison, candidates, compare, divide
-from driftlab.soak.blocks import GrowingBlocks
+from driftlab.soak.blocks import GrowingSoak
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
 
@@ -52,9 +52,9 @@ def soak(shape: str, size: float, seed: int, sweeps: int = SWEEPS) -> tuple[np.n
 
 def judged(T: np.ndarray, bias: np.ndarray) -> KindComparison:
     """Compare all installed kinds on a soak."""
-    growing = GrowingBlocks()
+    growing = GrowingSoak()
     growing.add(np.arange(len(T), dtype=float), T, bias)
-    blocks = growing.blocks()
+    blocks = growing.rows()
     tried = candidates([], registry().classes(ThermalMap).values())
     return compare(tried, blocks.T, blocks.bias, divide([blocks.T]))
 

@@ -91,7 +91,7 @@ def table(rows: list[dict[str, Any]]) -> None:
 
 
 def _z(rows: list[dict[str, Any]]) -> np.ndarray:
-    """Return how far the sizes of the axes that have one are off, in their sigmas."""
+    """Return the errors of the sizes of the axes that have one, in their sigmas."""
     off = [
         abs(abs(size) - true) / sigma
         for row in rows

@@ -1,4 +1,4 @@
-"""How odd a planted unit is to somebody who knows the law that its family was drawn from, and its own noise.
+"""Oddness of a planted unit, given the law that its family was drawn from and its own noise.
 
 No project code. The rows of an axis are a curve of the law, a level for each soak, walk and white noise, in which
 
@@ -27,7 +27,7 @@ STRONGEST = 200  # eigenvalues of a walk, of which the rest is white noise alone
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true of a planted unit and its family; S soaks, R rows in all.
+    """The truth of a planted unit and its family; S soaks, R rows in all.
 
     Attributes
     ----------
@@ -63,13 +63,13 @@ class Truth:
 
     @property
     def free(self) -> np.ndarray:
-        """What nothing is known of (R, M + S), orthonormal: curves of the law, and a level for each soak."""
+        """Basis without prior knowledge (R, M + S), orthonormal: curves of the law, and a level for each soak."""
         curves = [np.stack([np.interp(T, self.grid, mode) for mode in self.modes.T], axis=1) for T in self.T]
         U, size, _ = np.linalg.svd(np.hstack([np.vstack(curves), _levels(self.t)]), full_matrices=False)
         return U[:, size > 1e-9 * size[0]]
 
     def chance(self, seed: int) -> float:
-        """Return how seldom it is."""
+        """Return its probability by chance."""
         if self.odd == "level":
             beyond = min(np.sum(self.levels >= self.level), np.sum(self.levels <= self.level))
             return min(2.0 * (1 + float(beyond)) / (1 + len(self.levels)), 1.0)

@@ -1,4 +1,4 @@
-"""Whether a plan comes true: the sigma that it foretells against simulated soaks of the same profiles, fitted.
+"""Accuracy of a plan: its predicted sigma against simulated soaks of the same profiles, fitted.
 
     python benchmarks/plan.py [SEEDS]
 
@@ -47,7 +47,7 @@ MAPS: dict[str, dict[str, Any]] = {"polynomial": {"order": 5}, "spline": {}}
 
 @dataclass(frozen=True)
 class Came:
-    """What 20 soaks came to: rms of what the fits are off by, and the median of what they say, SI."""
+    """Result of 20 soaks: rms of the errors of the fits, and the median of their sigma, SI."""
 
     true: float
     said: float

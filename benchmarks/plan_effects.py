@@ -48,7 +48,7 @@ def late(x, tau, step=1.0):
 
 
 def slip(T, width):
-    """Return how far a body that T (N,) drags along through a play stays behind."""
+    """Return the lag of a body that T (N,) drags along through a play."""
     out, at = np.empty_like(T), T[0]
     for k, value in enumerate(T):
         at = min(max(at, value - width / 2), value + width / 2)
@@ -63,7 +63,7 @@ def curve(T, slope=1.0):
 
 
 def shown(effect, t, T):
-    """Return what an effect shows (N,), its values of hyper-parameters as they stand in `effect`, of any size."""
+    """Return the signature of an effect (N,), with the hyper-parameters that stand in `effect`, of any size."""
     values = dict(effect.hyper_parameters)
     return {
         "hysteresis": lambda: slip(T, values["width"]),
@@ -86,7 +86,7 @@ class Case:
 
 
 def unit():
-    """Return what the plan is told of the unit."""
+    """Return the plan's model of the unit."""
     from driftlab.planning.unit_model import UnitModel
     from driftlab.units import BiasUnit
     from fusion_plugins.thermal_maps.spline import Spline
@@ -103,7 +103,7 @@ def temperature(profile):
 
 
 def outlook(profile, kinds=()):
-    """Return what the plan says of a profile."""
+    """Return the plan's prediction for a profile."""
     from driftlab.planning.detectability import predict_detectability
 
     t, T = temperature(profile)
@@ -135,7 +135,7 @@ def recording(case, effect, size):
 
 
 def answer(case, effect, size):
-    """Return what the loop found: names, and what cannot be told from each."""
+    """Return the identified effects: names, and their rivals."""
     from driftlab.identification.result import investigate
     from fusion_plugins.thermal_maps.spline import Spline
 
@@ -144,7 +144,7 @@ def answer(case, effect, size):
 
 
 def asked(job):
-    """Answer one case: it, its size and what was found."""
+    """Answer one case: it, its size and the identified effects."""
     case, effect, size = job
     return case, answer(case, effect, size)
 
@@ -165,7 +165,7 @@ def main():
                 work += [(case, one.effect, one.found_from * case.times) for case in cases]
     with ProcessPoolExecutor(given.jobs) as pool:
         found = list(pool.map(asked, work))
-    print("| profile | effect | found from [deg/h] | found at 2 x | another named | at half | plan: not told from |")
+    print("| profile | effect | found from [deg/h] | found at 2 x | another named | at half | plan: confused with |")
     print("|---|---|---|---|---|---|---|")
     for (profile, kind), one in said.items():
         own = {t: [a for c, a in found if (c.profile, c.kind, c.times) == (profile, kind, t)] for t in (2.0, 0.5)}

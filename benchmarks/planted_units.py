@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from driftlab.family.unit_information import SoakRows
+from driftlab.soak.blocks import SoakRows
 
 DEG_H = np.deg2rad(1 / 3600)  # rad/s
 LOW, HIGH, ROW = -20.0, 60.0, 20.0  # degC, s
@@ -56,7 +56,7 @@ class Planted:
 
 
 def played(T: np.ndarray) -> np.ndarray:
-    """Return what follows T (R,) with play."""
+    """Return the response to T (R,) with play."""
     follows, y = np.empty(len(T)), T[0]
     for k, own in enumerate(T):
         y = min(max(y, own - PLAY), own + PLAY)

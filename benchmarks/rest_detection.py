@@ -1,4 +1,4 @@
-"""What is taken for motion: false alarms on soaks at rest, and the power on real motion.
+"""Detection of motion: false alarms on soaks at rest, and the power on real motion.
 
     python benchmarks/rest_detection.py [--foreign] [--json FILE] [--seeds 3] [--against FILE] [--only "FOG 100"]
 
@@ -110,7 +110,7 @@ def config_of(densities):
 
 
 def refused(config, t, T, rates, force, dt=DT):
-    """Return which epochs (N,) are refused by the gathering of a map, and by the detector of a run."""
+    """Return the epochs (N,) that are refused by the gathering of a map, and by the detector of a run."""
     N = len(t)
     channels = {"gyro": rates, "accel": force, "temperature": T, "tau": np.full(N, dt)}
     channels = {name: values for name, values in channels.items() if values is not None}

@@ -26,7 +26,7 @@ CHANNELS = {
 
 
 def imu_at_200_hz(N: int, picture: int = 0, every: int = 10) -> Callable[..., object]:
-    """Return what writes N messages of an inertial unit and, beside them, pictures of so many bytes."""
+    """Return a function that writes N messages of an inertial unit and, beside them, pictures of so many bytes."""
 
     def messages(types):
         rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Where the time of a run goes: `python stages.py CONFIG RECORDING OUT` prints processor seconds of each stage as JSON.
+"""Time of a run by stage: `python stages.py CONFIG RECORDING OUT` prints processor seconds of each stage as JSON.
 
 The functions of each stage are wrapped; what one calls of another stage counts there and not here.
 """

@@ -64,15 +64,15 @@ class Config(Settings):
     """Heading of the x axis, from north, clockwise."""
     # one made in memory is none of the union
     source: Annotated[Source, Installed(), SerializeAsAny()] | None = None
-    """How the recording is read."""
+    """Source that reads the recording."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_default_kind)] = None
     """The filter: its sensors, and how their biases move."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
-    """What the unit may have at most; the pages say whether it passes."""
+    """Upper limits of acceptance; the pages say whether the unit passes."""
 
     @property
     def name(self) -> str:
-        """What its file is called; empty where it was made otherwise."""
+        """Name of its file; empty where it was made otherwise."""
         return self._name
 
     @property
@@ -82,7 +82,7 @@ class Config(Settings):
 
     @property
     def recording(self) -> str:
-        """What its recording is called; empty where it has none."""
+        """Name of its recording; empty where it has none."""
         return "" if self.source is None else self.source.name
 
     def as_yaml(self) -> str:
@@ -111,7 +111,7 @@ class Config(Settings):
 
     @property
     def site(self) -> Site:
-        """Where the sensors are."""
+        """Site of the sensors."""
         return Site(self.latitude, self.heading)
 
     def maps(self) -> list[ThermalMap]:
@@ -239,7 +239,7 @@ LONGEST = 64  # characters of a serial number
 
 
 def _serial(value: Any) -> Any:
-    """Return a serial number as text; of a number with a point nobody knows any more how it was written."""
+    """Return a serial number as text; a number with a point has lost its spelling."""
     if isinstance(value, float):
         raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
     if isinstance(value, int) and not isinstance(value, bool):
@@ -256,7 +256,7 @@ Bias = Annotated[float, Unit("bias", positive=True, example="5 deg/h")]
 
 
 class Limits(Settings):
-    """What the worst axis of the tracked sensor may have at most."""
+    """Upper limits of acceptance for the worst axis of the tracked sensor."""
 
     bias_instability: Bias | None = None
     """Floor of the Allan deviation, the coefficient B of IEEE Std 952."""

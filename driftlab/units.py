@@ -26,7 +26,7 @@ class BiasUnit:
 
     @cached_property
     def factor(self) -> float:
-        """What a bias in SI is multiplied by to be shown."""
+        """Factor from a bias in SI to the shown unit."""
         return 1.0 / float(convert(1.0, self.shown, self.si))
 
     @property
@@ -62,7 +62,7 @@ class BiasUnit:
 
     @property
     def note(self) -> dict[str, str]:
-        """What stands in JSON beside names that say no unit."""
+        """Note in JSON beside names that say no unit."""
         return {} if self.si == "rad/s" else {"unit": self.si}
 
 
@@ -80,19 +80,19 @@ def unit_of(sensor: Sensor) -> BiasUnit:
 
 
 def tracked_unit(model: MeasurementModel | None) -> BiasUnit:
-    """Return the unit of the bias that a config's product is about; that of a gyro where nothing is said."""
+    """Return the unit of the bias that a config's product is about; that of a gyro by default."""
     return RATE if model is None else unit_of(model.tracked)
 
 
 def axis_name(channel: str, axis: str) -> str:
-    """Return what an axis is called in a sentence: `gyro x`, or as the channel where it has no name of its own."""
+    """Return the name of an axis in a sentence: `gyro x`, or the channel where the axis has none of its own."""
     return channel if axis == axis_of(channel) else f"{channel} {axis}"
 
 
 def number(value: float, *, zeros: bool = False, missing: str = "") -> str:
     """Return a value with three digits, from 1000 on without decimals.
 
-    `zeros` keeps those at its end; `missing` is said of what is not finite.
+    `zeros` keeps those at its end; `missing` stands for values that are not finite.
     """
     if missing and not math.isfinite(value):
         return missing

@@ -27,7 +27,7 @@ class NisTest:
 
     @property
     def consistent(self) -> bool:
-        """Whether the mean is within its bounds."""
+        """True if the mean is within its bounds."""
         return self.low <= self.mean <= self.high
 
 

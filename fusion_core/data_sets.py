@@ -233,7 +233,7 @@ class DataSetRows:
         return [values]
 
     def _places(self, start: int, stop: int) -> Iterator[tuple[tuple[slice, ...], tuple[int, ...]]]:
-        """Yield where each chunk of some rows goes in them, and where it is in the data set."""
+        """Yield the place of each chunk among some rows, and in the data set."""
         ranges = [range(0, n, c) for n, c in zip(self.node.shape, self.node.chunks, strict=True)]
         ranges[self.axis] = range(start, stop, self.step)
         for number in range(math.prod(map(len, ranges))):

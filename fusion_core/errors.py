@@ -22,7 +22,7 @@ def moment(t: float, first_row: float | None) -> str:
     t : float
         In the file's own seconds.
     first_row : float or None
-        Of the recording, in the same; None where it is not known: the file's own time is then said alone.
+        Of the recording, in the same; None where it is not known: the file's own time then stands alone.
     """
     if first_row is None:
         return f"t = {seconds(t)}"

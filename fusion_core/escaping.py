@@ -46,7 +46,7 @@ def lines(text: str) -> str:
 
 
 def is_plain(text: str) -> bool:
-    """Whether `line` leaves a text as it is."""
+    """Return True if `line` leaves a text as it is."""
     return text.isprintable() or line(text) == text
 
 

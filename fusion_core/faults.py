@@ -138,7 +138,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
 
 
 def _all_usable(values: Array, low: float, high: float) -> bool:
-    """Whether no value is NaN or beyond the range; of LARGEST the sum of squares shows it in one pass."""
+    """Return True if no value is NaN or beyond the range; of LARGEST the sum of squares shows it in one pass."""
     flat = values.ravel()
     if high < LARGEST:
         return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN

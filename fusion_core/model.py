@@ -46,7 +46,7 @@ class Transition:
 
     @property
     def invariant(self) -> bool:
-        """Whether F, Q and C are the same for every step."""
+        """True if F, Q and C are the same for every step."""
         return self.F.ndim == 2 and self.Q.ndim == 2 and (self.C is None or self.C.ndim == 2)
 
     def part(self, rows: slice) -> Transition:
@@ -79,7 +79,7 @@ class Measurement:
 
     @property
     def invariant(self) -> bool:
-        """Whether H and R are the same at every sample, and every sample is measured."""
+        """True if H and R are the same at every sample, and every sample is measured."""
         return self.H.ndim == 2 and self.R.ndim == 2 and bool(self.used.all())
 
     def part(self, rows: slice) -> Measurement:

@@ -42,7 +42,7 @@ ConfigPath = Annotated[Path, BeforeValidator(_beside_config)]
 
 
 def can_be_path(text: str) -> bool:
-    """Whether a text can be the path of a file."""
+    """Return True if a text can be the path of a file."""
     return "\0" not in text and len(text) < 4096 and all(len(part.encode()) < 256 for part in text.split("/"))
 
 
@@ -59,7 +59,7 @@ class Frozen(BaseModel):
         return copy
 
     def __eq__(self, other: object) -> bool:
-        """Whether all fields are the same, whatever has been worked out from them since."""
+        """Return True if all fields are the same, whatever has been worked out from them since."""
         fields = type(self).model_fields
         return type(other) is type(self) and all(getattr(self, name) == getattr(other, name) for name in fields)
 

@@ -53,12 +53,19 @@ class BiasWalk:
             return np.asarray(covariance - np.eye(len(t)) * (lasted / (3 * self.span)))  # a mean varies less
         covariance = np.zeros((len(t), len(t)))
         for tau in self.taus:
-            x = lasted / tau
-            variance = 2 * (x - 1 + np.exp(-x)) / x**2
-            covariance += np.where(apart > 0, (2 * np.sinh(x / 2) / x) ** 2 * np.exp(-apart / tau), variance) / len(
-                self.taus
-            )
+            covariance += gauss_markov(apart, lasted, tau) / len(self.taus)
         return covariance
+
+
+def gauss_markov(apart: Array, lasted: float, tau: float) -> Array:
+    """Return the covariance of means over `lasted` s, so far `apart` (N, N), s, of a process of correlation time tau.
+
+    The process has a variance of 1; means overlap wholly or not at all.
+    """
+    x = lasted / tau
+    own = 2 * (x + np.expm1(-x)) / x**2
+    beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - lasted, 0.0) / tau)
+    return np.asarray(np.where(apart < lasted / 2, own, beside))
 
 
 @dataclass(frozen=True, eq=False)

@@ -242,16 +242,16 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 583,
-    "driftlab/commands": 2777,
+    "driftlab/commands": 2774,
     "driftlab/evaluation": 1282,
-    "driftlab/family": 2866,
+    "driftlab/family": 2755,
     "driftlab/filtering": 1198,
-    "driftlab/identification": 2196,
+    "driftlab/identification": 2192,
     "driftlab/live": 777,
-    "driftlab/maps": 1781,
-    "driftlab/noise": 1151,
+    "driftlab/maps": 1772,
+    "driftlab/noise": 1147,
     "driftlab/planning": 1164,
-    "driftlab/production": 2262,
+    "driftlab/production": 2260,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
     "driftlab/reports": 2735,
@@ -259,12 +259,12 @@ BUDGET = {
     "driftlab/spc": 654,
     "driftlab/starter": 573,
     "driftlab/storage": 1072,
-    "fusion_core": 1832,
+    "fusion_core": 1833,
     "fusion_core/contracts": 1676,
     "fusion_core/fast": 710,
     "fusion_core/host": 699,
     "fusion_core/testing": 934,
-    "fusion_core/thermal": 1001,
+    "fusion_core/thermal": 981,
     "fusion_core/units": 419,
     "plugins": 55,
     "plugins/bias_models": 254,
@@ -279,8 +279,7 @@ BUDGET = {
 
 SMALL = 9  # modules under 60 lines that are no plugin
 ANNEXES = 2  # modules under 120 lines whose only importer lies in their own folder
-RETURN_WHAT = 5  # docstrings that hide their subject behind "what", "who", "how"
-QUESTION = re.compile(r"(What|Who|How|Which|Where|When|Why|Whether)\b")
+QUESTION = re.compile(r"((Return|Yield) )?(what|who|whose|how|which|where|when|why|whether|whatever)\b", re.IGNORECASE)
 NO_NAMES = {
     "after", "ahead", "asked", "before", "doing", "done", "each", "found", "given", "hands", "judged", "kept", "known",
     "learned", "lost", "more", "odd", "own", "said", "seen", "shown", "telling", "told", "wanted",
@@ -304,7 +303,8 @@ def test_rooms_keep_their_budgets():
         room = f"{top}/{second}" if rest else top
         rooms[room] = rooms.get(room, 0) + code_lines(path, tree)
     assert set(rooms) == set(BUDGET)
-    assert {room: n for room, n in rooms.items() if n > BUDGET[room]} == {}
+    over = {room: n for room, n in rooms.items() if n > BUDGET[room]}
+    assert not over, f"{over} lines; delete as many as were added, or raise BUDGET by those of a new plugin"
 
 
 def test_a_file_is_a_subject():
@@ -370,6 +370,11 @@ def test_every_module_is_in_the_glossary():
     assert written.endswith(script("make_names").lines()), "run python docs/reference/make_names.py"
 
 
+def test_the_python_api_is_that_of_the_source():
+    written = (ROOT / "docs" / "reference" / "python_api.md").read_text()
+    assert written.endswith(script("make_python_api").lines()), "run python docs/reference/make_python_api.py"
+
+
 def test_what_moved_is_where_the_page_says():
     moved = script("make_moved")
     assert (ROOT / "docs" / "reference" / "moved.md").read_text() == moved.text(), "run docs/reference/make_moved.py"
@@ -383,17 +388,19 @@ def test_what_moved_is_where_the_page_says():
 
 
 def test_docstrings_begin_with_their_subject():
-    modules_that_ask, returns = [], []
-    for name, _, tree in modules():
-        if QUESTION.match(ast.get_docstring(tree) or ""):
-            modules_that_ask.append(name)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef | ast.ClassDef):
-                text = ast.get_docstring(node) or ""
-                if re.match(r"Return (what|who|how|which)\b", text):
-                    returns.append(f"{name}.{node.name}")
-    assert not modules_that_ask
-    assert len(returns) <= RETURN_WHAT
+    """Of modules, classes, functions and fields, of the product, the examples and the benchmarks."""
+    paths = [path for folder in (*FOLDERS, "examples", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
+    assert len(paths) > 400
+    asking = []
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and QUESTION.match(str(node.value.value))
+            ):
+                asking.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert not asking
 
 
 def test_the_filter_knows_no_sensor():

@@ -61,7 +61,7 @@ def ask(case: Case, timeout: float) -> Result:
 
 
 def _explain(prepared: Prepared, folder: Path, timeout: float) -> tuple[float, str]:
-    """Return how many seconds it took, and what went wrong."""
+    """Return its duration in seconds, and its error."""
     config = save(prepared.config, folder / "declared.yaml")
     options = ("calibration", prepared.calibration), ("train", prepared.train), ("holdout", prepared.holdout)
     words = [word for option, names in options for name in names for word in (f"--{option}", str(name))]
@@ -91,7 +91,7 @@ def _last(text: str) -> str:
 
 
 def judged(prepared: Prepared, out: Path) -> dict[str, Any]:
-    """Return how well what explain left in a folder answers the case."""
+    """Return the score of the results of explain in a folder."""
     content = json.loads((out / "loop.json").read_text(encoding="utf-8"))
     named = judge(content, prepared.truths, prepared.tolerated)
     before, after = errors(out / "prediction.h5", prepared.bias)

@@ -1,4 +1,4 @@
-"""What a case is: a config, recordings, what is in them, and yardsticks."""
+"""Cases: a config, recordings, their truth, and reference errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When an answer names what is in a recording: effects of the same physics count alike.
+"""Scoring of the effects that an answer names: those of the same physics count alike.
 
 An answer is *right* where it is the truth or cannot differ from it in shape; *related* where channel and physics are
 right and the shape is not; anything else that was added is *false*.
@@ -27,7 +27,7 @@ class Pattern:
     form: str | None = None  # what the parameter `form` must not be
 
     def fits(self, effect: Effect) -> bool:
-        """Return whether the effect is one of these; a hyper-parameter that is not told fits."""
+        """Return True if the effect is one of these; a hyper-parameter that is not given fits."""
         if self.kind not in (effect["kind"], "*"):
             return False
         if self.channel is not None and not _about(self.channel, str(effect.get("channel", ""))):
@@ -41,7 +41,7 @@ class Pattern:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is in a recording, in words, and the answers that name it."""
+    """An effect in a recording, in words, and the answers that name it."""
 
     name: str
     right: tuple[Pattern, ...]
@@ -51,7 +51,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Named:
-    """How many truths were named right, how many by a relative, and what was added that is not there."""
+    """Counts of true effects that were named, of those named by a relative, and the false ones."""
 
     right: int
     related: int
@@ -59,7 +59,7 @@ class Named:
 
 
 def _about(expected: str, channel: str) -> bool:
-    """Return whether the channel, or the product of channels, is the expected one."""
+    """Return True if the channel, or the product of channels, is the expected one."""
     return sorted(expected.split("*")) == sorted(channel.split("*"))
 
 
@@ -78,13 +78,13 @@ def shown(effect: Effect) -> str:
 
 
 def _rivals(effect: Effect) -> list[dict[str, str]]:
-    """Return what an effect could not be told from, as effects without parameters."""
+    """Return the effects that one could not be distinguished from, without parameters."""
     parts = [str(name).partition(" of ") for name in effect.get("indistinguishable_from", [])]
     return [{"kind": kind, **({"channel": channel} if channel else {})} for kind, _, channel in parts]
 
 
 def judge(content: Mapping[str, Any], truths: Sequence[Truth], tolerated: Sequence[Pattern]) -> Named:
-    """Return how well the effects of loop.json name what is there; each names one truth at most."""
+    """Return the score of the effects of loop.json; each names one true effect at most."""
     left = list(content["effects"])
     found = {"right": 0, "related": 0}
     open_ = list(truths)

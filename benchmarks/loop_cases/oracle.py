@@ -1,4 +1,4 @@
-"""What a model that is told the truth reaches: least squares of a smooth map, true signatures and levels.
+"""Least error of a model that knows the truth: least squares of a smooth map, true signatures and levels.
 
 ::
 

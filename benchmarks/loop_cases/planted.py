@@ -42,7 +42,7 @@ class Bed:
         return self.t - starts[np.maximum(np.searchsorted(starts, self.t, "right") - 1, 0)]
 
     def inside(self) -> list[Array]:
-        """Return which rows each part has."""
+        """Return the rows of each part."""
         return [(self.t >= start) & (self.t < stop) for start, stop in self.parts]
 
 
@@ -111,7 +111,7 @@ def findable(bed: Bed, signature: Array) -> float:
 def plant(
     bed: Bed, kinds: Sequence[str], size: float, d: int, rng: np.random.Generator, known: Mapping[str, Kind]
 ) -> tuple[Array, tuple[names.Truth, ...], dict[str, Array], Array]:
-    """Return what is added to the gyro (N, d), its names, channels, and signatures (N, k); `size` is a findable rms."""
+    """Return the addition to the gyro (N, d), its names, channels, and signatures (N, k); `size` is a findable rms."""
     added, truths, channels, signatures = np.zeros((len(bed.t), d)), [], {}, np.empty((len(bed.t), len(kinds)))
     for k, kind in enumerate(kinds):
         signatures[:, k], truth, more = known[kind](bed, rng)

@@ -1,4 +1,4 @@
-"""What can be planted: signatures of drawn hidden parameters, computed by hand and sharing nothing with driftlab."""
+"""Signatures to be planted, of drawn hidden parameters, computed by hand and sharing nothing with driftlab."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def late(x: Array, tau: float, dt: float = 1.0) -> Array:
 
 
 def dragged(T: Array, width: float) -> Array:
-    """Return where an element with play is, that is dragged along by T from both ends."""
+    """Return the position of an element with play that is dragged along by T from both ends."""
     out, at = np.empty_like(T), T[0]
     for k, value in enumerate(T.tolist()):
         at = min(max(at, value - width / 2), value + width / 2)

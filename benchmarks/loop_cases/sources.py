@@ -1,4 +1,4 @@
-"""Where the measured recordings are; a case whose recording is not there cannot be made, and says so."""
+"""Places of the measured recordings; a case whose recording is not there cannot be made, and says so."""
 
 from __future__ import annotations
 

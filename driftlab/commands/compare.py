@@ -40,9 +40,8 @@ class CompareResult(Result):
         return self.found[name]
 
     def lines(self) -> list[str]:
-        """Return who coasts best, and the notes on the runs, a sentence each."""
-        limits = [f"{name}: {line}" for name, line in comparison.limit_lines(self.found).items()]
-        return [self.summary["verdict"], *limits, *comparison.notes(self.found)]
+        """Return the ranking by coast, and the notes on the runs, a sentence each."""
+        return [self.summary["verdict"], *comparison.limit_lines(self.found), *comparison.notes(self.found)]
 
     def to_polars(self) -> pl.DataFrame:
         """Return the tables as one: table, row, config, axis and error in SI."""
@@ -138,8 +137,8 @@ def show(result: CompareResult, given: Mapping[str, Any]) -> None:
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
     terminal().print(comparison.verdict(comparisons))
-    for name, line in comparison.limit_lines(comparisons).items():
-        terminal().print(f"{name}: {line}", soft_wrap=True)
+    for line in comparison.limit_lines(comparisons):
+        terminal().print(line, soft_wrap=True)
     terminal().print()
     _side_by_side(comparisons, coasts)
     if given["paper"]:

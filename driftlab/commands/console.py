@@ -167,10 +167,8 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 @cache
 def note_compiling() -> None:
-    """Announce once a process, on standard error, that loops are compiled: by a new installation or processor."""
+    """Announce once in a process, on standard error, that loops are compiled for an installation or a processor."""
     from numba.core import event
-
-    console = terminal(stderr=True)
 
     class Notice(event.Listener):  # type: ignore[misc]
         seconds, announced = 0.0, False
@@ -178,7 +176,7 @@ def note_compiling() -> None:
         def on_start(self, event: Any) -> None:
             if self.seconds > COMPILED and not self.announced:
                 self.announced = True
-                console.print(
+                terminal(stderr=True).print(
                     "compiling the filter for this processor, up to some minutes; it is kept for the next time",
                     soft_wrap=True,
                 )

@@ -123,7 +123,7 @@ def explain(
     calibration : as `data` of `run`, or a list of them
         The soak; may be repeated.
         All recordings are at rest. What is in memory is distinguished by the hash of its samples; parts that overlap
-        are not.
+        are not recognised.
     train : as `calibration`
         To find effects on; may be repeated.
     holdout : as `calibration`
@@ -232,7 +232,7 @@ def _explained(
 
 
 def _refute(folder: Path, declared: Config, candidate: Config, whole: Identification) -> None:
-    """Move what was found to the candidate's files, and leave config and map as they were declared, to the byte."""
+    """Move the identified effects to the candidate's files, and leave config and map as they were declared."""
     for declared_map in folder.glob("declared.*"):
         explained = folder / f"explained{declared_map.suffix}"
         candidate = with_map(candidate, path=Path(explained.rename(folder / f"candidate{explained.suffix}").name))

@@ -17,7 +17,7 @@ from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import UnitPosterior, unit_posterior
-from driftlab.family.rows import rows_of, soaked_of
+from driftlab.family.unit_noise import soaked_of
 from driftlab.maps.fit import USUAL, fit_gathered, gather, map_settings
 from driftlab.reports import family_map as words
 from driftlab.reports.charts import Chart
@@ -139,7 +139,7 @@ def fit_family_map(
         own = fit_gathered(config, map_settings(config, None if config.tracked_maps() else USUAL), soak)
     except DataError as error:
         faults.note(f"no map of its own: {error}")
-    information, _ = soaked_of("", tuple(tracked.axes), rows_of(soak, tracked.channel), law.knots.step)
+    information, _ = soaked_of("", tuple(tracked.axes), soak.rows(tracked.channel), law.knots.step)
     posterior = unit_posterior(law, information, lot)
     result = FamilyMapResult(config, recordings, (family, law), posterior, own, faults)
     if out is not None:

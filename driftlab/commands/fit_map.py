@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
@@ -29,7 +30,7 @@ from driftlab.reports.charts import Chart
 from driftlab.reports.figures import svg
 from driftlab.reports.map import chart, page_of
 from driftlab.reports.provenance import map_facts, sheet_of
-from driftlab.soak.blocks import GrowingBlocks
+from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_file, check_place, save, write_text
 from driftlab.units import BiasUnit, tracked_unit
@@ -267,17 +268,18 @@ def _compared(config: Config, soak: GatheredSoak, progress: Progress | None) -> 
 
 
 def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
-    """Return T (K_r,) and bias (K_r, d) of each recording's blocks, all of the same number of samples."""
-    n = 1
-    while len(soak.T) > n * MAX_BLOCKS:
-        n *= 2
+    """Return T (K_r,) and bias (K_r, d) of each recording's blocks, all of about the same number of samples.
+
+    The coldest and the warmest block stand at the lowest and the highest temperature of the recording.
+    """
+    n = 2 ** max(int(np.ceil(np.log2(len(soak.T) / MAX_BLOCKS))), 0)
     T, bias = [], []
-    for start, stop in zip(soak.starts, [*soak.starts[1:], len(soak.T)], strict=True):
-        growing = GrowingBlocks(most=stop - start + 1, n=n)
-        growing.add(np.arange(start, stop, dtype=np.float64), soak.T[start:stop], soak.bias[start:stop])
-        means = growing.blocks()
-        T.append(means.T)
-        bias.append(means.bias)
+    for start, stop in pairwise([*soak.starts, len(soak.T)]):
+        own_T, cuts = soak.T[start:stop], runs([0], stop - start, n)
+        T.append(means(own_T, cuts))
+        bias.append(means(soak.bias[start:stop], cuts))
+        if len(cuts) > 1:
+            T[-1][[np.argmin(T[-1]), np.argmax(T[-1])]] = np.min(own_T), np.max(own_T)
     return T, bias
 
 

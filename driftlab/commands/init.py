@@ -33,9 +33,9 @@ class FirstConfig:
 def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | None = None) -> FirstConfig:
     """Write a first config of a file, with every guess marked.
 
-    Which source reads it, its channels, units and noise. FILE is a log of PX4 (.ulg) or ArduPilot (.bin), a ROS bag,
+    It has the source, channels, units and noise. FILE is a log of PX4 (.ulg) or ArduPilot (.bin), a ROS bag,
     CSV (.csv.gz too), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that an installed framing knows.
-    What cannot be guessed is asked for.
+    Values without a guess are left to be filled in.
 
     Parameters
     ----------

@@ -202,7 +202,7 @@ class Live:
         return {"source_faults": dict(self.status.faults.found)}
 
     def _samples(self) -> Iterator[Chunk]:
-        """Yield what was recorded before, then what comes; record it, and end when asked to."""
+        """Yield the samples recorded before, then new ones; record these, and end when asked to."""
         if self.recorder is not None and self.recorder.rows:
             yield from recorded_source(self.recorder.path).chunks(ROWS, Faults())
         begun = flushed = time.monotonic()

@@ -1,4 +1,4 @@
-"""The chamber profile that tells most, before anything is recorded or after it: `driftlab plan`."""
+"""The chamber profile of the smallest map uncertainty, before anything is recorded or after it: `driftlab plan`."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class PlanResult(Result):
         self.summary = plain(presentation.document)
 
     def lines(self) -> list[str]:
-        """Return why this profile, what is known so far, and on what the plan stands, a sentence each."""
+        """Return the reasons for this profile, the knowledge so far, and the basis of the plan, a sentence each."""
         return self._presentation.lines
 
     def table(self) -> Table:
@@ -131,7 +131,9 @@ def plan(
     out: Place | None = None,
     progress: Progress | None = None,
 ) -> PlanResult:
-    """Find the chamber profile that tells most, or the shortest.
+    """Find the chamber profile of least map uncertainty.
+
+    With a sigma to reach, the shortest one that reaches it.
 
     Parameters
     ----------
@@ -156,9 +158,9 @@ def plan(
     kind : str, optional
         Kind of map, instead of the config's.
     effects : sequence of str
-        Effects that the profile is to tell apart.
-        As `("hysteresis", "thermal_lag")`, in place of all that are installed; the profile is then the one that tells
-        them best among those whose sigma is nearly the best.
+        Effects that the profile is to distinguish.
+        As `("hysteresis", "thermal_lag")`, in place of all that are installed; the profile is then the one that
+        distinguishes them best among those whose sigma is nearly the best.
     channel : as that of `run`
     after : as `data` of `run`, or a list of them, optional
         What was recorded already; may be repeated.
@@ -321,7 +323,7 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 
 def show(result: PlanResult, given: Mapping[str, Any]) -> None:
-    """Print the plan; of effects that were named, which are told apart."""
+    """Print the plan; of effects that were named, which are distinguished."""
     console = terminal()
     console.print(result.headline, soft_wrap=True)
     console.print(result.table())

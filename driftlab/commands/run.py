@@ -247,7 +247,7 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 
 def show(result: RunResult, given: Mapping[str, Any]) -> None:
-    """Print the verdict on the limits, the table of yardsticks and the notes."""
+    """Print the verdict on the limits, the table of errors and the notes."""
     console, config = terminal(), result.config
     print_verdict(result.verdict)
     for row in result.judged:

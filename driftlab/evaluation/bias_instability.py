@@ -57,14 +57,13 @@ class Averages:
         """Return the bias instability of all stretches at rest without a gap."""
         cut, values = self._whole()
         lasted = cut.samples * self.step
-        none = np.full(len(self.axes), np.nan)
         if not cut.enough:
             longest, least = np.max(cut.places, initial=0) * self.step, MIN_STRETCH * self.step
             text = (
                 f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {MIN_SAMPLES * self.step:.4g} s or "
                 f"more, {least:.4g} s of it without a gap"
             )
-            return Measured(none, self.axes, missing=text)
+            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         fits = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
         of = "the rest less the map, " if self.less is not None else "the rest, "
         return of_allan(fits, self.axes, lasted, of=of)["bias_instability"]

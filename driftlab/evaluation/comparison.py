@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -143,7 +143,7 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
     for name, config in configs.items():
         # the first one's error is that of all, whatever they take the noise for
         initial = next(iter(runs.values())).initial if runs else None
-        runs[name] = _compared(config, initial, partial(_report, progress, name))
+        runs[name] = _compared(name, config, initial, progress or (lambda what: None))
     return runs
 
 
@@ -156,19 +156,14 @@ def _check_alike(configs: dict[str, Config]) -> None:
         raise ConfigError(f"the configs are about different sensors ({each}); compare configs of one sensor")
 
 
-def _report(progress: Callable[[str], None] | None, name: str, what: str) -> None:
-    if progress is not None:
-        progress(f"{name}: {what}")
-
-
-def _compared(config: Config, initial: InitialError | None, progress: Callable[[str], None]) -> Comparison:
+def _compared(name: str, config: Config, initial: InitialError | None, progress: Callable[[str], None]) -> Comparison:
     journal = RunLog()
     run = Run(config, journal)
     recording = concatenate(list(epochs(read(config, journal.faults), run.model.update_interval)))
-    progress("nominal")
+    progress(f"{name}: nominal")
     initial = initial_error(run.model.tracked) if initial is None else initial
     nominal = _condition(config, recording, 0.0, initial.threshold, journal)
-    progress("with an initial error")
+    progress(f"{name}: with an initial error")
     offset = _condition(config, recording, initial.size, initial.threshold, RunLog())
     rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
     away = rate - _reference(nominal.estimates)
@@ -258,9 +253,9 @@ def verdict(runs: Mapping[str, Comparison]) -> str:
     return ranking.verdict(scores, unit, min(run.span for run in runs.values()))
 
 
-def limit_lines(runs: Mapping[str, Comparison]) -> dict[str, str]:
-    """Return, of each config that has limits, whether it keeps them, in a line."""
-    return {name: limits.verdict(run.judged) for name, run in runs.items() if run.judged}
+def limit_lines(runs: Mapping[str, Comparison]) -> list[str]:
+    """Return the verdict on the limits of each config that has some, in a line."""
+    return [f"{name}: {limits.verdict(run.judged)}" for name, run in runs.items() if run.judged]
 
 
 def notes(runs: Mapping[str, Comparison]) -> list[str]:

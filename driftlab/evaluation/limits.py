@@ -12,7 +12,8 @@ d axes; all values in SI.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -75,7 +76,7 @@ class Measured:
     otherwise : str
         What would decide where time does not.
     beside : str
-        What is said beside the verdict where no limit is set for it.
+        Remark beside the verdict where no limit is set for it.
     """
 
     values: Array
@@ -113,7 +114,7 @@ class LimitResult:
     more : float
         Time that would, beside what was measured, s; NaN where none would, or that is not known.
     beside : str
-        What is said beside the verdict on all limits, since none is set for it; the first row has it.
+        Remark beside the verdict on all limits, since none is set for it; the first row has it.
     """
 
     name: str
@@ -202,9 +203,8 @@ def verdict(rows: Sequence[LimitResult]) -> str:
     """
     if not rows:
         return ""
-    words = ("pass", "fail", "undecided", "not measured")
-    by = {word: [NAMES[row.name] for row in rows if row.verdict == word] for word in words}
-    more = "".join(f"; {word}: {', '.join(by[word])}" for word in words[2:] if by[word])
+    by = {word: [NAMES[row.name] for row in rows if row.verdict == word] for word in VERDICTS}
+    more = "".join(f"; {word}: {', '.join(by[word])}" for word in ("undecided", "not measured") if by[word])
     beside = "".join(f"; {row.beside}" for row in rows if row.beside)
     count = f"{len(by['pass'])} of {len(rows)} limit{'s' * (len(rows) > 1)} kept"
     if by["fail"]:
@@ -218,6 +218,21 @@ def worst(rows: Sequence[Mapping[str, Any]]) -> str | None:
     """Return the verdict on a unit of the rows of its limits as JSON has them; None where there are none."""
     verdicts = [row.get("verdict") for row in rows]
     return next((word for word in VERDICTS if word in verdicts), None)
+
+
+def verdict_of_units(units: Iterable[Sequence[Mapping[str, Any]]]) -> str:
+    """Return the number of units that pass, fail or are undecided, and by which limits; empty where none is set.
+
+    Of each unit, `units` has the rows of its limits as JSON has them.
+    """
+    judged = [(word, rows) for rows in units if (word := worst(rows)) is not None]
+    parts = []
+    for word in ("pass", "fail", "undecided", "not measured"):
+        of_word = [rows for verdict, rows in judged if verdict == word]
+        names = Counter(NAMES[row["name"]] for rows in of_word for row in rows if row["verdict"] == word != "pass")
+        by = ", ".join(f"{name} {count:,}" for name, count in names.most_common())
+        parts += [f"{len(of_word):,} {word}{f' ({by})' * bool(by)}"] if of_word or word == "pass" else []
+    return f"limits: {'; '.join(parts)}" if judged else ""
 
 
 def outcome(line: str) -> str:
@@ -275,8 +290,7 @@ def _undecided(row: LimitResult, measured: Measured) -> LimitResult:
         more = float("nan")
     else:
         beyond = "below" if row.value <= row.limit else "above"
-        hours = more / 3600
-        size = f"{hours:.2g} h" if hours >= 0.95 else f"{max(more / 60, 1):.2g} min"
+        size = f"{more / 3600:.2g} h" if more >= 0.95 * 3600 else f"{max(more / 60, 1):.2g} min"
         needs = f"about {size} more would decide it, if {row.axis} stays {beyond} the limit by as much"
     return replace(row, needs=needs, more=float(more))
 

@@ -39,7 +39,7 @@ def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
 
     The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
     its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
-    the curve's change between the two temperatures. A hysteresis is said in `unit` where no limit is set for it.
+    the curve's change between the two temperatures. A hysteresis is noted in `unit` where no limit is set for it.
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
@@ -88,7 +88,7 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
         return Measured(none, axes, missing=text)
     size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
     if memory["answer"] == "undecided":
-        why = memory["why"] or "it cannot be told on this soak"
+        why = memory["why"] or "it is not known from this soak"
         looked_for = memory.get("log_evidence") is not None
         return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
     if memory["answer"] == "none":
@@ -132,7 +132,7 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     """Return the coast of a run: the rms of its error over 10 minutes after an alignment, in the mean over the run.
 
     `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into coasts of 10
-    minutes, each as if aligned right before it (`yardsticks.coasts`). What so many of them have in the mean is told by
+    minutes, each as if aligned right before it (`yardsticks.coasts`). The mean of so many is computed by
     `fusion_core.wandering`, of the error e of the prediction over the whole run: white noise w in each cell of it,
     and what wanders by the law W::
 
@@ -165,7 +165,7 @@ def _drifted(covariance: Array, m: int) -> float:
 
 
 def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]:
-    """Return why a coast over a horizon is not to be judged, empty where it is, and how much of it was at rest."""
+    """Return the reason not to judge a coast over a horizon, empty where there is none, and its share at rest."""
     ends, share = HORIZONS[horizon], yardsticks.share[horizon]
     first = f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
     at_rest = f"{100 * share:.0f} % at rest"

@@ -194,7 +194,7 @@ class _Thinned:
     def add(self, block: Columns) -> None:
         """Take those of the next block."""
         N = len(block["t"])
-        while (self.at + N) // self.stride >= POINTS:
+        while (self.at + N) // self.stride >= POINTS - 1:
             self.stride *= 2
             self.parts = [_every(_joined(self.parts, self.parts[0]), 0, 2)] if self.parts else []
         kept = _every({name: block[name] for name in DRAWN if name in block}, -self.at % self.stride, self.stride)

@@ -97,7 +97,7 @@ def verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
     """
     ranked = ranking(runs)
     if ranked is None:
-        return "Which config coasts best is not known: too little of the recording is at rest after the alignment."
+        return "The config that coasts best is not known: too little of the recording is at rest after the alignment."
     text = _single(ranked, unit) if len(runs) == 1 else _several(ranked, unit)
     text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
     return text + _shorter(runs, ranked, span)
@@ -114,13 +114,13 @@ def _several(ranked: Ranking, unit: BiasUnit) -> str:
     best = ranked.best
     over = "" if ranked.axes is None else " rms over the axes"
     values = {name: unit.number(value) for name, value in ranked.errors.items()}
-    others = [f"{name} {value}" for name, value in values.items() if name not in best]
+    others = ", ".join(f"{name} {value}" for name, value in values.items() if name not in best) + f" {unit.shown}"
     if len(best) == 1:
         return (
             f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
-            f"{', '.join(others)}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
+            f"{others}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
         )
-    worse = f"; worse: {', '.join(others)}" if others else ""
+    worse = f"; worse: {others}" if len(best) < len(values) else ""
     return (
         f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
         f"{listed([values[n] for n in best])} {unit.shown}{over}, "
@@ -132,11 +132,11 @@ def _sigma(ranked: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
     """Return the sigma that the configs of these names differ by less or more than."""
     largest = max(names, key=ranked.sigmas.__getitem__)
     whose = f" of {largest}" if len({unit.number(ranked.sigmas[name]) for name in names}) > 1 else ""
-    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])})"
+    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])} {unit.shown})"
 
 
 def _agree(ranked: Ranking) -> str:
-    """Return whether the axes rank the best as their rms does, and whether it is as good as its sigma."""
+    """Return the remarks on axes that rank the best otherwise than their rms, and on its sigma."""
     first, rival = list(ranked.errors)[:2]
     parts, axes = [], ranked.axes
     if axes is not None:
@@ -159,7 +159,7 @@ def _disagree(ranked: Ranking) -> str:
 
 
 def _shorter(runs: Mapping[str, Scores], ranked: Ranking, span: float) -> str:
-    """Return whether ten minutes give the same ranking, where they are not the whole."""
+    """Return the ranking over ten minutes beside that over the whole; empty where they are the whole."""
     short = ranking(runs, [OFTEN]) if ranked.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
     if short is None:
         return ""

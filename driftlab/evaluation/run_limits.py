@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from fusion_core.contracts import ThermalBias
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.evaluation.overview import Overview
-    from fusion_core.chunk import Array
     from fusion_core.contracts import Alignment, FittedMap
 
 
@@ -26,7 +24,10 @@ def map_of(config: Config) -> FittedMap | None:
 
 
 def averages_of(config: Config, alignment: Alignment) -> Averages | None:
-    """Return the averages that the limits of a config need of a run; None where none of them does."""
+    """Return the averages that the limits of a config need of a run; None where none of them does.
+
+    They are of the calibrated rate, or of the rate less the map's bias.
+    """
     limits = config.limits
     if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
         return None
@@ -37,17 +38,17 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     if fitted is None:
         return Averages(alignment.dt, sensor.axes)
     clamped = replace(fitted, outside="clamp")  # the run has refused already what is to be refused
-
-    def explained(block: Mapping[str, Array]) -> Array:
-        return clamped.bias(block["temperature"])
-
-    return Averages(alignment.dt, sensor.axes, explained)
+    return Averages(alignment.dt, sensor.axes, lambda block: clamped.bias(block["temperature"]))
 
 
 def check_run_limits(
     config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
 ) -> list[LimitResult]:
-    """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
+    """Judge a run by the limits of its config.
+
+    The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
+    survey has filled; residual, swing and hysteresis are of the map.
+    """
     if config.limits is None or config.filter is None:
         return []
     align = config.filter.align

@@ -21,13 +21,14 @@ R rows, d axes, K columns of all effects on one axis, J placebos.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows, means, runs
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
@@ -207,7 +208,7 @@ class UnitRows:
         white = []
         for axis, noise in enumerate(zip(self.soaked.white, self.soaked.walk, strict=True)):
             blocks = [
-                rows.whitened(np.column_stack([*same, own[:, axis]]), *noise, free=k > 0)[0]
+                rows.whitened(np.column_stack([*same, own[:, axis]]), *noise, free=k > 0)
                 for k, (rows, (own, *same)) in enumerate(short)
             ]
             white.append(np.concatenate(blocks))
@@ -255,17 +256,9 @@ def without_noise(T: Array) -> Array:
 
 
 def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:
-    """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most; what is over is left out."""
-    run = -(-len(rows.t) // ROWS)
-    if run == 1:
-        return rows, list(columns)
-    count = len(rows.t) // run
-
-    def mean(values: Array) -> Array:
-        return np.asarray(values[: count * run].reshape(count, run, *values.shape[1:]).mean(axis=1))
-
-    span = mean(rows.span) * run
-    return SoakRows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), [mean(values) for values in columns]
+    """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most."""
+    starts = runs([0], len(rows.t), -(-len(rows.t) // ROWS))
+    return replace(rows, channels={}).coarsened(starts), [means(values, starts, rows.span) for values in columns]
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:

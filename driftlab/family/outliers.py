@@ -211,7 +211,7 @@ class _Words:
         return tuple(sorted(outliers, key=lambda odd: odd.p))
 
     def _of_loop(self, k: int, p: Mapping[tuple[str, int], float], reason: Reason) -> bool:
-        """Whether a curve is off by no more than what its hysteresis is, which ends where the temperature turns."""
+        """Return True if a curve is off by no more than its hysteresis, which ends where the temperature turns."""
         loops = [own for what, own in p if what == "hysteresis" and own in reason.axes]
         value = [float(self.tests.values[k, self.tests.what.index(("hysteresis", own))]) for own in loops]
         return bool(value) and abs(reason.off) < max(value)
@@ -435,7 +435,7 @@ class CurveReasons:
         return cost, self._ordinary(left, own, _cost(J, h, mine.c, mine.L)[1])
 
     def _ordinary(self, left: CurveDeviation, axis: int, before: CurveDeviation) -> bool:
-        """Whether what is left of a curve is ordinary, or next to nothing of what it was."""
+        """Return True if what is left of a curve is ordinary, or next to nothing of what it was."""
         law, square = self.laws.curves.get("curve"), left.squared()
         if law is None or np.isnan(square):
             return False

@@ -94,7 +94,7 @@ class UnitPosterior:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Whether each of T (N,) was soaked."""
+        """True where T (N,) was soaked."""
         temperature = self.T
         return (temperature >= self.band.low) & (temperature <= self.band.high)
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.record import Figure
-from driftlab.family.unit_information import SoakRows
 from driftlab.family.unit_noise import densities_of
+from driftlab.soak.blocks import SoakRows
 from fusion_core.chunk import Array
 from fusion_core.recursions import play
 

@@ -28,7 +28,7 @@ from fusion_core.host.registry import Installed
 if TYPE_CHECKING:
     from driftlab.units import BiasUnit
 
-DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
+DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished
 HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 MIN_UNITS = 2  # of a lot, for a law of its own
 NAMED = 6  # lots that are named one by one
@@ -94,7 +94,7 @@ class LotEffects:
     differs: float = 1.0
 
     def has(self, lot: str) -> bool:
-        """Whether the units of a lot have the effect."""
+        """Return True if the units of a lot have the effect."""
         return self.others is None or any(one.lot == lot and one.has for one in self.lots)
 
     def law_of(self, lot: str) -> EffectDistribution:
@@ -186,32 +186,31 @@ def _without(soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect])
     spread = np.concatenate([np.zeros((d, 0)), *(law.spread for law in laws)], axis=1)
     Z = columns_of([one.effect for one in coefficient], soaked, chunks_of(soaked))
     T = seen_temperatures(soaked, [effect.effect for effect in effects])
-    J, h, squares, log_det = soaked.J.copy(), soaked.h.copy(), soaked.squares.copy(), soaked.log_det.copy()
+    J, h = soaked.J.copy(), soaked.h.copy()
     bias = [rows.bias.copy() for rows in soaked.recordings]
     for axis in range(d):
-        N, log_det[axis] = _products(soaked, axis, T, [z[:, axis] for z in Z], mean[axis], spread[axis])
+        N = _products(soaked, axis, T, [z[:, axis] for z in Z], mean[axis], spread[axis])
         V = N[q + 1 :, q + 1 :] + np.eye(mean.shape[1])
         S = N[: q + 1, : q + 1] - N[: q + 1, q + 1 :] @ np.linalg.solve(V, N[q + 1 :, : q + 1])
-        J[axis], h[axis], squares[axis] = S[:q, :q], S[:q, q], S[q, q]
-        log_det[axis] += float(np.linalg.slogdet(V)[1])
+        J[axis], h[axis] = S[:q, :q], S[:q, q]
         curve = np.linalg.lstsq(J[axis], h[axis], rcond=1e-10)[0]
         beyond = np.linalg.solve(V, N[q + 1 :, q] - N[q + 1 :, :q] @ curve)
         for one, z in zip(bias, Z, strict=True):
             one[:, axis] -= z[:, axis] @ (mean[axis] + spread[axis] * beyond)
     rows = tuple(replace(one, T=t, bias=y) for one, t, y in zip(soaked.recordings, T, bias, strict=True))
-    return replace(soaked, J=J, h=h, squares=squares, log_det=log_det, recordings=rows)
+    return replace(soaked, J=J, h=h, recordings=rows)
 
 
 def _products(
     soaked: UnitInformation, axis: int, T: Sequence[Array], Z: Sequence[Array], mean: Array, spread: Array
-) -> tuple[Array, float]:
-    """Return the products of splines, bias less effects at their means, and effects a spread each; and log det S."""
-    total, log_det = np.zeros(()), 0.0
+) -> Array:
+    """Return the products of splines, bias less effects at their means, and effects a spread each."""
+    total = np.zeros(())
     for k, (rows, t, z) in enumerate(zip(soaked.recordings, T, Z, strict=True)):
         columns = np.column_stack([soaked.knots.values(t), rows.bias[:, axis] - z @ mean, z * spread])
-        X, own = rows.whitened(columns, soaked.white[axis], soaked.walk[axis], free=k > 0)
-        total, log_det = total + X.T @ X, log_det + own
-    return total, log_det
+        X = rows.whitened(columns, soaked.white[axis], soaked.walk[axis], free=k > 0)
+        total = total + X.T @ X
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +384,7 @@ def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     if effect.others is not None:
         lines.append(f"{name}: in the other lots {_sizes(effect, effect.others, unit, axes)}.")
     if effect.indistinguishable_from:
-        lines.append(f"{name}: cannot be told from {', '.join(effect.indistinguishable_from)} on these soaks.")
+        lines.append(f"{name}: cannot be distinguished from {', '.join(effect.indistinguishable_from)} on these soaks.")
     return lines
 
 
@@ -411,6 +410,6 @@ def _sizes(effect: SharedEffect, law: EffectDistribution, unit: BiasUnit, axes: 
             mean, sigma, spread = (float(v[axis, k]) * unit.factor for v in (law.mean, law.sigma, law.spread))
             term = effect.effect.terms[k]
             about = f"{name} {term}".strip()
-            lines.append(f"{about} {mean:.2g} +- {sigma:.1g} {units[place]} (units spread {spread:.1g})")
+            lines.append(f"{about} {mean:.2g} ± {sigma:.1g} {units[place]} (units spread {spread:.1g})")
     signs = bool(np.all(law.spread > SIGNS * np.abs(law.mean)))
     return ("of either sign, " if signs else "") + ", ".join(lines)

@@ -108,7 +108,7 @@ class Candidate:
 
     @property
     def pays(self) -> bool:
-        """Whether there is enough evidence, and left-out units are predicted."""
+        """True if there is enough evidence, and left-out units are predicted."""
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 

@@ -50,7 +50,7 @@ class SharedEffects:
     Attributes
     ----------
     verdict : str
-        `nothing_common`, `explained`, or `ambiguous`: rivals cannot be told apart.
+        `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished.
     effects : tuple of SharedEffect
     rejected : tuple of (str, str)
         The best of every other kind, and why it was not added.

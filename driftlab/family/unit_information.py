@@ -4,8 +4,8 @@ The bias of an axis over R rows, means of some seconds at rest, is::
 
     y = B(T) c + walk + white,    c the coefficients of the family's basis (`driftlab.family.basis`)
 
-The likelihood of c under the noise of the rows has J = B' S^-1 B and h = B' S^-1 y: -2 log L = c'Jc - 2 c'h + y'S^-1y
-+ log det S. Coefficients at temperatures that were never seen have no information, and that is all it takes for units
+The likelihood of c under the noise of the rows has J = B' S^-1 B and h = B' S^-1 y: -2 log L = c'Jc - 2 c'h and what
+knows no c. Coefficients at temperatures that were never seen have no information, and that is all it takes for units
 that saw half of the range. The rows stay beside it: the signature of an effect in them may be asked for later.
 q coefficients, d axes.
 """
@@ -13,78 +13,16 @@ q coefficients, d axes.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
-from driftlab.noise.local_level import log_determinant, whitened
+from driftlab.soak.blocks import SoakRows
 from fusion_core.budget import opened
 from fusion_core.chunk import Array
-
-UNKNOWN = 1e8  # times the noise and the walk of a whole recording: variance of a level of which nothing is known
-
-
-def unknown_level(noise: Array, steps: Array) -> float:
-    """Return the variance of an unknown level, beside variances (R,) of white noise and of the steps of the walk."""
-    return UNKNOWN * float(np.max(noise) + np.sum(steps))
-
-
-@dataclass(frozen=True, eq=False)
-class SoakRows:
-    """Means of one recording at rest, in the order of time.
-
-    Attributes
-    ----------
-    t : (R,) array
-        Their middles, s.
-    T : (R,) array
-        Temperature as measured, degC.
-    bias : (R, d) array
-        Of the tracked sensor, SI.
-    span : (R,) array
-        How long each was measured, s.
-    channels : mapping of str to (R,) or (R, k) array
-        What else was recorded, for effects.
-    """
-
-    t: Array
-    T: Array
-    bias: Array
-    span: Array
-    channels: Mapping[str, Array]
-
-    def part(self, where: NDArray[np.bool_]) -> SoakRows:
-        """Return the rows of which `where` (R,) is true."""
-        channels = {name: values[where] for name, values in self.channels.items()}
-        return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
-
-    def within(self, low: float, high: float) -> NDArray[np.bool_]:
-        """Whether each row (R,) is at a temperature from low to high, degC."""
-        temperature = self.T
-        return (temperature >= low) & (temperature <= high)
-
-    def variances(self, white: float, walk: float, *, free: bool) -> tuple[Array, Array]:
-        """Return variances (R,) of the white noise of the rows and of the walk that leads to each.
-
-        `white` and `walk` are densities, SI/sqrt(Hz) and SI/sqrt(s). The level is that of the curve at the first row,
-        or `free`: nothing is known of it, as of a further recording of the same unit.
-        """
-        steps = walk**2 * np.diff(self.t, prepend=self.t[0])
-        noise = np.maximum(white**2 / self.span, np.finfo(float).tiny)
-        if free:
-            steps[0] = unknown_level(noise, steps)
-        return noise, steps
-
-    def whitened(self, columns: Array, white: float, walk: float, *, free: bool) -> tuple[Array, float]:
-        """Return columns (R, m) over the rows as normalised innovations, and log det of the covariance of the rows.
-
-        The noise is that of `variances`.
-        """
-        noise, steps = self.variances(white, walk, free=free)
-        return whitened(columns, noise, steps), log_determinant(noise, steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +38,11 @@ class UnitInformation:
         Over the temperatures that the unit saw.
     J, h : (d, q, q) and (d, q) arrays
         Information on the coefficients, and information times their values.
-    squares, log_det : (d,) arrays
-        y' S^-1 y, and log det S: what a likelihood needs beside J and h.
     count : int
         Rows in all.
     white, walk : (d,) arrays
         Densities of the noise that J and h stand on, SI/sqrt(Hz) and SI/sqrt(s).
-    recordings : tuple of Rows
+    recordings : tuple of SoakRows
         The first one's level is the map's, each further one has a level of its own.
     """
 
@@ -115,8 +51,6 @@ class UnitInformation:
     knots: SplineBasis
     J: Array
     h: Array
-    squares: Array
-    log_det: Array
     count: int
     white: Array
     walk: Array
@@ -135,23 +69,19 @@ class UnitInformation:
         T = np.concatenate([rows.T[where] for rows, where in zip(recordings, used, strict=True)])
         knots = SplineBasis.over(T, step)
         d, q = len(axes), knots.q
-        J, h, squares, log_det = np.zeros((d, q, q)), np.zeros((d, q)), np.zeros(d), np.zeros(d)
+        J, h = np.zeros((d, q, q)), np.zeros((d, q))
         parts = []
         for k, (rows, where) in enumerate(zip(recordings, used, strict=True)):
             if not np.any(where):
                 continue
             parts.append(rows.part(where))
-            B = knots.values(rows.T[where])
+            B = knots.values(parts[-1].T)
             for axis in range(d):
-                noise, steps = rows.variances(white[axis], walk[axis], free=k > 0)
-                noise, steps = noise[where], np.diff(np.cumsum(steps)[where], prepend=0.0)
-                X = whitened(np.column_stack([B, rows.bias[where, axis]]), noise, steps)
-                N = X.T @ X
-                J[axis] += N[:q, :q]
-                h[axis] += N[:q, q]
-                squares[axis] += N[q, q]
-                log_det[axis] += log_determinant(noise, steps)
-        return cls(unit, axes, knots, J, h, squares, log_det, len(T), white, walk, tuple(parts))
+                columns = np.column_stack([B, parts[-1].bias[:, axis]])
+                X = parts[-1].whitened(columns, white[axis], walk[axis], free=k > 0, start=rows.t[0])
+                J[axis] += X[:, :q].T @ X[:, :q]
+                h[axis] += X[:, :q].T @ X[:, q]
+        return cls(unit, axes, knots, J, h, len(T), white, walk, tuple(parts))
 
     def between(self, low: float, high: float) -> UnitInformation | None:
         """Return the information of the rows at temperatures from low to high, degC.
@@ -178,7 +108,7 @@ class UnitInformation:
             "knots": np.array([self.knots.first, self.knots.intervals, self.knots.step]),
             "count": np.array(self.count),
         }
-        arrays |= {name: getattr(self, name) for name in ("J", "h", "squares", "log_det", "white", "walk")}
+        arrays |= {name: getattr(self, name) for name in ("J", "h", "white", "walk")}
         for k, rows in enumerate(self.recordings):
             arrays |= {f"{k}/{name}": getattr(rows, name) for name in ("t", "T", "bias", "span")}
             arrays |= {f"{k}/channel/{name}": values for name, values in rows.channels.items()}
@@ -199,6 +129,5 @@ class UnitInformation:
                 recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
             return cls(
                 str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
-                file["J"], file["h"], file["squares"], file["log_det"], int(file["count"]), file["white"],
-                file["walk"], tuple(recordings),
+                file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
             )  # fmt: skip

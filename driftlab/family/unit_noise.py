@@ -1,15 +1,9 @@
 """Densities of a unit's white noise and random walk, whatever its curve: restricted maximum likelihood.
 
 The rows of a soak are a curve of the family's basis, a walk and white noise (`driftlab.family.unit_information`). With
-the densities s of the white noise and k of the walk, and r = k^2 / s^2, the noise has the covariance s^2 V(r), and
-what no curve can make of the rows y is as likely as::
-
-    - 2 l(s, r) = nu log s^2 + Q(r) / s^2 + log det V + log det B' V^-1 B,
-    Q = y' V^-1 y - y' V^-1 B (B' V^-1 B)^-1 B' V^-1 y
-
-with nu rows less coefficients and levels; s^2 = Q / nu is taken out, and r is found on a grid in its logarithm that is
-made finer where it is likely. Deviations are those of the logarithms, from the curvature of l at its maximum.
-d axes, q coefficients.
+the densities s of the white noise and k of the walk, r = k^2 / s^2 is found beside the curve
+(`driftlab.noise.local_level`) on a grid in its logarithm, of which the likelihood is smooth. Deviations are those of
+the logarithms, from the curvature of the likelihood at its maximum. d axes, q coefficients.
 
 A real unit's slow noise is more than its fast walk lets expect: it lags, it wanders where the temperature does, and
 after a warm night it is elsewhere. So `walk_from_repeated_sweeps` cuts the soak into sweeps and holds a curve for each
@@ -19,8 +13,6 @@ sweep against one for all. By white noise and walk alone, the gain is chi-square
 
 Where G is more than chance, the walk is the least at which G is n; white noise is that of neighbouring rows.
 Temperatures visited only once contribute nothing.
-
-Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545.
 """
 
 from __future__ import annotations
@@ -30,15 +22,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows, unknown_level
-from driftlab.noise.local_level import log_determinant, whitened
+from driftlab.family.basis import STEP, SplineBasis
+from driftlab.family.unit_information import UnitInformation
+from driftlab.noise.local_level import LevelLikelihood
+from driftlab.soak.blocks import SoakRows
 from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
 
-WIDE = np.arange(-14.0, 14.1, 2.0)  # of log (walk over the whole soak / white noise of a row), its variance
-FINE = 0.4  # step of the logarithm where it is likely
-REACH = 10.0  # of - 2 log likelihood, within which the grid is finer
+GRID = np.linspace(-18.0, 14.0, 44)  # of log (walk over the whole soak / white noise of a row), its variance
 GAIN = 2.71  # of - 2 log likelihood: a walk that gains less does not show, 95 % on one side
 RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
 MIN_FREEDOM = 8  # rows more than coefficients, for a walk
@@ -70,21 +61,26 @@ class Densities:
     likely: Array
 
 
+def soaked_of(
+    unit: str, axes: tuple[str, ...], rows: tuple[SoakRows, ...], step: float = STEP
+) -> tuple[UnitInformation, Densities]:
+    """Return the information of rows on a unit under its own noise, and the densities of that.
+
+    The walk is the likely one, or the larger one that repeated sweeps need.
+    """
+    noise = densities_of(rows, step)
+    walk = walk_from_repeated_sweeps(rows, noise.white, noise.likely, step)
+    return UnitInformation.of(unit, axes, rows, noise.white, walk, step), noise
+
+
 def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     """Return the densities of the noise in rows about a curve with knots `step` K apart."""
-    profile = _Profile(recordings, step)
-    costs, scales = profile.of(WIDE)
-    near = [WIDE[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
-    fine = np.arange(min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0, FINE)
-    grid = np.concatenate([WIDE, fine])
-    order = np.argsort(grid, kind="stable")
-    order = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
-    costs, scales = (np.concatenate(pair)[order] for pair in zip((costs, scales), profile.of(fine), strict=True))
-    none, scale = (values[0] for values in profile.of(np.array([-np.inf])))
-    columns = zip(costs.T, scales.T, none, scale, strict=True)
-    of_axes = [_axis(grid[order], cost, s2, n, s2_none, profile.nu) for cost, s2, n, s2_none in columns]
-    white, white_sigma, walk, walk_sigma, likely = np.array(of_axes).T
-    root = np.sqrt(profile.unit)  # from the ratio of the grid to that of the densities
+    likelihood, unit = _likelihood(recordings, step)
+    costs, scales = likelihood.over(np.exp(GRID) * unit)
+    none, s2_none, nu = likelihood.at(0.0)
+    columns = zip(costs.T, scales.T, none, s2_none, strict=True)
+    white, white_sigma, walk, walk_sigma, likely = np.array([_axis(*column, nu) for column in columns]).T
+    root = np.sqrt(unit)  # from the ratio of the grid to that of the densities
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
 
@@ -93,82 +89,60 @@ def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> Array:
 
     A soak that hardly shows a walk does not exclude one that is many times larger; many such soaks together do.
     """
-    profiles = [_Profile(recordings, step) for recordings in units]
-    shift = float(np.median([np.log(profile.unit) for profile in profiles]))
-    grid = np.arange(WIDE[0] - 4.0, WIDE[-1] + 0.1, 1.0)
-    costs = np.sum([profile.of(grid + shift - np.log(profile.unit))[0] for profile in profiles], axis=0)
-    at = np.linspace(grid[0], grid[-1], 1801)
+    likelihoods, own = zip(*(_likelihood(recordings, step) for recordings in units), strict=True)
+    shift = float(np.median(np.log(own)))
+    costs = np.sum([likelihood.over(np.exp(GRID + shift))[0] for likelihood in likelihoods], axis=0)
+    return np.asarray(np.sqrt([_mean(*_fine(cost)) * np.exp(shift) for cost in costs.T]))
+
+
+def _fine(cost: Array) -> tuple[Array, Array]:
+    """Return log ratios (G,) and - 2 log likelihood there, from that on the grid."""
     from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(grid, costs)(at)
-    weight = np.exp(-(curve - curve.min(axis=0)) / 2 + at[:, None] / 2)  # even in the walk, as that of a unit
-    return np.asarray(np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0)))
+    at = np.linspace(GRID[0], GRID[-1], 12801)
+    return at, CubicSpline(GRID, cost)(at)
 
 
-class _Profile:
-    """The likelihood of the walk's ratio, all axes at once."""
-
-    def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
-        self.recordings = recordings
-        T = np.concatenate([rows.T for rows in recordings])
-        B = SplineBasis.over(T, step).values(T)
-        own, V = np.linalg.eigh(B.T @ B)
-        seen = own > RANK * own[-1]
-        U = B @ (V[:, seen] / np.sqrt(own[seen]))
-        y = np.concatenate([rows.bias for rows in recordings])
-        y = y - U @ (U.T @ y)  # the curve is free: to take it off first only saves digits
-        edges = np.cumsum([len(rows.T) for rows in recordings])[:-1]
-        self.columns = [np.ascontiguousarray(part) for part in np.split(np.hstack([U, y]), edges)]
-        self.q = U.shape[1]
-        self.nu = max(len(T) - self.q - (len(recordings) - 1), 1)
-        whole = sum(float(rows.t[-1] - rows.t[0]) for rows in recordings) or 1.0
-        self.unit = 1.0 / (whole * float(np.median(np.concatenate([rows.span for rows in recordings]))))
-
-    def of(self, logs: Array) -> tuple[Array, Array]:
-        """Return - 2 log likelihood and s^2 (G, d) of log ratios (G,), in `unit`."""
-        costs, scales = [], []
-        tiny = np.finfo(float).tiny
-        for ratio in np.exp(logs) * self.unit:
-            N, log_det = np.zeros((self.columns[0].shape[1],) * 2), 0.0
-            for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
-                noise, steps = 1.0 / rows.span, ratio * np.diff(rows.t, prepend=rows.t[0])
-                if k:  # a level of its own: nothing is known of it
-                    steps[0] = unknown_level(noise, steps)
-                X = whitened(columns, noise, steps)
-                N += X.T @ X
-                log_det += log_determinant(noise, steps) - (np.log(steps[0]) if k else 0.0)
-            q = self.q
-            L = np.linalg.cholesky(N[:q, :q])
-            taken = np.linalg.solve(L, N[:q, q:])
-            s2 = np.maximum(np.diag(N)[q:] - np.sum(taken**2, axis=0), tiny) / self.nu
-            costs.append(self.nu * np.log(s2) + log_det + 2 * np.sum(np.log(np.diag(L))))
-            scales.append(s2)
-        return np.array(costs), np.array(scales)
+def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
+    """Return the mean of the walk's variance under the likelihood, even in the walk; `scale` is that of white noise."""
+    weight = np.exp(-(cost - cost.min()) / 2 + at / 2)
+    return float(np.sum(weight * scale * np.exp(at)) / np.sum(weight))
 
 
-def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
+def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
+    """Return the likelihood of the walk beside the curve, all axes at once, and the ratio that is 1 on the grids."""
+    knots = SplineBasis.over(np.concatenate([rows.T for rows in recordings]), step)
+    first, *others = [knots.values(rows.T) for rows in recordings]
+    # a curve that the levels of further recordings can make is theirs
+    B = np.concatenate([first, *(values - values.mean(axis=0) for values in others)])
+    own, V = np.linalg.eigh(B.T @ B)
+    seen = own > RANK * own[-1]
+    U = B @ (V[:, seen] / np.sqrt(own[seen]))
+    y = np.concatenate([rows.bias for rows in recordings])
+    y = y - U @ (U.T @ y)  # the curve is free: to take it off first only saves digits
+    edges = np.cumsum([len(rows.T) for rows in recordings])[:-1]
+    columns = np.split(np.hstack([U, y]), edges)
+    noises = [(1.0 / rows.span, rows.steps(free=k > 0)) for k, rows in enumerate(recordings)]
+    whole = sum(float(rows.t[-1] - rows.t[0]) for rows in recordings) or 1.0
+    unit = 1.0 / (whole * float(np.median(np.concatenate([rows.span for rows in recordings]))))
+    return LevelLikelihood([(X, *noise) for X, noise in zip(columns, noises, strict=True)], U.shape[1]), unit
+
+
+def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
     """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
     from scipy.interpolate import CubicSpline
 
-    curve, scale = CubicSpline(grid, cost), CubicSpline(grid, np.log(s2))
-    k = int(np.argmin(cost))
-    at = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 201)
-    values = curve(at)
-    best = float(at[int(np.argmin(values))])
-    least = min(float(values.min()), none)
-    fine = np.linspace(grid[0], grid[-1], 2001)
-    weight = np.exp(-(curve(fine) - least) / 2 + fine / 2)  # even in the walk's density
-    variance = np.exp(scale(fine) + fine)
-    likely = np.sqrt(float(np.sum(weight * variance) / np.sum(weight)))
+    scale, (at, curve) = CubicSpline(GRID, np.log(s2)), _fine(cost)
+    likely = np.sqrt(_mean(at, curve, np.exp(scale(at))))
+    k = int(np.argmin(curve))
     if nu < MIN_FREEDOM:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
-    if none - float(values.min()) < GAIN:
+    if none - curve[k] < GAIN:
         return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
-    bend = max(float(curve(best, 2)), 1e-3)
-    slope = float(scale(best, 1))
+    bend, slope = max(float(CubicSpline(GRID, cost)(at[k], 2)), 1e-3), float(scale(at[k], 1))
     of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
     of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
-    white, walk = np.exp(scale(best) / 2), np.exp((scale(best) + best) / 2)
+    white, walk = np.exp(scale(at[k]) / 2), np.exp((scale(at[k]) + at[k]) / 2)
     return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
 
 
@@ -218,7 +192,7 @@ class _Sweeps:
         size = self.count * self.q
         N = np.zeros((size + 1, size + 1))
         for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
-            X, _ = rows.whitened(np.column_stack([columns, rows.bias[:, axis]]), white, walk, free=k > 0)
+            X = rows.whitened(np.column_stack([columns, rows.bias[:, axis]]), white, walk, free=k > 0)
             N += X.T @ X
         A, b = N[:size, :size], N[:size, size]
         each, rank = _explained(A, b)

@@ -242,7 +242,7 @@ class FirstRest:
         return self._parts[0]
 
     def _is_rest(self, window: Chunk) -> bool:
-        """Whether the unit was at rest; then it is aligned."""
+        """Return True if the unit was at rest; then it is aligned."""
         model = self.plan.model
         measured = np.sum(window["tau"]) >= model.align / 2  # a gap is no rest
         if not (measured and len(window) > 2 and model.still(window)):

@@ -58,7 +58,7 @@ class RunSegment:
 
     @property
     def fresh(self) -> bool:
-        """Whether the filter starts here from its prior."""
+        """True if the filter starts here from its prior."""
         return self.began is not None
 
     def columns(self) -> dict[str, NDArray[Any]]:

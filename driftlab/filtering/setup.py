@@ -33,7 +33,7 @@ TURNED = 0.02  # rad, between two inputs: more is no bias
 
 
 def turned(one: Alignment, other: Alignment, channel: str) -> bool:
-    """Whether a unit lies in another way, by the input of a sensor."""
+    """Return True if a unit lies in another way, by the input of a sensor."""
     a, b = one.inputs[channel], other.inputs[channel]
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
 

@@ -141,7 +141,7 @@ class EffectRegressors:
         return np.asarray(values * self.scale[cols])
 
     def within(self, inner: Indices, outer: Indices) -> bool:
-        """Whether columns are combinations of others."""
+        """Return True if columns are combinations of others."""
         if not len(inner):
             return True
         A, b = self.W[:, outer], self.W[:, inner]

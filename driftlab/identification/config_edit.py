@@ -50,7 +50,7 @@ def host_of(declared: BiasModel) -> ThermalBias:
 
 
 def built_in(cls: type[Any]) -> bool:
-    """Whether a plugin came with driftlab."""
+    """Return True if a plugin came with driftlab."""
     return cls.__module__.startswith("fusion_plugins.")
 
 

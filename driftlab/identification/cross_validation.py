@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
@@ -148,7 +148,7 @@ def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float
     if len(levels) < 2:
         return 0.0, np.inf
     spread = float(np.std(levels, ddof=1)) * float(np.sqrt(1 + 1 / max(len(others), 1)))
-    return float(np.mean(others)), float(np.hypot(spread * student.ppf(0.8413, len(levels) - 1), left))
+    return float(np.mean(others)), float(np.hypot(spread * stdtrit(len(levels) - 1, 0.8413), left))
 
 
 def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: LocalLevel) -> Array:

@@ -1,4 +1,4 @@
-"""Diagnosis of a search: effects with their evidence, explanations that cannot be told apart, and the verdict.
+"""Diagnosis of a search: effects with their evidence, explanations that cannot be distinguished, and the verdict.
 
 The residual when nothing is added any more, and whether it is noise.
 
@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from driftlab.identification.acceptance import CHANCE, GAIN
+from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, span, with_residual
 from driftlab.identification.experiment_design import Experiment, Question, propose
 from driftlab.identification.least_squares import Term
@@ -37,7 +37,7 @@ PROMISING = 0.8  # left-out ratio of a candidate that another recording may well
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect of the model: its trial, its place in the model, its final form, and what cannot be told from it.
+    """An effect of the model: its trial, its place in the model, its final form, and its rivals.
 
     `rivals` are of other physics, the best of each name, `alike` are other names of the same.
     """
@@ -139,13 +139,13 @@ def _beside_all(search: Search, place: int, trial: Trial, rivals: tuple[Trial, .
 
 
 def _more_than(search: Search, rival: Trial, trial: Trial) -> bool:
-    """Whether the rival is the effect and more: then it is no other explanation."""
+    """Return True if the rival is the effect and more: then it is no other explanation."""
     wide, own = rival.term, trial.term
     return contains(search.columns, wide, own) and not contains(search.columns, own, wide)
 
 
 def _same_physics(search: Search, rival: Trial, trial: Trial) -> bool:
-    """Whether two candidates are one: both a short memory of temperature, or its rate, and of one shape."""
+    """Return True if two candidates are one: both a short memory of temperature, or its rate, and of one shape."""
     for effect in (rival.term.effect, trial.term.effect):
         if effect.subject != "temperature" or effect.memory_span is None or effect.memory_span >= SHORT:
             return False
@@ -170,7 +170,7 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _promising(trial: Trial) -> bool:
-    """Whether left-out parts or fast times speak for a candidate, though not enough of them."""
+    """Return True if left-out parts or fast times speak for a candidate, though not enough of them."""
     evidence = trial.evidence
     slow = evidence.steady < -1 and evidence.left_out > 0 and evidence.ratio < PROMISING
     likely = evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
@@ -233,7 +233,7 @@ def structures(search: Search, error: Array) -> list[Structure]:
 
     `error` (d,) is that of the model on left-out parts, SI.
     """
-    from scipy.stats import chi2, norm
+    from scipy.special import log_ndtr
 
     columns, evidence = search.columns, search.evidence
     left = np.stack(search.residuals(search.model), axis=1)
@@ -247,10 +247,10 @@ def structures(search: Search, error: Array) -> list[Structure]:
     wanders = f"what is left, {size:.3g} {unit.shown} rms, stays for about {span(stays)}, and not as noise does"
     varying, outlying = [], []
     for W, z in scales:
-        p = float(chi2.logsf(float(np.sum(z**2)), z.size))
-        varying.append(Structure("time", stays, wanders, min(-p, MAX_NATS), limit))
+        nats = nats_of(float(np.sum(z**2)), z.size)
+        varying.append(Structure("time", stays, wanders, min(nats, MAX_NATS), limit))
         largest, length = float(np.max(np.abs(z))), W * evidence.interval
-        p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
+        p = float(log_ndtr(-largest)) + float(np.log(2 * z.size))
         text = f"what is left jumps within {span(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.gain) for each in (varying, outlying)]
@@ -267,7 +267,7 @@ def _white(search: Search, parts: list[Array]) -> list[Array]:
 
 
 def _slow(interval: float, parts: list[Array], error: Array) -> bool:
-    """Whether means of the residual (n, d) are a good part of the error (d,), on any axis."""
+    """Return True if means of the residual (n, d) are a good part of the error (d,), on any axis."""
     W = max(1, round(SLOW / interval))
     means = np.concatenate([_windows(part, W).mean(axis=1) for part in parts])
     return bool(len(means) and np.any(np.sqrt(np.mean(means**2, axis=0)) > MATTERS * error))

@@ -3,8 +3,8 @@
 A bias that moves over minutes is as well seen in means of seconds as in the updates themselves. Effects are computed
 on means of at most 10 s, so that their memories are as they run; regressions are made on rows of one or more of these.
 
-Missing excitation, in sentences that one understands at the bench: a temperature that only goes one way, and a channel
-that moves with it, keep recordings from telling explanations apart.
+Missing excitation, in sentences for the test engineer: a temperature that only goes one way, and a channel
+that moves with it, keep recordings from distinguishing explanations.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
+from driftlab.soak.blocks import means
 from driftlab.soak.sweeps import one_way, ways
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
@@ -69,9 +70,7 @@ class Record:
 
     def rows(self, values: Array) -> Array:
         """Return the means (n, ...) over rows of values (N, ...)."""
-        sizes = np.diff(np.append(self.starts, len(self.chunk)))
-        total = np.add.reduceat(values, self.starts, axis=0)
-        return np.asarray(total / sizes.reshape(-1, *[1] * (values.ndim - 1)))
+        return means(values, self.starts)
 
     @cached_property
     def t(self) -> Array:
@@ -293,8 +292,8 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
         r = _correlation(np.concatenate(T), np.concatenate([chunk[name] for chunk in chunks]))
         if abs(r) > TOGETHER:
             yield (
-                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): what one does cannot "
-                "be told from what the other does; move one of them by itself"
+                f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): their "
+                "effects cannot be distinguished; move one of them by itself"
             )
 
 

@@ -4,7 +4,7 @@ Predictions of a holdout recording, to which nothing was fitted, by the declared
 
 `loop.json`: the verdict for programs.
 
-The verdict in sentences that one understands at the bench.
+The verdict in sentences for the test engineer.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from driftlab.identification.records import Evidence, Progress, missing_excitati
 from driftlab.identification.search import search
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.noise.local_level import falling
+from driftlab.soak.blocks import means, runs
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
@@ -61,17 +62,17 @@ class Identification:
 
     @property
     def anything(self) -> bool:
-        """Whether anything was added to the declared model."""
+        """True if anything was added to the declared model."""
         return self.search.model != self.search.declared
 
     @property
     def refuted(self) -> bool:
-        """Whether the holdout is predicted worse beyond chance: then the declared config stays."""
+        """True if the holdout is predicted worse beyond chance: then the declared config stays."""
         return self.verdict.word == "refuted"
 
     @property
     def worse(self) -> bool:
-        """Whether the holdout is predicted worse with the effects, by chance or beyond it."""
+        """True if the holdout is predicted worse with the effects, by chance or beyond it."""
         return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
 
 
@@ -147,7 +148,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ErrorChange:
-    """How the error of the prediction changes over all holdout recordings: its rms before and after, SI.
+    """Change of the prediction error over all holdout recordings: its rms before and after, SI.
 
     `sigma` is by how many deviations of chance the sum of its squares grows.
     """
@@ -158,7 +159,7 @@ class ErrorChange:
 
     @property
     def worse(self) -> bool:
-        """Whether it grows beyond chance."""
+        """True if it grows beyond chance."""
         return self.after > self.before and self.sigma > SURE
 
 
@@ -190,19 +191,16 @@ def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
     unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
     figures = f"{change.before * unit.factor:.3g} -> {change.after * unit.factor:.3g} {unit.shown}"
     if not change.worse:
-        return f"{names}: predicted worse with what was found ({figures}), though by no more than chance may do"
+        return f"{names}: predicted worse with the identified effects ({figures}), but not beyond chance"
     return (
-        f"{names}: predicted worse with what was found than without ({figures}; {change.sigma:.1f} sigma): "
-        "explained.yaml is the declared config, and candidate.yaml has what was found"
+        f"{names}: predicted worse with the identified effects than without ({figures}; {change.sigma:.1f} "
+        "sigma): explained.yaml is the declared config, and candidate.yaml has the effects"
     )
 
 
 def _means(values: Array) -> Array:
     """Return values (N, d) as at most `MAX_MEANS` means."""
-    length = max(1, -(-len(values) // MAX_MEANS))
-    starts = np.arange(0, len(values), length)
-    sizes = np.diff(np.append(starts, len(values)))
-    return np.asarray(np.add.reduceat(values, starts, axis=0) / sizes[:, None]) if len(values) else values
+    return means(values, runs([0], len(values), -(-len(values) // MAX_MEANS))) if len(values) else values
 
 
 def _variance(e: Array, s: Array) -> float:
@@ -370,7 +368,7 @@ def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
     if finding.alike:
         lines.append(f"{name}: here the same as {', '.join(finding.alike)}")
     if finding.names:
-        lines.append(f"{name}: cannot be told from {', '.join(finding.names)} on these recordings")
+        lines.append(f"{name}: cannot be distinguished from {', '.join(finding.names)} on these recordings")
     return lines
 
 

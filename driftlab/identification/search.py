@@ -159,7 +159,7 @@ def _left_out_square(state: Search, model: Model) -> float:
 
 
 def _waits(state: Search, trial: Trial, other: Trial) -> bool:
-    """Whether a trial is to wait for another: that is a part of it, or an effect of its channel without memory.
+    """Return True if a trial is to wait for another: that is a part of it, or an effect of its channel without memory.
 
     A part that does not show alone is tried beside the other in the next round.
     """

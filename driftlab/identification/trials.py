@@ -48,13 +48,13 @@ def uncertainty(trial: Trial, other: Trial) -> float:
 
 
 def as_good(trial: Trial, chosen: Trial) -> bool:
-    """Whether neither left-out errors nor likelihood tell a trial from the chosen one."""
+    """Return True if neither left-out errors nor likelihood tell a trial from the chosen one."""
     close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
     return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def contains(columns: EffectRegressors, wide: Term, term: Term) -> bool:
-    """Whether a term's columns are combinations of another's, on every axis."""
+    """Return True if a term's columns are combinations of another's, on every axis."""
     if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
         return False
     pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
@@ -113,7 +113,7 @@ def _not_worth_it(search: Search, base: Model, model: Model, noises: list[LocalL
 
 
 def _retuned(search: Search, term: Term, candidate: Term) -> bool:
-    """Whether a term of the base is to be chosen anew with a candidate: both have a memory."""
+    """Return True if a term of the base is to be chosen anew with a candidate: both have a memory."""
     both = [search.columns.of(t.effect).starts is not None for t in (term, candidate)]
     return all(both) and term not in search.declared and not term.effect.acts_on_input
 

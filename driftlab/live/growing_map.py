@@ -24,7 +24,7 @@ from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, map_settings
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.kind_selection import TURN
 from driftlab.planning.request import read_range
-from driftlab.soak.blocks import GrowingBlocks
+from driftlab.soak.blocks import GrowingSoak
 from driftlab.soak.rest import Used, at_rest
 from driftlab.soak.sweeps import sweeps_of
 from driftlab.soak.temperature import soak_temperature
@@ -83,7 +83,7 @@ class GrowingMap:
         self.status = GrowingMapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
                                 axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
         self.faults = Faults()
-        self.blocks, self.used = GrowingBlocks(MAX_BLOCKS), Used()
+        self.blocks, self.used = GrowingSoak(MAX_BLOCKS), Used()
         self.fitted: FittedMap | None = None
         self._soak: GatheredSoak | None = None  # of the last fit
         self._readings, self._each = np.empty(0), 1  # every how many-th temperature
@@ -188,9 +188,9 @@ class GrowingMap:
 
     def _fit(self) -> FittedMap:
         """Fit the blocks as `fit-map` fits samples; the record is that of the samples."""
-        blocks = self.blocks.blocks()
-        T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), blocks.n)
-        interval = blocks.n * (self.config.filter.update_interval if self.config.filter else 1.0)
+        blocks, n = self.blocks.rows(), self.blocks.n
+        T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), n)
+        interval = n * (self.config.filter.update_interval if self.config.filter else 1.0)
         domain = Used(low=self.used.low, high=self.used.high)
         name = self.config.source.name if self.config.source else ""
         soak = GatheredSoak(T, blocks.bias, [name], [0], interval, used=domain, steps=steps)
@@ -198,7 +198,7 @@ class GrowingMap:
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
             # of a thermometer with steps, what readings do within a block is rounding and not temperature
-            within = blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
+            within = self.blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
             update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
         self._soak = soak
         return replace(fitted, record=fitted.record.model_copy(update=update))
@@ -216,7 +216,7 @@ class GrowingMap:
         self.status = replace(self.status, **{**unused, **changes})
         if blocks.samples:
             # readings with steps show no temperature between two levels; the last fit knows of those
-            T = blocks.blocks().T if soak is None or soak.steps.size == 0.0 else soak.T
+            T = blocks.rows().T if soak is None or soak.steps.size == 0.0 else soak.T
             self.status = with_coverage(self.status, T, blocks.ends, blocks.samples)
         return self.status
 
@@ -256,7 +256,7 @@ def soaking(
         If a text cannot be read, one is missing, or the file cannot be written.
     """
     if until_reached and (sigma is None or span is None):
-        raise ConfigError("--until-reached: what is to be reached is not said; give --sigma and --range")
+        raise ConfigError("--until-reached: has no target, a sigma over a range was expected; give --sigma and --range")
     settings = map_settings(config, kind)
     unit = tracked_unit(config.filter)
     wanted = None if sigma is None else to_si(sigma, unit.si)

@@ -160,7 +160,7 @@ class LiveHistory:
 
     @property
     def ended(self) -> bool:
-        """Whether the run has ended."""
+        """True if the run has ended."""
         return self.fixed["ended"] is not None
 
     def seen(self, stretch: RunSegment) -> None:

@@ -76,7 +76,7 @@ class MapVerdict:
 
     @property
     def seen(self) -> bool:
-        """Whether the bias is seen to differ between up and down."""
+        """True if the bias is seen to differ between up and down."""
         return self.memory.answer == "seen"
 
     @cached_property
@@ -93,7 +93,7 @@ class MapVerdict:
 
     @cached_property
     def coverage(self) -> Coverage:
-        """How the samples lie over the temperatures."""
+        """Distribution of the samples over the temperatures."""
         return coverage_of(self.soak, self.fitted, self.good)
 
     def sentences(self, unit: BiasUnit) -> list[str]:
@@ -249,7 +249,7 @@ class Thin:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """How a soak's samples lie over its temperatures.
+    """Distribution of a soak's samples over its temperatures.
 
     Attributes
     ----------

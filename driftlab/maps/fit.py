@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from driftlab.config import Config, with_recording
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
-from driftlab.soak.blocks import SoakSummary, brief
+from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Index, Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import of_thermometer, soak_temperatures
@@ -32,6 +33,9 @@ from fusion_core.thermal.thermometer import NO_STEPS, Steps
 Progress = Callable[[float, int], None]
 
 USUAL = "spline"  # kind of a map where neither the config nor the user names one: it bends where the sensor does
+ROW = 10.0  # s, of a row of a soak
+MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
+LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
@@ -193,6 +197,25 @@ class GatheredSoak:
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""
         return brief(self.T, self.bias, self.starts, self.interval)
+
+    def rows(self, channel: str) -> tuple[SoakRows, ...]:
+        """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
+        rows, ends = [], np.cumsum([len(window) for window in self.windows])
+        for start, stop in pairwise([*self.starts, len(self.T)]):
+            own = slice(int(np.searchsorted(ends, start, "right")), int(np.searchsorted(ends, stop, "left")) + 1)
+            rows.append(_rows(self.windows[own], self.T[start:stop], self.bias[start:stop], channel))
+        return tuple(rows)
+
+
+def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> SoakRows:
+    """Return the rows of epochs, their temperatures T (N,) and bias (N, d)."""
+    t, tau = (np.concatenate(part) for part in zip(*((window.t, window["tau"]) for window in windows), strict=True))
+    length = max(ROW, float(t[-1] - t[0]) / MAX_ROWS)
+    starts = np.flatnonzero(np.diff(np.floor((t - t[0]) / length + 1e-6), prepend=-1.0))
+    names = [name for name in windows[0].channels if name not in (*LEFT_OUT, channel)]
+    channels = {name: means(np.concatenate([window[name] for window in windows]), starts, tau) for name in names}
+    t, T, bias = (means(values, starts, tau) for values in (t - tau / 2, T, bias))
+    return SoakRows(t, T, bias, np.add.reduceat(tau, starts), channels)
 
 
 def gather(

@@ -100,7 +100,7 @@ class KindComparison:
 
 @dataclass(frozen=True, eq=False)
 class ErrorScale:
-    """How errors of blocks are put together: `cell` (K,), -1 where not scored, and `weight`, `part` of each cell."""
+    """Weighting of the errors of blocks: `cell` (K,), -1 where not scored, and `weight`, `part` of each cell."""
 
     cell: NDArray[np.int64]
     weight: Array

@@ -10,11 +10,11 @@ axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.soak.blocks import means, runs
 from fusion_core.thermal.soak_noise import summed
 from fusion_core.wandering import WalkContrasts, bounds, contrasts, rows_of
 
@@ -53,15 +53,8 @@ def residual_of(
 
     Each recording begins at one of `starts`; at most a whole one is averaged, where it is shorter than AVERAGED.
     """
-    n = max(1, round(AVERAGED / interval))
-    parts = []
-    for start, stop in pairwise([*starts, len(T)]):
-        cuts = np.arange(start, max(stop - n, start) + 1, n)
-        left = bias[start:stop] - fitted.bias(T[start:stop])
-        sums = np.add.reduceat(np.column_stack([T[start:stop], left]), cuts - start)
-        parts.append(sums / np.diff(cuts, append=stop)[:, None])
-    means = np.concatenate(parts)
-    T, left = np.asarray(means[:, 0], dtype=np.float64), np.asarray(means[:, 1:], dtype=np.float64)
+    cuts = runs(starts, len(T), max(1, round(AVERAGED / interval)))
+    T, left = means(T, cuts), means(bias - fitted.bias(T), cuts)
     rms = np.sqrt(np.mean(left**2, axis=0))
     rows, joined = rows_of(np.arange(0, AVERAGED * len(T), AVERAGED, dtype=np.float64), left, MAX_ROWS)
     if len(joined) < MIN_ROWS or np.ptp(T) == 0:

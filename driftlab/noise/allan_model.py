@@ -104,14 +104,14 @@ class AllanCurve:
 
     @property
     def counts(self) -> Index:
-        """How many stretches each averaging time stands on (J,), bridged ones as one."""
+        """Number of stretches behind each averaging time (J,), bridged ones as one."""
         if self.bridge is not None:
             return self.bridge.pieces
         return np.array([np.sum(self.lengths >= 3 * m) for m in self.m])
 
     @property
     def used(self) -> Array:
-        """How long the samples last that each averaging time stands on (J,), s."""
+        """Duration of the samples behind each averaging time (J,), s."""
         if self.bridge is not None:
             return np.asarray(self.bridge.samples * self.dt)
         return np.array([np.sum(self.lengths[self.lengths >= 3 * m]) * self.dt for m in self.m])
@@ -119,7 +119,7 @@ class AllanCurve:
 
 @dataclass(frozen=True)
 class Class:
-    """How stretches of like length contribute to the first L averaging times; no other is short enough for them.
+    """Stretches of like length, and their contribution to the first L averaging times, which alone are short enough.
 
     Attributes
     ----------

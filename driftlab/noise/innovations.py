@@ -25,11 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from driftlab.noise.local_level import innovation_sums, minimum_near
+from driftlab.noise.local_level import LevelLikelihood
 from fusion_core.chunk import Array
 from fusion_core.contracts import Factor, Inflation, Lag
 from fusion_core.errors import SingularFit
 from fusion_core.model import Flags
+from fusion_core.thermal.soak_noise import minimum_near
 
 LAGS = (10.0, 60.0, 600.0, 3600.0)  # s
 MIN_DIFFERENCES = 8  # at a lag: with fewer it says nothing
@@ -85,24 +86,23 @@ class _Axis:
     """The likelihood of one axis, in units of its declared noise."""
 
     def __init__(self, readings: SensorReadings, axis: int, noise: float, walk: float) -> None:
-        self.d = np.ascontiguousarray(readings.d[:, axis]) / noise
-        self.rest = readings.tau, np.diff(readings.t, prepend=readings.t[0]), readings.fresh
+        d = readings.d[:, axis] / noise
+        dt = np.diff(readings.t, prepend=readings.t[0])
+        dt[readings.fresh] = dt[0] = np.inf  # the level is unknown
+        self.likelihood = LevelLikelihood([(d[:, None], np.where(np.isfinite(d), 1 / readings.tau, np.inf), dt)])
+        self.starts = -(-np.arange(PARTS) * len(d) // PARTS)
         self.declared = (walk / noise) ** 2
-
-    def sums(self, log_ratio: float) -> Array:
-        """Return sums (3, B) of nis and log S at alpha = 1, and the count."""
-        return np.asarray(innovation_sums(self.d, *self.rest, self.declared * np.exp(log_ratio), PARTS))
 
     def concentrated(self, log_ratio: float) -> tuple[float, float]:
         """Return alpha^2, and less the log-likelihood at it."""
-        nis, log_det, count = (float(np.sum(part)) for part in self.sums(log_ratio))
-        a = nis / count
-        return a, 0.5 * (count * np.log(a) + log_det)
+        cost, a, _ = self.likelihood.at(self.declared * float(np.exp(log_ratio)))
+        return float(a[0]), 0.5 * float(cost[0])
 
     def log_likelihood(self, theta: Array) -> Array:
         """Return the log-likelihood (B,) of log alpha and log beta."""
-        nis, log_det, count = self.sums(2 * float(theta[1] - theta[0]))
-        return np.asarray(-0.5 * (nis * np.exp(-2 * theta[0]) + log_det + 2 * count * theta[0]))
+        y, S = self.likelihood.rows(self.declared * float(np.exp(2 * (theta[1] - theta[0]))))[0]
+        terms = y[:, 0] ** 2 * np.exp(-2 * theta[0]) + np.where(np.isfinite(S), np.log(S) + 2 * theta[0], 0.0)
+        return np.asarray(-0.5 * np.add.reduceat(terms, self.starts))
 
     def factors(self) -> Array:
         """Return value, low and high of alpha and of beta (2, 3)."""

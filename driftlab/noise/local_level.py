@@ -11,36 +11,43 @@ g^2 S a row. J. F. Muth, J. Am. Stat. Assoc. 55 (1960) 299. So the gain of least
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
 
 from fusion_core.chunk import Array
-from fusion_core.model import Flags
+from fusion_core.thermal.soak_noise import minimum_near
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def whitened(columns: Array, white: Array, walk: Array) -> Array:
-    """Return columns (R, m) as normalised innovations (R, m) of a local level that begins at 0.
+def whitened(columns: Array, white: Array, walk: Array) -> tuple[Array, Array]:
+    """Return columns (R, m) as normalised innovations (R, m) of a local level that begins at 0, and variances (R,).
+
+    An innovation is 0, and the variance that it had infinite, where a row says nothing: it was not read, or is the
+    first of an unknown level.
 
     Parameters
     ----------
     columns : (R, m) array
     white : (R,) array
-        Variance of the white noise of each row.
+        Variance of the white noise of each row; infinite where it was not read.
     walk : (R,) array
-        Variance by which the level walks from the row before to each; of the first, from what is known.
+        Variance by which the level walks from the row before to each; infinite where it is unknown from there on.
     """
     R, m = columns.shape
-    out = np.empty_like(columns)
+    out, variances = np.zeros_like(columns), np.full(R, np.inf)
     x = np.zeros(m)
     P = 0.0
     for k in range(R):
         P += walk[k]
+        if np.isinf(white[k]):
+            continue
+        if np.isinf(P):
+            x[:] = columns[k]
+            P = white[k]
+            continue
         S = P + white[k]
         gain, root = P / S, 1.0 / np.sqrt(S)
         for j in range(m):
@@ -48,55 +55,56 @@ def whitened(columns: Array, white: Array, walk: Array) -> Array:
             out[k, j] = y * root
             x[j] += gain * y
         P *= 1.0 - gain
-    return out
+        variances[k] = S
+    return out, variances
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def log_determinant(white: Array, walk: Array) -> float:
-    """Return the logarithm of the determinant of the covariance of the rows that `whitened` takes apart."""
-    P, total = 0.0, 0.0
-    for k in range(len(white)):
-        P += walk[k]
-        S = P + white[k]
-        total += np.log(S)
-        P -= P * P / S
-    return total
+class LevelLikelihood:
+    """Restricted likelihood of white noise and walk in signals y beside free columns X, by the ratio r of the two.
 
+    With white noise of the variance s^2 w_k in a row and a walk by r s^2 dt_k from the one before, the noise of the
+    rows has the covariance s^2 V(r), and what no columns can make of them is as likely as::
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def innovation_sums(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, parts: int) -> Array:
-    """Return the sums of nis and log S, and the count, over parts of a series (3, parts).
+        - 2 l(s, r) = nu log s^2 + Q(r) / s^2 + log det V + log det X' V^-1 X,
+        Q = y' V^-1 y - y' V^-1 X (X' V^-1 X)^-1 X' V^-1 y
 
-    The readings d (N,) are of a level of walk q in white noise 1 / tau, NaN where they do not count; the level is
-    unknown at the first one, and again from each on that is `fresh`.
+    with nu rows less columns and unknown levels, which are taken out as columns are; s^2 = Q / nu is taken out, too.
+
+    Source: H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal,
+    Biometrika 58 (1971) 545.
+
+    Parameters
+    ----------
+    parts : sequence of (R, q + d), (R,) and (R,) arrays
+        X and y, w and dt of each recording; w is infinite where a row was not read, dt where the level is unknown.
+    q : int
+        Number of columns X, which are independent of one another and of the unknown levels.
     """
-    sums = np.zeros((3, parts))
-    m, P, started = 0.0, 0.0, False
-    for k in range(len(d)):
-        if fresh[k]:
-            started = False
-        P += q * dt[k]
-        if not np.isfinite(d[k]):
-            continue
-        R = 1.0 / tau[k]
-        if not started:
-            m, P, started = d[k], R, True
-            continue
-        S, y = P + R, d[k] - m
-        part = k * parts // len(d)
-        sums[0, part] += y * y / S
-        sums[1, part] += np.log(S)
-        sums[2, part] += 1
-        m += P / S * y
-        P -= P * P / S
-    return sums
 
+    def __init__(self, parts: Sequence[tuple[Array, Array, Array]], q: int = 0) -> None:
+        self.parts = [(np.ascontiguousarray(columns), white, dt) for columns, white, dt in parts]
+        self.q = q
 
-def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:
-    """Return the minimum of a cost, between the neighbours of the best place of a grid."""
-    k = int(np.argmin([cost(float(x)) for x in grid]))
-    bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
-    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
+    def rows(self, ratio: float) -> list[tuple[Array, Array]]:
+        """Return the columns of each part as innovations where s is 1, and their variances (`whitened`)."""
+        walks = [np.multiply(dt, ratio, out=np.full(len(dt), np.inf), where=np.isfinite(dt)) for *_, dt in self.parts]
+        return [whitened(columns, white, walk) for (columns, white, _), walk in zip(self.parts, walks, strict=True)]
+
+    def at(self, ratio: float) -> tuple[Array, Array, int]:
+        """Return - 2 l and s^2 (d,) of each signal where s^2 is the likeliest, and nu."""
+        rows = self.rows(ratio)
+        N = np.sum([X.T @ X for X, _ in rows], axis=0)
+        variances = np.concatenate([S[np.isfinite(S)] for _, S in rows])
+        L, nu = np.linalg.cholesky(N[: self.q, : self.q]), max(len(variances) - self.q, 1)
+        taken = np.linalg.solve(L, N[: self.q, self.q :])
+        squares = np.diag(N)[self.q :] - np.sum(taken**2, axis=0)
+        s2 = np.maximum(squares, np.finfo(float).tiny) / nu
+        return nu * np.log(s2) + np.sum(np.log(variances)) + 2 * np.sum(np.log(np.diag(L))), s2, nu
+
+    def over(self, ratios: Array) -> tuple[Array, Array]:
+        """Return - 2 l and s^2 (G, d) of ratios (G,)."""
+        costs, scales, _ = zip(*map(self.at, ratios), strict=True)
+        return np.array(costs), np.array(scales)
 
 
 MIN_GAIN, MAX_GAIN = 1e-4, 0.98
@@ -134,10 +142,18 @@ class LocalLevel:
 
 def one_step(parts: Sequence[Array], gain: float) -> list[Array]:
     """Return the one-step errors (n - 1, ...) of signals (n, ...) predicted by an exponential average of their past."""
-    errors = []
-    for x in parts:
-        before = lfilter([gain], [1.0, gain - 1.0], x - x[:1], axis=0)
-        errors.append(x[1:] - x[:1] - before[:-1])
+    return [_one_step(np.atleast_2d(x.T).T, gain).reshape(len(x) - 1, *x.shape[1:]) for x in parts]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _one_step(x: Array, gain: float) -> Array:
+    """Return the errors (n - 1, d) of the signals (n, d)."""
+    n, d = x.shape
+    errors, level = np.empty((n - 1, d)), np.zeros(d)  # the level over the first row
+    for k in range(1, n):
+        for j in range(d):
+            errors[k - 1, j] = x[k, j] - x[0, j] - level[j]
+            level[j] = gain * (x[k, j] - x[0, j]) - (gain - 1.0) * level[j]
     return errors
 
 

@@ -4,8 +4,8 @@
 
     N = allan(tau) sqrt(tau) at the shortest averaging times     B = min allan(tau)     walk = sqrt(3)/2 B^2 / N
 
-The walk is that whose Allan curve, with the white noise above it, has its minimum at B: what data sheets allow to be
-said, too (docs/explanation/noise.md). A short stretch has not seen the minimum: the walk is then at most that.
+The walk is that whose Allan curve, with the white noise above it, has its minimum at B: as data sheets allow,
+too (docs/explanation/noise.md). A short stretch has not seen the minimum: the walk is then at most that.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class Analysis:
 
     @property
     def stretches(self) -> int:
-        """How many stretches without a gap were used."""
+        """Number of stretches without a gap that were used."""
         return len(self.first.stretches)
 
 

@@ -43,7 +43,7 @@ class RestWindows:
 
     @property
     def doubtful(self) -> bool:
-        """Whether so many windows look like motion that it is the noise that is not as declared."""
+        """True if so many windows look like motion that it is the noise that is not as declared."""
         return bool(np.mean(~self.still) > MAX_MOVING)
 
     @property
@@ -106,13 +106,13 @@ class Pieces:
 
     @property
     def samples(self) -> int:
-        """How many rows the spans have in all."""
+        """Number of rows of all spans."""
         total = np.concatenate([[0], np.cumsum(np.diff(self.rows, axis=1)[:, 0])])
         return int(np.sum(total[self.parts[:, 1]] - total[self.parts[:, 0]]))
 
     @property
     def enough(self) -> bool:
-        """Whether there are samples enough for an Allan deviation."""
+        """True if there are samples enough for an Allan deviation."""
         return self.samples >= MIN_SAMPLES and bool(np.max(self.places, initial=0) >= MIN_STRETCH)
 
     @property

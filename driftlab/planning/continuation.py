@@ -19,6 +19,7 @@ from driftlab.maps.fit import samples
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, RatedProfile, SearchResult, SigmaCurve
 from driftlab.planning.unit_model import UnitModel
+from driftlab.soak.blocks import means, runs
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.faults import Faults
@@ -89,7 +90,7 @@ class RecordedSoak(SigmaCurve):
 
     @property
     def whole(self) -> bool:
-        """Whether the range was seen from end to end."""
+        """True if the range was seen from end to end."""
         low, high = self.seen
         near = EDGE * self.chamber.swing
         return low <= self.chamber.low + near and high >= self.chamber.high - near
@@ -141,8 +142,9 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
     fitted = subject.map.fit(T, bias, {})
     many = int(np.ceil(len(T) / SAMPLES[1]))
-    means = tuple((_means(T_r, many), _means(b_r, many)) for T_r, b_r in parts)
-    T_m, b_m = (np.concatenate(values) for values in zip(*means, strict=True))
+    cuts = [runs([0], len(T_r), many) for T_r, _ in parts]
+    rows = tuple((means(T_r, own), means(b_r, own)) for (T_r, b_r), own in zip(parts, cuts, strict=True))
+    T_m, b_m = (np.concatenate(values) for values in zip(*rows, strict=True))
     answer, step = subject.map.smoother(T_m, b_m), dt * many
     noise, walk = measured_noise(T_m, b_m - fitted.bias(T_m), step, answer)
     straight = replace(fitted, outside="tangent")
@@ -156,13 +158,7 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
     alone = expected_curve_error(T_m, step, noise, walk, answer).variance(grid)
     misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone, 0.0, None))
-    return RecordedSoak(known, chamber, means, step, fitted, grid, sigma, misfit)
-
-
-def _means(values: Array, many: int) -> Array:
-    """Return the means of `many` samples after one another; the last few that are fewer are left out."""
-    n = max(len(values) // many, 1)
-    return np.asarray(values[: n * many].reshape(n, -1, *values.shape[1:]).mean(axis=1))
+    return RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, misfit)
 
 
 def jointly(profile: Profile, before: RecordedSoak, seed: int = 0) -> RatedProfile:

@@ -34,7 +34,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
-TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be told apart
+TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be distinguished
 ALIKE = 0.2  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
 OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters, for the smallest size
 REALISATIONS = 7  # of the noise
@@ -81,7 +81,7 @@ class Detectability:
 
     @property
     def found(self) -> bool:
-        """Whether the loop would find one of any size."""
+        """True if an effect of any size would be identified."""
         return bool(np.isfinite(self.found_from))
 
     @property
@@ -157,7 +157,7 @@ def families(search: Search) -> dict[str, list[Effect]]:
 
 
 def _of_map(search: Search, effect: Effect) -> bool:
-    """Whether an effect is a function of the temperature alone: run backwards, its signature is the same backwards."""
+    """Return True if an effect is a function of the temperature alone: its signature commutes with time reversal."""
     chunk = search.columns.evidence.chunks[0]
     back = chunk.having(temperature=chunk["temperature"][::-1].copy())
     way, reverse = (effect.signature(one, None)[0] for one in (chunk, back))
@@ -348,7 +348,7 @@ class _Case:
         self._white = [self._base(axis) for axis in range(len(self.y))]
 
     def passes(self, j: int, size: float) -> bool:
-        """Whether most realisations pass where the effect has the j-th shape and this size."""
+        """Return True if most realisations pass where the effect has the j-th shape and this size."""
         passed = 0
         for k in range(REALISATIONS):
             passed += self._passes(k, REALISATIONS + j, size)

@@ -233,7 +233,7 @@ def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str
 
 
 def _is_classic(item: RatedProfile) -> bool:
-    """Whether a profile is a staircase whose last step leads up: it never comes back."""
+    """Return True if a profile is a staircase whose last step leads up: it never comes back."""
     moving = item.profile.rates[item.profile.rates != 0]
     return item.profile.family == "staircase" and bool(moving[-1] > 0)
 

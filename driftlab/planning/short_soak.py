@@ -19,9 +19,10 @@ import numpy as np
 
 from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import band_of, sigma
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.search import RatedProfile
+from driftlab.soak.blocks import SoakRows
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 
@@ -145,7 +146,7 @@ def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) ->
     x, inside = (grid - middle) / half, (np.clip(grid, low, high) - middle) / half
     for order in ORDERS:
         V = np.polynomial.chebyshev.chebvander((rows.T - middle) / half, order)
-        X, _ = rows.whitened(np.column_stack([V, seen]), soaked.white[axis], soaked.walk[axis], free=False)
+        X = rows.whitened(np.column_stack([V, seen]), soaked.white[axis], soaked.walk[axis], free=False)
         own, rest = X[:, : order + 1], X[:, order + 1 :]
         K = np.linalg.pinv(own)
         slopes = np.polynomial.chebyshev.chebder(np.eye(order + 1), axis=0)

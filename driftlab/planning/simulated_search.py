@@ -173,7 +173,7 @@ class Information:
         return len(self._places[k])
 
     def direction(self, k: int) -> Array:
-        """Return coefficients (p,) of the k-th effect's columns: of what it may show, what is seen middling well."""
+        """Return coefficients (p,) of the k-th effect's columns: of its directions, that of median information."""
         own = self._places[k]
         values, vectors = np.linalg.eigh(self.G[:, own][:, :, own].sum(axis=0))
         return np.asarray(vectors[:, len(values) // 2])

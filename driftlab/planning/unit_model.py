@@ -166,7 +166,7 @@ def fitted_map(config: Config) -> FittedMap | None:
 
 
 def _shape(config: Config, twin: Twin | None) -> tuple[Curve | None, str]:
-    """Return the curve to be fitted and where it is from; None where nobody knows."""
+    """Return the curve to be fitted and where it is from; None where it is not known."""
     if twin is not None:
         return twin.curve, "the simulated unit's"
     fitted = fitted_map(config)

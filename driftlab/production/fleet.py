@@ -190,6 +190,7 @@ class _Command:
             units_from=jobs.manifest.name,
             counts={**counts, "done_now": jobs.done, "left": len(left)},
             limits=status.limits,
+            acceptance=status.acceptance,
             pass_with_hysteresis=status.beside,
             replaced=jobs.again,
             kept_without_recordings=jobs.without_recordings,

@@ -22,7 +22,7 @@ CHANGES = ("ETag", "etag", "md5Hash", "Content-MD5", "Digest", "LastModified", "
 
 
 def is_url(name: str) -> bool:
-    """Whether a recording lies behind a URL: `URL` or `URL::START:STOP`."""
+    """Return True if a recording lies behind a URL: `URL` or `URL::START:STOP`."""
     return _URL.match(name) is not None
 
 

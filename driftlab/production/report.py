@@ -25,7 +25,7 @@ from fusion_core.chunk import Array
 
 
 def is_written(folder: Path, *, family: bool) -> bool:
-    """Whether all files of a fleet as a whole are there."""
+    """Return True if all files of a fleet as a whole are there."""
     return all((folder / name).is_file() for name in (TABLE, REPORT, *([FAMILY] if family else ())))
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field
 
 from driftlab import __version__
+from driftlab.units import duration
 
 
 @dataclass
@@ -53,14 +54,6 @@ class Stage:
 FleetProgress = Callable[[Stage], None]
 
 
-def duration(seconds: float) -> str:
-    """Return a time in words: `45 s`, `12 min`, `3 h 20 min`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
-
-
 NAMED = 10  # units that a line names
 MAX_PAGES = 20  # pages of units that stand out and were not asked for
 
@@ -101,6 +94,7 @@ class FleetSummary(BaseModel):
     units_from: str = ""
     counts: dict[str, int]
     limits: dict[str, int] = {}
+    acceptance: Annotated[str, Field(exclude=True)] = ""
     pass_with_hysteresis: int = 0
     replaced: list[str] = []
     kept_without_recordings: list[str] = []
@@ -132,8 +126,7 @@ class FleetSummary(BaseModel):
             lines += [f"failed: unit {unit}: {why}" for unit, why in self.failed.items()]
             more = f"and {failed - len(self.failed):,} more; " if failed > len(self.failed) else ""
             lines.append(f"{more}why each failed is in the column `error` of units.parquet")
-        if self.limits:
-            lines.append(f"limits: {', '.join(f'{count:,} {word}' for word, count in sorted(self.limits.items()))}")
+        lines += [self.acceptance] if self.acceptance else []
         if count := self.pass_with_hysteresis:
             lines.append(f"of those that pass a hysteresis or lag is seen in {units(count)}; no limit is set for it")
         return lines
@@ -148,8 +141,8 @@ class FleetSummary(BaseModel):
             )
         if without:
             lines.append(
-                f"of {units(len(without))} a recording is not there any more ({some(without)}): what was found before "
-                "is kept; --force lets it go"
+                f"of {units(len(without))} a recording is not there any more ({some(without)}): their results "
+                "are kept; --force drops them"
             )
         return lines
 

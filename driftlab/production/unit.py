@@ -23,7 +23,7 @@ from driftlab import __version__
 from driftlab.commands.explain import explain
 from driftlab.config import Config, part_of, paths_of, products, understood
 from driftlab.family.record import UnitRecord
-from driftlab.family.rows import rows_of, soaked_of
+from driftlab.family.unit_noise import Densities, soaked_of
 from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
@@ -36,7 +36,6 @@ from fusion_core.host.provenance import participants
 
 if TYPE_CHECKING:
     from driftlab.family.unit_information import UnitInformation
-    from driftlab.family.unit_noise import Densities
     from driftlab.production.unit_map import CoastResult, UnitMap
 
 CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
@@ -185,7 +184,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if not soaks:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
     unit = fit_unit_map(config, soaks, faults)
-    fitted, rows = unit.fitted, rows_of(unit.soak, unit.fitted.record.channel)
+    fitted, rows = unit.fitted, unit.soak.rows(unit.fitted.record.channel)
     soaked, densities = soaked_of(task.unit, unit.axes, rows)
     run = coasted(unit, tests, soaks, soaked.walk)
     files = {"unit.npz": soaked.to_bytes(), unit.file: unit.content()}

@@ -37,6 +37,7 @@ from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict, judge
 from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.residual import AVERAGED
+from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.contracts import FittedMap, ThermalMap
@@ -254,10 +255,8 @@ def residual_sigma(residual: Array, soaked: UnitInformation) -> Array:
     n = sum(float(np.sum(part.span)) for part in rows) / AVERAGED
     count = sum(len(part.T) for part in rows)
     size = max(round(AVERAGED * count / (n * AVERAGED)), -(-count // MAX_AVERAGES), 1)
-    parts = [np.arange(0, max(len(part.T) - size, 0) + 1, size) for part in rows]
-    T = np.concatenate(
-        [np.add.reduceat(p.T, c) / np.diff(c, append=len(p.T)) for p, c in zip(rows, parts, strict=True)]
-    )
+    parts = [runs([0], len(part.T), size) for part in rows]
+    T = np.concatenate([means(part.T, cuts) for part, cuts in zip(rows, parts, strict=True)])
     Q = np.linalg.svd(soaked.knots.values(T), full_matrices=False)
     U = Q[0][:, Q[1] > 1e-6 * Q[1][0]]
     walks, at = np.zeros((len(T), len(T))), 0

@@ -22,7 +22,7 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
-from driftlab.evaluation.limits import worst
+from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.record import UnitRecord
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
@@ -162,7 +162,7 @@ class UnitJobs:
         )  # fmt: skip
 
     def _stays(self, record: UnitRecord, task: Task) -> bool:
-        """Whether a unit of another stamp is the same as before, or could not be done again."""
+        """Return True if a unit of another stamp is the same as before, or could not be done again."""
         if record.state == "done" and missing(task):
             self.without_recordings.append(task.unit)
             return True
@@ -192,7 +192,7 @@ class UnitJobs:
         return (self.folder.unit(unit) / PAGE).is_dir()
 
     def pages_missing(self, known: Collection[str]) -> bool:
-        """Whether a page is asked for that is not there, or that the report does not know of."""
+        """Return True if a page is asked for that is not there, or that the report does not know of."""
         wanted = (entry.unit for entry in self.manifest.units if self._wants_page(entry.unit))
         return any(unit not in known or not self._has_page(unit) for unit in wanted)
 
@@ -246,7 +246,7 @@ def stamp_of(task: Task, versions: str) -> str:
 
 
 def missing(task: Task) -> bool:
-    """Whether a recording on a file system is not there."""
+    """Return True if a recording on a file system is not there."""
     return any(not is_url(name) and not _path(task.folder, name).exists() for name in task.names)
 
 
@@ -311,6 +311,11 @@ class FleetStatus:
     def limits(self) -> dict[str, int]:
         """Units by the verdict on the limits of the config; empty where it has none."""
         return dict(Counter(verdict for record in self.done if (verdict := worst(record.limits)) is not None))
+
+    @property
+    def acceptance(self) -> str:
+        """The units by verdict, and the limits that decide; empty where the config has none."""
+        return verdict_of_units(record.limits for record in self.done)
 
     @property
     def beside(self) -> int:

@@ -113,7 +113,7 @@ class Gaps:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
-    """Return whether any value (N, d) is stuck or beyond the limit, and how long each axis (d,) has repeated itself.
+    """Return True if any value (N, d) is stuck or beyond the limit, and the length of each axis' repetition (d,).
 
     One pass over what is nearly always good; `_repeats` says where it is not, in NumPy.
     """

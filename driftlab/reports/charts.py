@@ -31,7 +31,7 @@ class Look:
     width: float = 1.4
 
 
-# told apart by readers who do not see all colours (Okabe and Ito), and by width: what is given is broad and pale, what
+# distinct to readers who do not see all colours (Okabe and Ito), and by width: what is given is broad and pale, what
 # is estimated thin above it
 LOOKS = {
     "estimate": Look("#0072b2", "#56b4e9"),

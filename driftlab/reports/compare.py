@@ -188,7 +188,7 @@ def input_chart(runs: Runs) -> Chart:
         lines = tuple(Line(clock(t), rate[:, k] * sensor.factor, name, role) for name, role, t, rate in slow)
         label = f"rate {axis}" if sensor.integral else axis_name(sensor.channel, axis)
         panels.append(Panel(lines, f"{label} [{sensor.shown}]"))
-    return Chart(tuple(panels), clock.label, "What the filters are given (figures 9 and 10)")
+    return Chart(tuple(panels), clock.label, "Input of the filters (figures 9 and 10)")
 
 
 def _slow(estimates: Columns) -> tuple[Array, Array]:
@@ -219,7 +219,7 @@ def _clock(runs: Runs) -> Clock:
 
 
 def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
-    """Return where the unit moved, and where the filter of a config refused one that stood still.
+    """Return the spans in which the unit moved, or a config's filter refused one that stood still.
 
     Motion is told from the sensors alone: it is shown once where all configs have the same.
     """

@@ -37,11 +37,11 @@ OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unkno
            "refuted": "fail"}  # fmt: skip
 WORSE = "But the error on the test recording grows, though by no more than chance may do: record another before use."
 MEANING = {
-    "explained": "What the declared model lacks has been found and added.",
+    "explained": "Effects that the declared model lacks are added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
     "unexplained": "Something significant is left that no installed effect explains.",
-    "refuted": "What was found predicts the test recording worse than the declared model: that stays as it is, "
-    "and candidate.yaml has what was found.",
+    "refuted": "The identified effects predict the test recording worse than the declared model: that stays as it "
+    "is, and candidate.yaml has them.",
     "ambiguous": "These recordings cannot tell some explanations apart.",
 }
 
@@ -202,7 +202,7 @@ def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
 
 
 def _shades(summary: dict[str, Any], clock: Clock) -> tuple[Shade, ...]:
-    """Return where the unit moved, and where the filter refused what it measured with the new config."""
+    """Return the spans in which the unit moved, or the filter of the new config refused measurements."""
     dt = summary.get("updates", {}).get("interval_s", 0.0)
     return (
         *charts.span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),

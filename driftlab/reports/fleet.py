@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.evaluation.limits import worst
+from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import Outlier, describe
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.reports.charts import Chart
@@ -90,8 +90,6 @@ class FleetOverview:
     effects : sequence of SharedEffectRow
     links : mapping of str to str
         Units' pages, relative to this one.
-    numbers : sequence of (str, str)
-        Of the run: what, and a text.
     remarks : sequence of str
         What else should be known.
     """
@@ -107,7 +105,6 @@ class FleetOverview:
     odd: Mapping[str, Sequence[Outlier]] = field(default_factory=dict)
     effects: Sequence[SharedEffectRow] = ()
     links: Mapping[str, str] = field(default_factory=dict)
-    numbers: Sequence[tuple[str, str]] = ()
     remarks: Sequence[str] = ()
 
 
@@ -119,17 +116,19 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     for record in overview.records:
         rows.add(record, reasons.get(record.unit, ""), overview.links.get(record.unit, ""))
     odd, failed, table = len(reasons), len(rows.failed), rows.table()
-    lead = [f"{_units(rows.count)}: {rows.count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    units = f"{rows.count:,} unit{'s' * (rows.count != 1)}"
+    lead = [f"{units}: {rows.count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
     lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
-    stand_out = f"{odd:,} of {_units(rows.count)} stand{'s' * (odd == 1)} out. " if odd else ""
     write_page(
         path,
         "fleet",
         title=overview.title,
         lead="; ".join(lead),
-        verdict=stand_out + line.sentences[0],
+        limits=verdict_of_units(rows.limits).capitalize(),
+        outcome=worst([row for of_unit in rows.limits for row in of_unit]),
+        verdict=line.sentences[0],
         remarks=[*line.sentences[1:], *overview.remarks],
-        numbers=[*overview.numbers, *rows.numbers()],
+        numbers=rows.numbers(),
         maps=_maps(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
         charts=control_charts(line),
@@ -142,7 +141,6 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         failed=[(unit, "", error) for unit, error in rows.failed[:LISTED]],
         failed_count=failed,
         left_out=rows.count - len(table["unit"]),
-        rows_most=ROWS,
         names=embedded(list(line.units)),
         table=embedded(table),
     )
@@ -154,10 +152,6 @@ def _maps(overview: FleetOverview, ranges: Array) -> list[Chart]:
     curves, axes = overview.curves, overview.line.axes
     maps = MapFan(overview.T, curves, overview.drawn, axes, overview.unit, overview.mean, overview.odd)
     return [maps.fan(ranges), *([maps.spread()] if len(overview.drawn) > 1 else [])]
-
-
-def _units(count: int) -> str:
-    return f"{count:,} unit{'s' * (count != 1)}"
 
 
 ROWS = 5000
@@ -175,6 +169,8 @@ class FleetRows:
     count : int
         Units.
     failed : list of (unit, error)
+    limits : list of lists of dict
+        Of each unit that is done, held against it.
     ranges : list of (from, to)
         Temperatures of each unit that is done, degC.
     """
@@ -182,6 +178,7 @@ class FleetRows:
     def __init__(self, unit: BiasUnit) -> None:
         self.unit, self.count, self.hours, self.seconds = unit, 0, 0.0, 0.0
         self.failed: list[tuple[str, str]] = []
+        self.limits: list[list[dict[str, Any]]] = []
         self.ranges: list[tuple[float, float]] = []
         self.versions: dict[str, int] = {}
         self.axes: tuple[str, ...] = ()
@@ -194,8 +191,9 @@ class FleetRows:
         self.count += 1
         if record.state == "failed":
             self.failed.append((record.unit, record.error))
-        elif record.domain is not None and record.state == "done":
-            self.ranges.append(record.domain)
+        elif record.state == "done":
+            self.limits.append(record.limits)
+            self.ranges += [] if record.domain is None else [record.domain]
         self.axes = self.axes or record.axes
         self.hours, self.seconds = self.hours + record.hours, self.seconds + record.seconds
         self.versions[record.driftlab] = self.versions.get(record.driftlab, 0) + 1

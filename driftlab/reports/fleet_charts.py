@@ -79,7 +79,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
 def _span(chart: ControlChart, factor: float) -> tuple[float, float]:
     """Return from where to where y is drawn: all values, and the limits of most units.
 
-    A unit that is measured badly has limits so wide that nothing else could be told apart.
+    A unit that is measured badly has limits so wide that nothing else could be distinguished.
     """
     all_of = np.concatenate(
         [chart.value, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]]
@@ -264,7 +264,7 @@ class MapFan:
         bands = percentiles(self.curves)
         middle = bands[SHARES.index(50)].astype(self.curves.dtype)
         panels = self._panels(bands - middle, self.curves - middle, None, "less the median:")
-        return Chart(panels, LABEL, "By how much the units differ", self._caption(""))
+        return Chart(panels, LABEL, "Deviation from the median of the units", self._caption(""))
 
     def _panels(self, bands: Array, curves: Any, mean: Array | None, quantity: str) -> tuple[Panel, ...]:
         # what else is odd than a shape is not to be seen in a map

@@ -44,7 +44,7 @@ def sure_chart(verdict: MapVerdict, unit: BiasUnit) -> Chart:
     sigma = "Sigma: one standard deviation of the curve; its mean over the fit is not in it. "
     caption = "Samples: in a kelvin, warming and cooling apart."
     caption = caption if verdict.sigma is None else sigma + caption
-    return Chart(_sure(verdict, unit), LABEL, "How sure the curve is, and on what", caption)
+    return Chart(_sure(verdict, unit), LABEL, "Sigma of the curve, and its samples", caption)
 
 
 def _holes(verdict: MapVerdict) -> tuple[Shade, ...]:

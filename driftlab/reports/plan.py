@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it
-NOTES = "What to know"  # heading of the sentences on a page
+NOTES = "Remarks"  # heading of the sentences on a page
 
 
 def headline(plan: SearchResult) -> str:
@@ -91,7 +91,7 @@ def _target(plan: SearchResult) -> list[str]:
 
 
 def _limits(plan: SearchResult) -> list[str]:
-    """Return where the kind of map, and not the soak, is what limits."""
+    """Return the temperatures at which the kind of map, and not the soak, limits the sigma."""
     best, unit = plan.chosen, plan.subject.unit
     if plan.subject.shape is None or best.alone > NOTEWORTHY * best.score:
         return []
@@ -157,7 +157,7 @@ def sigma_chart(plan: SearchResult) -> Chart:
         curves.append((classic.temperature, classic.sigma, classic.profile.name))
     caption = "one standard deviation of the map's error, without its mean over the soak"
     panels = sigma_panels(plan.subject.axes, curves, unit, rules=target_rule(plan.target, unit.factor))
-    return Chart(panels, "temperature [°C]", "How sure the map will be", caption)
+    return Chart(panels, "temperature [°C]", "Predicted sigma of the map", caption)
 
 
 def sigma_panels(
@@ -188,7 +188,7 @@ def _pareto(plan: SearchResult) -> Chart:
         Line(hours, classic * unit.factor, "staircase one way", "series:1", style="dashed"),
     )
     caption = "each point is a search of its own"
-    return Chart(hours_panel(lines, plan.target, unit), "length [h]", "What more hours buy", caption, log=True)
+    return Chart(hours_panel(lines, plan.target, unit), "length [h]", "Gain of more hours", caption, log=True)
 
 
 # files
@@ -300,7 +300,7 @@ def write_report(path: Path, plan: SearchResult, notes: list[str], title: str, o
     """Write the page."""
     profile = plan.chosen.profile
     what = f"{profile.name}; the set points are in setpoints.csv"
-    first, *others = profile_chart(profile, plan.chamber.lag, "What to record", what), sigma_chart(plan), _pareto(plan)
+    first, *others = profile_chart(profile, plan.chamber.lag, "Chosen profile", what), sigma_chart(plan), _pareto(plan)
     parts = [
         (first.title, first),
         ("Profiles of the same hours", _profiles(plan)),

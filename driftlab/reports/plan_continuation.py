@@ -143,7 +143,7 @@ def sigma_chart(plan: Continuation) -> Chart:
     ]
     rules = target_rule(plan.target, unit.factor)
     panels = plan_page.sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
-    return Chart(panels, "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
+    return Chart(panels, "temperature [°C]", "Sigma of the map", "one standard deviation of the map's error")
 
 
 def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
@@ -176,7 +176,7 @@ def write_report(path: Path, plan: Continuation, outlook: DetectabilityReport, n
     profile, chart = plan.chosen.profile, sigma_chart(plan)
     parts = [
         (chart.title, chart),
-        ("What a further recording would add", _profiles(plan)),
+        ("Gain of a further recording", _profiles(plan)),
         (plan_page.NOTES, notes),
         (
             "The further profile",

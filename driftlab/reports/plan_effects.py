@@ -1,4 +1,4 @@
-"""The effects that a plan would show: a table, a matrix of what is told from what, sentences, JSON."""
+"""The effects that a plan would show: a table, a matrix of which are distinguished, sentences, JSON."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 PLAINLY = 0.9  # share of the nats: with less left, another effect takes a part of it that is worth saying
-HEADING = "Which effects it would tell"  # on a page
+HEADING = "Effects that it would identify"  # on a page
 
 
 def cells(outlook: DetectabilityReport) -> list[list[str]]:
-    """Return the rows of the table, what is found at the smallest size first."""
+    """Return the rows of the table, in the order of the smallest size that is identified."""
     silent = [[name, "not seen", "", "0", ""] for name in outlook.silent]
     return [*(_row(outlook, item) for item in outlook.effects), *silent]
 
@@ -34,7 +34,7 @@ def _effects(outlook: DetectabilityReport) -> TextTable:
     unit = outlook.shown
     size = f"{number(outlook.size * unit.factor)} {unit.shown}"
     sizes = (f"{name}\n[{unit.shown}]" for name in ("found from", "over its grid"))
-    heads = ["effect", *sizes, f"of {size}\n[nats]", "not told from"]
+    heads = ["effect", *sizes, f"of {size}\n[nats]", "confused with"]
     title = "effects that the loop would find on it, from lowest to highest, on every axis alike"
     return TextTable(heads, cells(outlook), title)
 
@@ -49,7 +49,7 @@ def table(outlook: DetectabilityReport) -> Table:
 def matrix(outlook: DetectabilityReport) -> tuple[list[str], list[tuple[str, list[tuple[str, str]]]]]:
     """Return the effects, and for each what is left of its nats, in %, where another takes its part.
 
-    Each with a word beside it where the two are not told apart at twice the smallest size that is found.
+    Each with a word beside it where the two are not distinguished at twice the smallest size that is found.
     """
     names = [item.name for item in outlook.effects]
     return names, [(item.name, [_left(item, name) for name in names]) for item in outlook.effects]
@@ -86,11 +86,11 @@ def brief(outlook: DetectabilityReport) -> list[str]:
     ]
     never = [*(item.name for item in outlook.effects if not item.found), *outlook.silent]
     parts += [f"not {', '.join(never)}"] if never else []
-    return [f"the loop would find on it {'; '.join(parts)} (--effects says what is told from what)"] if parts else []
+    return [f"the loop would find on it {'; '.join(parts)} (--effects says which are distinguished)"] if parts else []
 
 
 def lines(outlook: DetectabilityReport) -> list[str]:
-    """Return the effects that would be found, and those that are told apart, a sentence each."""
+    """Return the effects that would be found, and those that are distinguished, a sentence each."""
     unit = outlook.shown
     sentences = []
     for item in outlook.effects:
@@ -115,16 +115,16 @@ def lines(outlook: DetectabilityReport) -> list[str]:
 
 
 def _confusions(item: Detectability) -> list[str]:
-    """Return the effects that one is told apart from, where it is not plain, when it is twice the smallest size."""
+    """Return the effects that one is distinguished from, where it is not plain, when it is twice the smallest size."""
     nats = item.nats_found
     close = {name: share for name, share in item.left.items() if share < PLAINLY and name not in item.confused_with}
     parts = []
     if close:
         name, share = min(close.items(), key=lambda pair: pair[1])
-        parts.append(f"told apart from {name} by {_nats(share * nats)} of {_nats(nats)} nats")
+        parts.append(f"distinguished from {name} by {_nats(share * nats)} of {_nats(nats)} nats")
     if item.confused_with:
         names = [f"{name} ({_nats(item.left[name] * nats)})" for name in item.confused_with]
-        parts.append(f"not told apart from {', '.join(names)} of {_nats(nats)} nats")
+        parts.append(f"not distinguished from {', '.join(names)} of {_nats(nats)} nats")
     return parts
 
 
@@ -133,10 +133,10 @@ def seen_lines(seen: Sequence[EffectEstimate], unit: BiasUnit) -> list[str]:
     sentences = []
     for item in seen:
         if not item.sigma < float("inf"):
-            sentences.append(f"so far, {item.name}: cannot be told at all, temperature has not turned back")
+            sentences.append(f"so far, {item.name}: not known, temperature has not turned back")
             continue
         size = f"{number(item.size * unit.factor)} ± {number(item.sigma * unit.factor)} {unit.shown}"
-        word = "is in it, `driftlab explain` tells whether it is this" if item.sure else "cannot be told yet"
+        word = "is in it, `driftlab explain` tells whether it is this" if item.sure else "not known yet"
         sentences.append(f"so far, {item.name}: {size} on {item.axis}, {word}")
     return sentences
 

@@ -90,7 +90,7 @@ def hours_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
         if share == 1:
             without.append(Line(hours, alone * unit.factor, "all of it, without the family", "data", style="dashed"))
     panels = plan_page.hours_panel([*drawn, *without], plan.target, unit)
-    return Chart(panels, "length [h]", "How short a soak may be", "each point: the best place of that share", log=True)
+    return Chart(panels, "length [h]", "Sigma by length of soak", "each point: the best place of that share", log=True)
 
 
 def sigma_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
@@ -99,7 +99,7 @@ def sigma_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
     curves = [(best.temperature, best.sigma, "with the family"), (best.temperature, best.without_family, "without")]
     caption = "one standard deviation, level included"
     panels = plan_page.sigma_panels(plan.family.axes, curves, unit)
-    return Chart(panels, "temperature [°C]", "How sure the map will be", caption)
+    return Chart(panels, "temperature [°C]", "Predicted sigma of the map", caption)
 
 
 def document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def write_report(path: Path, plan: ShortSoakPlan, unit: BiasUnit, notes: list[st
     what = f"{profile.name}; the set points are in setpoints.csv"
     charts = [hours_chart(plan, unit), sigma_chart(plan, unit)]
     parts = [
-        ("What to soak", plan_page.profile_chart(profile, plan.chamber.lag, "What to soak", what)),
+        ("Chosen profile", plan_page.profile_chart(profile, plan.chamber.lag, "Chosen profile", what)),
         ("Expected sigma with the family (without), at the best place", _sigmas(plan, unit)),
         (plan_page.NOTES, notes),
         *((chart.title, chart) for chart in charts),

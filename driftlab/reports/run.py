@@ -133,7 +133,7 @@ def bias_chart(
 
 
 def event_shades(journal: RunLog, clock: Clock) -> tuple[Shade, ...]:
-    """Return where the filter refused what it measured, and where the unit moved."""
+    """Return the spans in which the filter refused measurements, or the unit moved."""
     dt = journal.alignments[0].dt
     return (
         *charts.span_shades(journal.refused.spans, clock, "refused", "refused", dt),

@@ -1,27 +1,28 @@
-"""Soaks as a few thousand means, however long the recording: blocks for a fit, and a summary for an assessment.
+"""A soak as means: rows in the order of time, however long the recording, coarser ones of these, and a summary.
 
-A block is the mean of n samples that follow one another. When there are `MAX_BLOCKS` blocks, neighbours are joined two
-by two and n doubles, so all blocks weigh the same and their order is that of time. N samples, d axes, K blocks.
+A row is the mean of samples that follow one another, with how long they lasted; rows of rows are means again, so what
+needs fewer of them joins runs (`SoakRows.coarsened`). A soak that goes on is kept as at most `most` rows: when there
+are so many, neighbours are joined two by two and the number of samples doubles, so all rows weigh the same and their
+order is that of time. N samples, d axes, R rows, K runs.
 
-The summary of a soak: means with the turns of the temperature, and the white noise.
+The summary of a soak: rows with the turns of the temperature, cells of temperature, and the white noise.
 
-The samples of a fit, N of d axes in the order of time, are read once, a slab at a time:
-
-- *slots*, S means of equally many samples that follow one another, with the way of the temperature
-  (`driftlab.soak.sweeps`);
-- *cells*, CELLS equal ranges of temperature, with the samples of each way in them;
+- *rows*, at most about SLOTS of equally many samples, with the way of the temperature (`driftlab.soak.sweeps`);
+- *cells*, CELLS equal ranges of temperature, with the samples of each way in them, read a slab at a time;
 - white noise, from the differences between neighbouring samples: var = mean((b_k+1 - b_k)^2) / 2, to which neither a
   curve nor a walk adds much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.noise.local_level import whitened
 from driftlab.soak.sweeps import Index, directions
 from fusion_core.chunk import Array
 from fusion_core.contracts import SLAB
@@ -29,112 +30,140 @@ from fusion_core.contracts import SLAB
 MAX_BLOCKS = 8192  # half as many, at least, once there are as many samples
 
 
+def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
+    """Return the begins (K,) of runs of n of `count` values; no run is of two recordings, which begin at `starts`.
+
+    All are of equal length, as the laws of a soak's noise have them; what is over at a recording's end belongs to its
+    last run.
+    """
+    parts = [np.arange(start, max(stop - n, start) + 1, n) for start, stop in pairwise([*starts, count])]
+    return np.concatenate(parts).astype(np.int64)
+
+
+def means(values: Array, starts: Index, weight: Array | None = None) -> Array:
+    """Return the means (K, ...) of runs of values (N, ...), which begin at `starts` (K,); each has a `weight` (N,)."""
+    wide = (-1, *[1] * (values.ndim - 1))
+    if weight is None:
+        total, size = np.add.reduceat(values, starts, axis=0), np.diff(starts, append=len(values))
+    else:
+        total, size = np.add.reduceat(values * weight.reshape(wide), starts, axis=0), np.add.reduceat(weight, starts)
+    return np.asarray(total / size.reshape(wide), dtype=np.float64)
+
+
 @dataclass(frozen=True, eq=False)
-class SoakBlocks:
-    """Means of `n` samples each, and how the samples are spread about them.
+class SoakRows:
+    """Means of a soak, in the order of time.
 
     Attributes
     ----------
-    T : (K,) array
-        Mean temperature, degC.
-    bias : (K, d) array
-        Mean bias, SI.
-    n : int
-        Samples of a block; the last one may have fewer.
-    spread : (K, 2 d + 1) array
-        Variances and covariances of a block's samples: of the bias (d), of bias and T (d), and of T.
-    t : (K,) array
-        Mean time, s.
+    t : (R,) array
+        Their middles, s.
+    T : (R,) array
+        Temperature as measured, degC.
+    bias : (R, d) array
+        Of the tracked sensor, SI.
+    span : (R,) array
+        How long each was measured, s.
+    channels : mapping of str to (R,) or (R, k) array
+        What else was recorded, for effects.
     """
 
+    t: Array
     T: Array
     bias: Array
-    n: int
-    spread: Array
-    t: Array
+    span: Array
+    channels: Mapping[str, Array] = field(default_factory=dict)
 
-    def within(self, slope: Array) -> Array:
-        """Return the mean square (d,) of the samples about a curve through their means, of slope (K, d)."""
-        d = self.bias.shape[1]
-        of_bias, mixed, of_T = self.spread[:, :d], self.spread[:, d : 2 * d], self.spread[:, 2 * d :]
-        squares = np.maximum(of_bias - 2 * slope * mixed + slope**2 * of_T, 0.0)
-        return np.asarray(np.mean(squares, axis=0), dtype=np.float64)
+    def part(self, where: NDArray[np.bool_]) -> SoakRows:
+        """Return the rows of which `where` (R,) is true."""
+        channels = {name: values[where] for name, values in self.channels.items()}
+        return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
+
+    def coarsened(self, starts: Index) -> SoakRows:
+        """Return the means of runs of rows, which begin at `starts` (K,)."""
+        t, T, bias = (means(values, starts, self.span) for values in (self.t, self.T, self.bias))
+        channels = {name: means(values, starts, self.span) for name, values in self.channels.items()}
+        return SoakRows(t, T, bias, np.add.reduceat(self.span, starts), channels)
+
+    def within(self, low: float, high: float) -> NDArray[np.bool_]:
+        """Return True for each row (R,) at a temperature from low to high, degC."""
+        return np.asarray((low <= self.T) & (high >= self.T))
+
+    def steps(self, *, free: bool, start: float | None = None) -> Array:
+        """Return the time (R,) that the walk to each row takes, s.
+
+        The level at `start`, by default the first row, is that of the curve; or it is `free`: nothing is known of it,
+        as of a further recording of the same unit, and the first time is infinite.
+        """
+        dt = np.diff(self.t, prepend=self.t[0] if start is None else start)
+        dt[0] = np.inf if free else dt[0]
+        return dt
+
+    def whitened(self, columns: Array, white: float, walk: float, *, free: bool, start: float | None = None) -> Array:
+        """Return columns (R, m) over the rows as normalised innovations.
+
+        `white` and `walk` are the densities of their noise, SI/sqrt(Hz) and SI/sqrt(s); the level is that of `steps`.
+        """
+        noise = np.maximum(white**2 / self.span, np.finfo(float).tiny)
+        steps = self.steps(free=free, start=start)
+        steps[1 if free else 0 :] *= walk**2
+        innovations: Array = whitened(np.ascontiguousarray(columns), noise, steps)[0]
+        return innovations
 
 
-class GrowingBlocks:
-    """Blocks of the samples so far, at most `most`, at first of `n` samples."""
+class GrowingSoak:
+    """Rows of the samples so far: fewer than `most`, an even number, of one sample each at first."""
 
-    def __init__(self, most: int = MAX_BLOCKS, n: int = 1) -> None:
-        self.most, self.n, self.samples = most, n, 0
+    def __init__(self, most: int = MAX_BLOCKS) -> None:
+        self.most, self.n, self.samples = most, 1, 0
         self.ends = np.inf, -np.inf  # lowest and highest temperature, degC
-        self._sums: list[Array] = []  # rows (k, 3 d + 3) of whole blocks: T, bias, their squares and products, t
-        self._rows = 0
-        self._rest: Array | None = None  # sums (1, 3 d + 3) of the block that is not whole
-        self._in_rest = 0
-        self._shift: Array | None = None  # of T and bias: the squares would lose digits to a large constant
+        self._sums = self._rest = np.empty((0, 0))  # (k, 3 d + 3) of rows, and of samples that make no row yet: of T,
+        # bias, their squares and products, and t, less `_shift` (d + 2,): squares would lose digits to a large constant
+        self._shift = np.empty(0)
 
     def add(self, t: Array, T: Array, bias: Array) -> None:
         """Add samples at t (N,) of T (N,) and bias (N, d), later than those before."""
         if len(T) == 0:
             return
-        if self._shift is None:
+        if not self.samples:
             self._shift = np.array([t[0], T.mean(), *bias.mean(axis=0)])
+            self._sums = self._rest = np.empty((0, 3 * bias.shape[1] + 3))
         self.samples += len(T)
         self.ends = min(self.ends[0], float(T.min())), max(self.ends[1], float(T.max()))
         x, left = T[:, None] - self._shift[1], bias - self._shift[2:]
-        self._append(np.hstack([x, left, left**2, left * x, x**2, t[:, None] - self._shift[0]]))
-        while self._rows >= self.most:
-            self._halve()
+        new = np.hstack([x, left, left**2, left * x, x**2, t[:, None] - self._shift[0]])
+        self._rest = np.vstack([self._rest, new])
+        while whole := min(len(self._rest) // self.n, self.most - len(self._sums)):
+            rows, self._rest = np.split(self._rest, [whole * self.n])
+            self._sums = np.vstack([self._sums, rows.reshape(whole, self.n, -1).sum(axis=1)])
+            if len(self._sums) == self.most:
+                self._sums, self.n = self._sums.reshape(self.most // 2, 2, -1).sum(axis=1), 2 * self.n
 
-    def blocks(self) -> SoakBlocks:
-        """Return the blocks, that which is not whole among them where it has half of its samples.
+    def rows(self, interval: float = 1.0) -> SoakRows:
+        """Return the rows, of samples `interval` s apart; the last has half of its samples at least.
 
         The coldest and the warmest one stand at the lowest and the highest temperature of all: a map's domain is that
         of its samples.
         """
-        assert self._shift is not None, "samples are added first"
-        d = len(self._shift) - 2
-        means = np.vstack([np.empty((0, 3 * d + 3)), *self._sums]) / self.n
-        if self._rest is not None and (2 * self._in_rest >= self.n or not len(means)):
-            means = np.vstack([means, self._rest / self._in_rest])
-        x, left = means[:, :1], means[:, 1 : 1 + d]
-        spread = means[:, 1 + d : -1] - np.hstack([left**2, left * x, x**2])
-        T = x[:, 0] + self._shift[1]
+        sums = self._means()
+        T, d = sums[:, 0] + self._shift[1], len(self._shift) - 2
         if len(T) > 1:
             T[np.argmin(T)], T[np.argmax(T)] = self.ends
-        return SoakBlocks(T, left + self._shift[2:], self.n, spread, means[:, -1] + self._shift[0])
+        span = np.full(len(T), self.n * interval)
+        return SoakRows(sums[:, -1] + self._shift[0], T, sums[:, 1 : 1 + d] + self._shift[2:], span)
 
-    def _append(self, rows: Array) -> None:
-        """Take rows (N, 3 d + 3) of samples into blocks."""
-        take = min(self.n - self._in_rest, len(rows)) if self._in_rest else 0
-        if take:
-            assert self._rest is not None
-            self._rest = self._rest + rows[:take].sum(axis=0, keepdims=True)
-            self._in_rest += take
-            if self._in_rest == self.n:
-                self._whole(self._rest)
-                self._rest, self._in_rest = None, 0
-        whole = (len(rows) - take) // self.n
-        stop = take + whole * self.n
-        if whole:
-            self._whole(rows[take:stop].reshape(whole, self.n, -1).sum(axis=1))
-        if stop < len(rows):
-            self._rest, self._in_rest = rows[stop:].sum(axis=0, keepdims=True), len(rows) - stop
+    def within(self, slope: Array) -> Array:
+        """Return the mean square (d,) of the samples about a curve through their means, of slope (R, d)."""
+        sums, d = self._means(), slope.shape[1]
+        x, left = sums[:, :1], sums[:, 1 : 1 + d]
+        of_bias, mixed, of_T = np.split(sums[:, 1 + d : -1] - np.hstack([left**2, left * x, x**2]), [d, 2 * d], axis=1)
+        return np.asarray(np.mean(np.maximum(of_bias - 2 * slope * mixed + slope**2 * of_T, 0.0), axis=0))
 
-    def _whole(self, sums: Array) -> None:
-        self._sums.append(sums)
-        self._rows += len(sums)
-
-    def _halve(self) -> None:
-        """Join neighbours; an odd one out begins the block that is not whole."""
-        sums = np.vstack(self._sums)
-        even = len(sums) // 2 * 2
-        if even < len(sums):
-            odd = sums[even:]
-            self._rest = odd if self._rest is None else odd + self._rest
-            self._in_rest += self.n
-        self._sums = [sums[:even].reshape(even // 2, 2, -1).sum(axis=1)]
-        self._rows, self.n = even // 2, 2 * self.n
+    def _means(self) -> Array:
+        """Return the means (R, 3 d + 3) of the rows' samples."""
+        whole = self._sums / self.n
+        last = 2 * len(self._rest) >= self.n or not len(whole)
+        return np.vstack([whole, self._rest.mean(axis=0)]) if last and len(self._rest) else whole
 
 
 SLOTS = 4096  # at most
@@ -145,21 +174,16 @@ CLEAR = 10  # times the scatter of the slots' temperatures: what is in no order,
 _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 
-@dataclass(frozen=True, eq=False)
-class SoakSummary:
-    """Summary of the samples that a map was fitted on, for its assessment.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SoakSummary(SoakRows):
+    """Rows of the samples that a map was fitted on, and their cells, for its assessment.
 
     Attributes
     ----------
     domain : tuple of float
         Lowest and highest temperature, degC.
-    interval : float
-        Between samples, s.
-    n, T, t, way, recording : (S,) arrays
-        Of each slot: samples, mean temperature, its middle in samples from the first, +1 warming, -1 cooling or 0, and
-        from which recording it is.
-    bias : (S, d) array
-        Mean bias of each slot.
+    way, recording : (R,) arrays
+        Of each row: +1 warming, -1 cooling or 0, and from which recording it is.
     count : (3, CELLS) array
         Samples in each cell on no way, warming, and cooling.
     cell_T, cell_bias : (3, CELLS) and (3, CELLS, d) arrays
@@ -169,13 +193,8 @@ class SoakSummary:
     """
 
     domain: tuple[float, float]
-    interval: float
-    n: Array
-    T: Array
-    t: Array
     way: Index
     recording: Index
-    bias: Array
     count: Array
     cell_T: Array
     cell_bias: Array
@@ -188,7 +207,7 @@ class SoakSummary:
 
     def hours(self, way: int) -> float:
         """Return the hours that the soak went one way."""
-        return float(np.sum(self.n[self.way == way])) * self.interval / 3600
+        return float(np.sum(self.span[self.way == way])) / 3600
 
     def cells(self, way: int) -> tuple[Array, Array, Array]:
         """Return samples (CELLS,), mean temperature (CELLS,) and mean bias (CELLS, d) of one way."""
@@ -197,19 +216,19 @@ class SoakSummary:
 
 
 def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> SoakSummary:
-    """Return the soak of samples T (N,) and bias (N, d); each recording begins at one of `starts`, the first at 0."""
+    """Return the summary of samples T (N,), bias (N, d); each recording begins at one of `starts`, the first at 0."""
     N, domain = len(T), (float(T.min()), float(T.max()))
-    size, stops = -(-N // SLOTS), [*starts[1:], N]
-    cuts = np.concatenate([np.arange(start, stop, size) for start, stop in zip(starts, stops, strict=True)])
-    n = np.diff(np.append(cuts, N)).astype(np.float64)
-    slot_T, slot_bias = np.add.reduceat(T, cuts) / n, np.add.reduceat(bias, cuts, axis=0) / n[:, None]
-    recording = np.searchsorted(np.asarray(starts), cuts, side="right") - 1
-    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(slot_T))
-    way = np.concatenate([directions(slot_T[recording == k], threshold) for k in range(len(starts))])
+    cuts = runs(starts, N, -(-N // SLOTS))
+    n, recording = np.diff(cuts, append=N), np.searchsorted(np.asarray(starts), cuts, side="right") - 1
+    t, row_T = (cuts + (n - 1) / 2) * interval, means(T, cuts)
+    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(row_T))
+    way = np.concatenate([directions(row_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
-    cells = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
-    middle = cuts + (n - 1) / 2
-    return SoakSummary(domain, interval, n, slot_T, middle, way, recording, slot_bias, *cells, _white(bias))
+    count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n), domain)
+    return SoakSummary(
+        t, row_T, means(bias, cuts), n * interval, domain=domain, way=way, recording=recording,
+        count=count, cell_T=cell_T, cell_bias=cell_bias, white=_white(bias),
+    )  # fmt: skip
 
 
 def _scatter(T: Array) -> float:

@@ -185,7 +185,7 @@ def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
 
 
 def _determined(design: _Design, H: Array) -> bool:
-    """Whether scale columns H (K, 2) are so far from the span of curve and placements that these stay as sure.
+    """Return True if scale columns H (K, 2) are so far from the span of curve and placements that these stay as sure.
 
     The residual of a column, as a part of it, is the variance of the curve without it to that with it.
     """
@@ -234,11 +234,11 @@ class Levels:
 
     @property
     def scale_determined(self) -> Array:
-        """Whether each scale factor is determined (d,)."""
+        """True where a scale factor is determined (d,)."""
         return np.asarray(self.scale_sigma < DETERMINED * SCALE)
 
     def level(self, axis: int) -> str:
-        """Return how far the level of an axis is known: `told`, `scale` (but for its scale factor), or `tilt`."""
+        """Return the state of an axis' level: `told`, `scale` (but for its scale factor), or `tilt`."""
         if self.sigma[axis] < DETERMINED * self.prior:
             return "told"
         return "scale" if self.given_scale[axis] < DETERMINED * self.prior else "tilt"

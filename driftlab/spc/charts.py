@@ -83,7 +83,7 @@ class Capability:
 
     @property
     def trusted(self) -> bool:
-        """Whether the indices hold; where not, the share of units above the limit does."""
+        """True if the indices hold; where not, the share of units above the limit does."""
         return self.normal >= 0.01
 
 

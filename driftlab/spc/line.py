@@ -323,7 +323,7 @@ def _apart(lot: LotOutlier, chart: ControlChart, line: LineReport) -> tuple[Cont
 
 
 def _as_neighbours(chart: ControlChart, own: NDArray[np.bool_], start: int, stop: int) -> bool:
-    """Whether a change of the line explains an odd lot: it came where the lot began, or before, and stayed."""
+    """Return True if a change of the line explains an odd lot: it came where the lot began, or before, and stayed."""
     if not chart.changes:
         return False
     edges = np.array([0, *(change.at for change in chart.changes), len(own)])

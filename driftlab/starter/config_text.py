@@ -180,7 +180,7 @@ def held_of(columns: FileColumns, channels: Channels) -> str | None:
 
 
 def _is_unit(text: str) -> bool:
-    """Whether a text is a unit, as the name of a column may be: `ppm` or `mV`."""
+    """Return True if a text is a unit, as the name of a column may be: `ppm` or `mV`."""
     return same_dimension(text, text)
 
 

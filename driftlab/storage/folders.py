@@ -301,7 +301,7 @@ WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command
 
 
 def matches(name: str, patterns: Collection[str]) -> bool:
-    """Whether a name is one of the patterns."""
+    """Return True if a name is one of the patterns."""
     return any(fnmatch(name, pattern) for pattern in patterns)
 
 
@@ -314,7 +314,7 @@ def remove(path: Path) -> None:
 
 
 def cannot_be_renamed(folder: Path) -> bool:
-    """Whether a folder is where a file system (or part of one) is mounted, or the working directory."""
+    """Return True if a folder is where a file system (or part of one) is mounted, or the working directory."""
     if os.path.ismount(folder) or folder == Path.cwd():
         return True
     try:

@@ -60,7 +60,7 @@ def check_own(path: Path, command: str, subject: str, remedy: str) -> None:
 
 
 def _seal(path: Path) -> tuple[int | None, str, bytes, bytes]:
-    """Return where a file says its SHA-256, of which command, what it says, and what it has with zeros there."""
+    """Return the place of the SHA-256 in a file, the command by it, its value there, and that with zeros there."""
     sha256, place, by, said, data, passed = hashlib.sha256(), None, "", b"", b"", 0
     with path.open("rb") as file:
         while (piece := file.read(COPIED)) and (place is not None or passed < LARGEST):
@@ -91,7 +91,7 @@ def signed(content: dict[str, Any], first: str, digests: Mapping[str, str]) -> s
 
 
 def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
-    """Return which files of a folder driftlab did not write, or not as they are."""
+    """Return the files of a folder that driftlab did not write as they are."""
     known = document(folder / first).get("written")
     known = known if isinstance(known, dict) else {}
     said = {name: str(known.get(name)) for name in names}

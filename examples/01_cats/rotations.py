@@ -22,7 +22,7 @@ from driftlab.config import load_config
 
 
 def same_map(folder: Path) -> bool:
-    """Return whether the explained map is the declared one, byte for byte."""
+    """Return True if the explained map is the declared one, byte for byte."""
     return (folder / "declared.json").read_bytes() == (folder / "explained.json").read_bytes()
 
 

@@ -28,7 +28,7 @@ PPM = 1e-6
 
 @dataclass(frozen=True)
 class Answer:
-    """What explain says of one resistor, and the errors of the predictions before and after, in parts of one."""
+    """The result of explain on one resistor, and the errors of the predictions before and after, in parts of one."""
 
     verdict: str
     lines: tuple[str, ...]

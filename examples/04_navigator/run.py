@@ -1,4 +1,4 @@
-"""What a warming vehicle gains from the thermal derivative: `python run.py [SEEDS]`.
+"""Gain of a warming vehicle from the thermal derivative: `python run.py [SEEDS]`.
 
 Five minutes for 20 drives; the figure is written to `demo_out/navigator/`.
 """

@@ -45,7 +45,7 @@ class Topic:
 
 @dataclass
 class Extras:
-    """What else stands in a log: dropouts as (time in us, ms), lines of text as (time in us, text)."""
+    """Other records of a log: dropouts as (time in us, ms), lines of text as (time in us, text)."""
 
     dropouts: Sequence[tuple[int, int]] = ()
     texts: Sequence[tuple[int, str]] = ()

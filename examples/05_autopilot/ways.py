@@ -1,4 +1,4 @@
-"""What each firmware takes off a gyro on a day: in its own arithmetic, from its own script's cubic and from ours."""
+"""Compensation of a gyro over a day by each firmware: its own arithmetic, with its own script's cubic and with ours."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FORMS = (("px4", "vehicle.params"), ("ardupilot", "vehicle.parm"), ("c", "c"))  
 def firmware(
     soaks: Sequence[Placement], flown: Placement, files: Mapping[str, Path], console: Console
 ) -> dict[str, Array]:
-    """Return what is taken off the gyro (N, 3) on the day that is flown, by way of compensation."""
+    """Return the compensation of the gyro (N, 3) on the day that is flown, by its name."""
     t, T = flown.t, flown.temperature
     own_px4, own_ardupilot = own_cubic(soaks)
     stairs = px4_arithmetic.published(t, T).astype(np.float64)
@@ -81,7 +81,7 @@ def own_cubic(
 
 
 def binned(T: Array, gyro: Array) -> tuple[Array, Array]:
-    """Return what PX4's script fits: medians of 31 samples (N, 3), averaged in 2000 equal intervals of T (N,)."""
+    """Return the points of PX4's fit: medians of 31 samples (N, 3), averaged in 2000 equal intervals of T (N,)."""
     filtered = np.stack([medfilt(column, MEDIAN) for column in gyro.T], axis=1)
     place = np.minimum((INTERVALS * (T - T.min()) / np.ptp(T)).astype(np.int64), INTERVALS - 1)
     count = np.bincount(place)
@@ -91,7 +91,7 @@ def binned(T: Array, gyro: Array) -> tuple[Array, Array]:
 
 
 def compiled(folder: Path, T: Array) -> Array:
-    """Return what the C code gives (N, 3), compiled."""
+    """Return the output of the compiled C code (N, 3)."""
     library = folder / "gyro_bias.so"
     run(["gcc", "-std=c99", "-O2", "-shared", "-fPIC", str(folder / "gyro_bias.c"), "-o", str(library)], check=True)
     function = CDLL(str(library.resolve())).gyro_bias

@@ -23,7 +23,7 @@ FRESH = "L10"  # lot of the new units
 
 @dataclass(frozen=True)
 class Line:
-    """What was made.
+    """A line with planted faults.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Line:
 
     @property
     def odd(self) -> dict[str, str]:
-        """What was planted, by unit."""
+        """Planted faults, by unit."""
         return {unit.name: unit.odd for unit in self.units if unit.odd}
 
 

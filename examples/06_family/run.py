@@ -1,4 +1,4 @@
-"""A line of 200 gyros, from its soaks to new units that need 40 % of one: what is found, beside what was planted.
+"""A line of 200 gyros, from its soaks to new units that need 40 % of one: results beside the planted faults.
 
 python examples/06_family/run.py
 """
@@ -37,7 +37,7 @@ RANGE = np.linspace(LOW, HIGH, 161)  # degC
 
 @dataclass(frozen=True)
 class Found:
-    """What the fleet says, beside what was planted.
+    """Results of the fleet, for comparison with the planted faults.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ def _load(path: Path) -> FittedMap:
 
 
 def of_the_line(line: Line, found: Found) -> Table:
-    """Return what was planted beside what the fleet says."""
+    """Return the planted faults beside the fleet's results."""
     made = Table(title="the line", title_justify="left", show_lines=True)
     for heading in ("planted", "found"):
         made.add_column(heading)
@@ -143,13 +143,13 @@ def of_the_line(line: Line, found: Found) -> Table:
 
 
 def _lines(found: Found, about: str) -> list[str]:
-    """Return what the fleet says about something."""
+    """Return the fleet's sentences about a subject."""
     told = found.told["family"]
     return [line for line in [*told["lines"], *told.get("line", [])] if about.lower() in line.lower()]
 
 
 def of_the_soaks(line: Line, found: Found) -> Table:
-    """Return what the maps of the new units are worth, and what they took of the chamber."""
+    """Return the errors of the new units' maps, and their time in the chamber."""
     title = f"{len(line.fresh)} new units: error of the map over {LOW:g} to {HIGH:g} °C, deg/h rms"
     made = Table(title=title, title_justify="left")
     made.add_column("map from")
@@ -164,7 +164,7 @@ def of_the_soaks(line: Line, found: Found) -> Table:
 
 
 def main() -> None:
-    """Make the line, run it, and say what was found."""
+    """Make the line, run it, and print the results."""
     begun = time.monotonic()
     shutil.rmtree(OUT, ignore_errors=True)
     console = Console(soft_wrap=True, highlight=False)

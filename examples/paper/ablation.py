@@ -1,4 +1,4 @@
-"""What the thermal derivative buys, and what the larger process noise: both filters at each walk, against the truth.
+"""Gains of the thermal derivative and of the larger process noise: both filters at each walk, against the truth.
 
 The paper's TCZUPT filter differs from its standard filter in two ways at once: it follows the map's derivative, and
 its walk is 3.3 times larger. Here every filter is run at the walk of table 1, of table 3, and at the one that makes its

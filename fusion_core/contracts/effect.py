@@ -57,7 +57,7 @@ class Effect(Plugin):
     sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
     """Standard deviations of the coefficients, in SI."""
     estimate: bool = False
-    """Whether the filter goes on estimating the coefficients, as states."""
+    """True if the filter goes on estimating the coefficients, as states."""
     initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
     """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
     domain: Annotated[Mapping[str, Ends | tuple[Ends, ...]], AfterValidator(Domain)] | None = None
@@ -110,7 +110,7 @@ class Effect(Plugin):
         return {}
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
-        """Yield what to try on these recordings, where the grid depends on them; it does not by default.
+        """Yield the grid of hyper-parameters to try, where it depends on the recordings; it does not by default.
 
         Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
         """
@@ -155,12 +155,12 @@ class Effect(Plugin):
     def realisation(self) -> tuple[Signal, ...] | None:
         """Return the signals that are the regressors of one axis, in the order of `terms`; each axis has the same.
 
-        For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
+        For firmware, which has no NumPy; the law: they are the signature. None, the default: not known.
         """
         return None
 
     def realised_input(self, temperature: Signal) -> Signal | None:
-        """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
+        """Return the temperature that the map sees, made of the thermometer's; None: not known."""
         return None if self.acts_on_input else temperature
 
     # text: names and units in configs and reports
@@ -223,17 +223,17 @@ class Effect(Plugin):
 
     @property
     def acts_on_input(self) -> bool:
-        """Whether the effect changes the temperature that the map sees."""
+        """True if the effect changes the temperature that the map sees."""
         return type(self).input is not Effect.input
 
     @property
     def fades(self) -> bool:
-        """Whether the effect has a memory of what came before the recording."""
+        """True if the effect has a memory of what came before the recording."""
         return type(self).fading is not Effect.fading
 
     @property
     def walks(self) -> bool:
-        """Whether the effect runs with time alone, as a walk of the bias may."""
+        """True if the effect runs with time alone, as a walk of the bias may."""
         return not self.requires and self.course != "line"
 
     @property

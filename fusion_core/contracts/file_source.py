@@ -51,13 +51,13 @@ class FileSource(Source):
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""
     start: Annotated[float, Unit("s", example="60 s")] | None = None
-    """Where to begin, from the first row; the beginning where it is left out."""
+    """Begin of the part that is read, from the first row; the beginning where it is left out."""
     stop: Annotated[float, Unit("s", example="600 s")] | None = None
-    """Where to end, from the first row; the end where it is left out."""
+    """End of the part that is read, from the first row; the end where it is left out."""
     interval: Annotated[float, Unit("s", positive=True, example="20 ms")] | None = None
     """Between rows, where the file has no time column."""
     channels: Annotated[Mapping[str, Channel], Field(min_length=1)]
-    """What to read: `time`, `gyro`, `accel`, `temperature`, `valid`; any other name is an auxiliary channel."""
+    """Channels: `time`, `gyro`, `accel`, `temperature`, `valid`; any other name is an auxiliary channel."""
 
     @model_validator(mode="after")
     def _check_channels(self) -> Self:
@@ -236,7 +236,7 @@ def kinds_of(first: bytes) -> list[str]:
 
 
 def recognised(first: bytes) -> bool:
-    """Whether the format of a file that begins so is known."""
+    """Return True if the format of a file that begins so is known."""
     return any(map(first.startswith, FORMATS)) or bool(kinds_of(first))
 
 

@@ -36,9 +36,9 @@ class MeasurementModel(Plugin):
     update_interval: Annotated[float, Unit("s", positive=True, example="0.1 s")] = Quantity(0.1, "0.1 s")
     """Duration of an epoch: samples in between are integrated first."""
     align: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-    """How long the first stretch at rest must be."""
+    """Least duration of the first stretch at rest."""
     temperature_rate: RateEstimator = Regression()
-    """How the temperature's rate is estimated."""
+    """Estimator of the temperature's rate."""
 
     # what it is about
 
@@ -76,7 +76,7 @@ class MeasurementModel(Plugin):
 
     @abstractmethod
     def still(self, window: Chunk) -> bool:
-        """Whether the sensors are at their known input over the epochs of a window, all of it."""
+        """Return True if the sensors are at their known input over the epochs of a window, all of it."""
 
     @abstractmethod
     def aligned(self, window: Chunk, site: Site) -> Alignment:

@@ -44,7 +44,7 @@ class Plugin(Settings, ABC):
     contract: ClassVar[int] = 1  # version of the family's contract that the class was written for
 
     kind: str
-    """Which plugin of the family it is."""
+    """Name of the plugin in its family."""
 
     @classmethod
     def examples(cls) -> Iterable[Self]:
@@ -79,7 +79,7 @@ def origin_of(cls: type) -> Origin | None:
 
 
 def built_in(plugin: Any) -> bool:
-    """Whether a plugin's class came with driftlab."""
+    """Return True if a plugin's class came with driftlab."""
     origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
     return origin is not None and origin.distribution == HOME
 

@@ -82,7 +82,7 @@ class SimulatedSource(Source):
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
     """Seed of the random numbers: the same gives the same samples."""
     duration: Annotated[float, Unit("s", positive=True, example="20 min")] | None = None
-    """How long it lasts; as long as the source itself has it by default."""
+    """Duration; the source's own by default."""
 
     @property
     def site(self) -> Site | None:

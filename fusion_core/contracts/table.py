@@ -67,7 +67,7 @@ class Table(ABC):
         """
 
     def has(self, path: str) -> bool:
-        """Whether `path` can be read."""
+        """Return True if `path` can be read."""
         return path in self.names
 
     def unit(self, path: str) -> str | None:

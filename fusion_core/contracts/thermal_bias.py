@@ -32,7 +32,7 @@ class ThermalBias(BiasModel):
     map: ThermalMap | None = None
     """The map of temperature that the bias follows."""
     effects: tuple[Effect, ...] = ()
-    """What else the bias follows, in this order."""
+    """Effects that the bias follows too, in this order."""
 
     @model_validator(mode="after")
     def _starts_somewhere(self) -> Self:

@@ -34,7 +34,7 @@ class ThermalMap(Plugin):
     outside: Outside = "refuse"
     """Beyond the temperatures of the fit: an error, the value at the end, or straight on."""
     min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")
-    """How far the temperature must move for a fit."""
+    """Least swing of the temperature for a fit."""
 
     _held: FittedMap | None = PrivateAttr(None)
 
@@ -123,7 +123,7 @@ class ThermalMap(Plugin):
 
     @property
     def has_map(self) -> bool:
-        """Whether there is a map to load: in memory, or in a file that is named."""
+        """True if there is a map to load: in memory, or in a file that is named."""
         return self._held is not None or self.path is not None
 
     def load(self) -> FittedMap:
@@ -166,6 +166,6 @@ class NetworkMap(ThermalMap):
     """Settings of a map that is a network of a size that can be chosen by trial."""
 
     target: Target = "bias"
-    """What the network gives: the bias, or its derivative with temperature."""
+    """Output of the network: the bias, or its derivative with temperature."""
     neurons: Annotated[int, Field(ge=1, le=20)] = 2
     """Neurons in each of the two hidden layers, an axis."""

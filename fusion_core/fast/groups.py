@@ -53,13 +53,13 @@ class IndependentGroups:
 
     @cached_property
     def ordered(self) -> bool:
-        """Whether the model has state i of every group, then state i + 1, and components so too: lanes as they are."""
+        """True if the model has state i of every group, then state i + 1, and components so too: lanes as they are."""
         lists = (self.states, self.n), (self.rows, self.m)
         return all(np.array_equal(places.T.ravel(), np.arange(size)) for places, size in lists)
 
     @cached_property
     def even(self) -> bool:
-        """Whether all groups have as many states, and as many components: no place is filled up."""
+        """True if all groups have as many states, and as many components: no place is filled up."""
         return self.states.size == self.n and self.rows.size == self.m
 
     def blocks(self, matrix: Array, rows: Index, columns: Index) -> Array:

@@ -100,7 +100,7 @@ inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 @compiled  # type: ignore[untyped-decorator]
 def uneven(Q: Array) -> bool:
-    """Whether a covariance is not symmetric, by more than rounding."""
+    """Return True if a covariance is not symmetric, by more than rounding."""
     sigma = np.sqrt(np.diag(Q))
     return not np.all(np.abs(Q - Q.T) <= 1e-9 * np.outer(sigma, sigma))
 

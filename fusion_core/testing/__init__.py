@@ -60,7 +60,7 @@ class Law:
         return f"{self.of}: {self.name}"
 
     def broken(self) -> str | None:
-        """Return why the law does not hold, None where it does."""
+        """Return the violation of the law, None where it holds."""
         try:
             self.check()
         except Exception as error:

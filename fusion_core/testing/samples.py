@@ -18,7 +18,7 @@ from fusion_core.contracts import USUAL, Memory, Plugin
 
 N = 120
 CUTS = ((), (1,), (60,), (7, 8, 9, 100), tuple(range(1, N)))
-"""Where recordings are cut: the first is not."""
+"""Rows at which recordings are cut; the first is not cut."""
 
 NONE: Mapping[str, int] = MappingProxyType({})
 Method = Callable[[Chunk, Memory], tuple[Mapping[str, Array], Memory]]

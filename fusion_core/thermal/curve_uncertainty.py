@@ -277,7 +277,7 @@ def _misfit(
     """Return the part (p,) of the free curve that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
-    it can follow says nothing of its misfit. Of what is found, as chi-square with its degrees of freedom, the part that
+    it can follow says nothing of its misfit. Of the finding, as chi-square with its degrees of freedom, the part that
     noise and smoothing are expected to have is taken off.
     """
     from scipy.special import chdtri

@@ -34,7 +34,7 @@ class MapRecord(Frozen):
     domain: tuple[float, float]
     """Smallest and largest input of the fit [degC]."""
     channel: Name = "gyro"
-    """Whose bias it is."""
+    """Channel whose bias it is."""
     unit: SiUnit = "rad/s"
     """Of the bias."""
     axes: AxisNames = ()
@@ -50,9 +50,9 @@ class MapRecord(Frozen):
 
     Each of the two is kept with 95 %."""
     lasted: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    """How long the samples of the fit were measured [s]; 0: not known."""
+    """Duration of the samples of the fit [s]; 0: not known."""
     memory: Annotated[Mapping[str, Any], AfterValidator(check_tree)] | None = None
-    """What the soak said of hysteresis and lags, as `judged.memory` of `fit-map --json`; None: not known."""
+    """Hysteresis and lags in the soak, as `judged.memory` of `fit-map --json`; None: not known."""
     samples: Annotated[int, Field(ge=0)] = 0
     """Rows of the fit; 0: not known, as of a map that was imported."""
     resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0

@@ -84,7 +84,7 @@ class Blocks:
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
-"""How a kind of map answers to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
+"""Response of a kind of map to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
 
 
 def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
@@ -170,7 +170,7 @@ class Contrasts:
         A = self.Z.T @ left  # the map has taken its part of the noise already
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
         if len(A) >= MIN_BLOCKS:
-            k2, s2 = _likeliest(self._turned(A, self.Z.T @ (y / scale)))
+            k2, s2 = _likeliest(*self._turned(A, self.Z.T @ (y / scale)))
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
@@ -178,22 +178,16 @@ class Contrasts:
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
         return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
-    def _turned(self, A: Array, u: Array) -> ScaledSum:
-        """Return the walk's covariance and u (m,) in contrasts A (m, K) that are turned so that white noise is alike.
+    def _turned(self, A: Array, u: Array) -> tuple[Array, Array]:
+        """Return the walk's variances (m,) and u (m,) in contrasts A (m, K) turned so that white noise has one of 1.
 
         What the map leaves nothing of is left out.
         """
-        from scipy.linalg import lapack
-
-        R, W = (A * self.white) @ A.T, A @ self.covariance @ A.T
-        root, failed = lapack.dpotrf(R, lower=1)
-        inverse = lapack.dtrtri(root, lower=1)[0] if not failed else None
-        # the smallest eigenvalue is at least one over the trace of the inverse
-        if inverse is None or np.sum(inverse**2) * np.trace(R) > 1 / TAKEN:
-            values, V = np.linalg.eigh(R)
-            free = values > TAKEN * values[-1]
-            inverse = (V[:, free] / np.sqrt(values[free])).T
-        return ScaledSum(inverse @ W @ inverse.T, (inverse @ u)[:, None])
+        values, V = np.linalg.eigh((A * self.white) @ A.T)
+        free = values > TAKEN * values[-1]
+        V = V[:, free] / np.sqrt(values[free])
+        own, turn = np.linalg.eigh(V.T @ (A @ self.covariance @ A.T) @ V)
+        return np.maximum(own, 0.0), turn.T @ (V.T @ u)
 
 
 def walk_covariance(blocks: Blocks) -> Array:
@@ -230,24 +224,29 @@ def _solved(root: Array, X: Array) -> Array:
     return np.asarray(cho_solve((root, True), X, check_finite=False))
 
 
-def _likeliest(sums: ScaledSum) -> tuple[float, float]:
-    """Return the variances of walk and white noise for which u (m,) ~ N(0, k^2 M + s^2) is likeliest."""
-    from scipy.optimize import minimize_scalar
-
-    if not np.any(sums.B):
+def _likeliest(own: Array, u: Array) -> tuple[float, float]:
+    """Return the variances of walk and white noise for which u (m,) ~ N(0, k^2 own + s^2) is likeliest."""
+    if not np.any(u):
         return 0.0, 0.0
 
     def at(ratio: float) -> tuple[float, float]:
-        solved, log_det = sums.solved(ratio)
-        scale = float(np.sum(sums.B * solved)) / len(solved)
-        return len(solved) * np.log(scale) + log_det, scale
+        variances = ratio * own + 1.0
+        scale = float(np.mean(u**2 / variances))
+        return len(u) * np.log(scale) + float(np.sum(np.log(variances))), scale
 
-    k = int(np.argmin([at(ratio)[0] for ratio in RATIOS]))
-    bounds = np.log(RATIOS[max(k - 1, 0)]), np.log(RATIOS[min(k + 1, len(RATIOS) - 1)])
-    best = float(np.exp(minimize_scalar(lambda log: at(float(np.exp(log)))[0], bounds=bounds, method="bounded").x))
+    best = float(np.exp(minimum_near(lambda log: at(float(np.exp(log)))[0], np.log(RATIOS))))
     best = best if at(best)[0] < at(0.0)[0] else 0.0
     scale = at(best)[1]
     return best * scale, scale
+
+
+def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:
+    """Return the minimum of a cost, between the neighbours of the best place of a grid."""
+    from scipy.optimize import minimize_scalar
+
+    k = int(np.argmin([cost(float(x)) for x in grid]))
+    bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
 
 
 def _pieces(blocks: Blocks) -> tuple[Array, Array]:
@@ -266,39 +265,3 @@ def straight_pieces(knots: Array, T: Array) -> Array:
     pieces, rows = np.zeros((len(T), len(knots))), np.arange(len(T))
     pieces[rows, place], pieces[rows, place + 1] = 1.0 - share, share
     return pieces
-
-
-class ScaledSum:
-    """r M + I, M (m, m), for columns and many ratios r: one reduction to three diagonals, then O(m) a ratio.
-
-    `B` (m, p) are the columns as Q' B. M is symmetric and non-negative, m rows, p columns::
-
-        M = Q T Q',  T tridiagonal;    r M + I = Q (r T + I) Q'
-
-    so inner products of columns under noise of the covariance r M + I are those of Q' B and (r T + I)^-1 Q' B.
-
-    Source: G. H. Golub and C. F. Van Loan, Matrix Computations, 4th ed., sec. 4.3.6 and 8.3.1.
-    """
-
-    def __init__(self, M: Array, B: Array) -> None:
-        from scipy.linalg import lapack
-
-        if len(M) == 1:  # a further row that adds nothing: LAPACK takes no empty second diagonal
-            M, B = np.pad(M, (0, 1)), np.pad(B, ((0, 1), (0, 0)))
-        m = len(M)
-        reduced, self.d, self.e, tau, _ = lapack.dsytrd(np.asfortranarray(M), lower=1, lwork=64 * m)
-        # Q is 1 in the first row and column; its reflectors are those of a QR of what is below the diagonal
-        turned = np.array(B, dtype=np.float64, order="F")
-        rest = np.asfortranarray(turned[1:])
-        reflectors = np.asfortranarray(reduced[1:, :-1])
-        turned[1:] = lapack.dormqr("L", "T", reflectors, tau, rest, 64 * rest.shape[1])[0]
-        self.B = turned
-
-    def solved(self, ratio: float) -> tuple[Array, float]:
-        """Return (r T + I)^-1 Q' B (m, p), and log det (r M + I)."""
-        from scipy.linalg import lapack
-
-        d, e, failed = lapack.dpttrf(ratio * self.d + 1.0, ratio * self.e)
-        if failed:
-            raise np.linalg.LinAlgError("the matrix is not non-negative")
-        return lapack.dpttrs(d, e, self.B)[0], float(np.sum(np.log(d)))

@@ -83,7 +83,7 @@ def steps_of(T: Array) -> Steps:
 
 
 def _jumps(T: Array, steps: Steps, path: float) -> bool:
-    """Whether the readings jump and flicker as they do under such steps, or hold or rest at places that are alike.
+    """Return True if the readings jump and flicker as under such steps, or hold or rest at places that are alike.
 
     On a path of so many K there is a jump for each step, which a mean may divide in two; with noise before the rounding
     readings flicker instead, and a mean of AVERAGED of them still does.

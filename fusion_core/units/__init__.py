@@ -222,6 +222,6 @@ def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:
 
 
 def unsettled(model: BaseModel) -> bool:
-    """Whether a field was given as a bare number, and nothing has said yet what the unit of the bias is."""
+    """Return True if a field was given as a bare number, and the unit of the bias is not known yet."""
     values = (item for _, value in model for item in (value if isinstance(value, tuple) else (value,)))
     return any(isinstance(item, Quantity) and item.unit == "" for item in values)

@@ -58,9 +58,9 @@ class ThermalDerivative(ThermalBias):
     map: Annotated[ThermalMap, Installed()] | None = None
     """The map of temperature that the bias follows."""
     form: Literal["difference", "slope"] = "difference"
-    """How a step follows the map: by the difference of its values, or by its slope times the temperature rate."""
+    """Form of a step along the map: by the difference of its values, or by its slope times the temperature rate."""
     effects: tuple[Annotated[Effect, Installed()], ...] = ()
-    """What else the bias follows, in this order."""
+    """Effects that the bias follows too, in this order."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

@@ -27,7 +27,7 @@ class Channel(OfChannel):
     channel: str = "voltage"
     """Name of the auxiliary channel."""
     columns: Annotated[int, Field(ge=1, le=64)] = 1
-    """How many columns the channel has."""
+    """Number of columns of the channel."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield itself: which channels there are, the recordings say."""

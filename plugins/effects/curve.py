@@ -30,7 +30,7 @@ class Curve(OfChannel):
     channel: str = "temperature"
     """Name of the channel."""
     powers: Annotated[int, Field(ge=1, le=_MAX_POWERS)] = 1
-    """How many powers."""
+    """Number of powers."""
     above: Annotated[int, Field(ge=0, le=15)] = 0
     """The degree that a declared map has already."""
     low: Annotated[float, Field(ge=-1e30, le=1e30)] = -40.0

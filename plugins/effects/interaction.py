@@ -32,7 +32,7 @@ class Interaction(Effect):
     channels: tuple[str, str] = ("voltage", "temperature")
     """Names of the two channels."""
     zero: tuple[float, float] = (0.0, 0.0)
-    """What is taken from the two channels before they are multiplied, in SI."""
+    """Offsets of the two channels, subtracted before they are multiplied, in SI."""
 
     @property
     def requires(self) -> tuple[str, ...]:

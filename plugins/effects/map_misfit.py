@@ -27,7 +27,7 @@ class MapMisfit(Effect):
 
     kind: Literal["map_misfit"] = "map_misfit"
     intervals: Annotated[int, Field(ge=1, le=64)] = 8
-    """How many intervals from low to high."""
+    """Number of intervals from low to high."""
     low: Annotated[float, Unit("degC", example="-40 degC")] = Quantity(-40.0, "-40 degC")
     """Lower end of the temperatures."""
     high: Annotated[float, Unit("degC", example="85 degC")] = Quantity(85.0, "85 degC")

@@ -37,7 +37,7 @@ class Relaxation(OfChannel):
     tau: Annotated[float, Unit("s", positive=True, example="20 min")] = Quantity(1200.0, "20 min")
     """Time constant of the lag."""
     form: Literal["relaxed", "late"] = "relaxed"
-    """What acts: the channel less its lag (relaxed), or the lag (late)."""
+    """Input: the channel less its lag (relaxed), or the lag (late)."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 20 s to 10 h."""

@@ -32,7 +32,7 @@ class ThermalGradient(Effect):
     channel: str = "temperature_case"
     """Name of the second thermometer's channel."""
     form: Literal["difference", "rate", "both"] = "both"
-    """What acts: the difference of the thermometers, its rate, or both."""
+    """Input: the difference of the thermometers, its rate, or both."""
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
     """Window over which the rate is taken."""
 

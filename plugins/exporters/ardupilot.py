@@ -85,7 +85,7 @@ class Ardupilot(Autopilot):
     imu: Annotated[int, Field(ge=1, le=5)] | None = None
     """Number of the IMU, from 1 as in INS_TCAL1. Without it, that of the log of which the map was made, else 1."""
     accel_offsets: bool = False
-    """Whether the offsets of the accelerometers are written too."""
+    """True if the offsets of the accelerometers are written too."""
 
     def shared(self, sensors: tuple[Calibrated, ...]) -> tuple[list[Parameter], list[str]]:
         """Return the switch and the limits of temperature, which an IMU's sensors share."""

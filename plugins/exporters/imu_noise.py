@@ -50,7 +50,7 @@ class ImuNoise(Exporter):
     rate: Annotated[float, Unit("Hz", positive=True, example="200 Hz")] | None = None
     """Rate of the messages; the config's where it has one."""
     compensated: bool = False
-    """Whether the program gets readings from which map and effects have been taken."""
+    """True if the program gets readings from which map and effects have been taken."""
     horizon: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
     """Time over which the program goes by a bias before it sees it anew: the walk covers what the bias does in it."""
 
@@ -108,7 +108,7 @@ class ImuNoise(Exporter):
         return SensorNoise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
 
     def _of_temperature(self, sensor: Calibrated, measured: Inflation | None) -> Iterator[str]:
-        """Yield what a walk has to do with the temperature."""
+        """Yield the notes on the part of temperature in a walk."""
         if sensor.map is None:
             return
         channel = sensor.channel
@@ -142,7 +142,7 @@ def _largest(
 
 
 def _over_lags(channel: str, measured: Inflation) -> Iterator[str]:
-    """Yield how far the bias moves over longer times than a step."""
+    """Yield the scatter of the bias over times longer than a step."""
     lags = []
     for lag in measured.lags:
         ratios = "/".join(f"{ratio:.3g}" for ratio in lag.ratio)

@@ -40,7 +40,7 @@ class Mat(Exporter):
     step: Annotated[float, Unit("delta_degC", positive=True, example="0.5 K")] = Quantity(0.5, "0.5 K")
     """Temperature from one row to the next."""
     method: Literal["linear", "spline"] = "linear"
-    """What `interp1` does between the rows, of which the loss is told."""
+    """Method of `interp1` between the rows, for which the loss is computed."""
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write a struct for each sensor that has a map."""

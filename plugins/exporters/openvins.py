@@ -38,7 +38,7 @@ class OpenVins(ImuNoise):
 
     kind: Literal["openvins"] = "openvins"
     form: Literal["openvins", "vins"] = "openvins"
-    """Whose: `vins` writes acc_n, acc_w, gyr_n and gyr_w, of single samples at `rate`."""
+    """Format: `vins` writes acc_n, acc_w, gyr_n and gyr_w, of single samples at `rate`."""
 
     def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the keys that OpenVINS reads, or those of VINS."""

@@ -44,9 +44,9 @@ class Checksum(Settings):
     start: Annotated[int, Field(ge=0, le=1 << 16)] = 0
     """First byte that is covered; the frame's first is 0."""
     byte_order: Literal["big", "little"] | None = None
-    """Byte order of the checksum; that of the frame where nothing is said."""
+    """Byte order of the checksum; that of the frame by default."""
     complement: bool = False
-    """Whether what is sent is the two's complement, so that all bytes add up to zero."""
+    """True if what is sent is the two's complement, so that all bytes add up to zero."""
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -136,7 +136,7 @@ class BinaryField(Settings):
     type: Literal["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
     """Type of the numbers."""
     count: Annotated[int, Field(ge=1, le=4096)] = 1
-    """How many numbers, one behind the other."""
+    """Count of numbers, one behind the other."""
     scale: float = 1.0
     """Value = number * scale + offset, in `unit`."""
     offset: float = 0.0
@@ -144,7 +144,7 @@ class BinaryField(Settings):
     unit: str | None = None
     """Unit of the value."""
     equals: int | None = None
-    """What the number is in every frame that is whole."""
+    """Value of the number in every whole frame."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -165,7 +165,7 @@ class Binary(Framing):
     fields: Annotated[tuple[BinaryField, ...], Field(min_length=1)]
     """The fields between sync and checksum, in order."""
     checksum: Checksum | None = None
-    """What follows the fields and says whether the frame is whole."""
+    """Checksum behind the fields, which says whether the frame is whole."""
     end: Hex = b""
     """Bytes that every frame ends with, in hexadecimal."""
     length: Annotated[int, Field(ge=1, le=1 << 16)] | None = None

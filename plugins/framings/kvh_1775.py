@@ -41,7 +41,7 @@ class Kvh1775(Framing):
     message: Literal["A", "B"] = "A"
     """Format of the messages: A is the unit's default; B has a time stamp."""
     output: Literal["delta", "rate"] = "delta"
-    """What the gyros give: the angle since the message before (the unit's default), or the angular rate."""
+    """Output of the gyros: the angle since the message before (the unit's default), or the angular rate."""
     angle: Literal["rad", "deg"] = "rad"
     """Unit of angles."""
     interval: Annotated[float, Unit("s", positive=True, example="10 ms")] | None = None
@@ -53,7 +53,7 @@ class Kvh1775(Framing):
     def _check(self) -> Self:
         if self.output == "delta" and self.interval is None:
             raise problem(
-                "the unit sends angles and not rates unless told otherwise; write interval: 10 ms (the time between "
+                "the unit sends angles and not rates unless configured otherwise; write interval: 10 ms (time between "
                 "messages), or output: rate where the unit was set so"
             )
         return self

@@ -45,15 +45,15 @@ class Text(Framing):
 
     kind: Literal["text"] = "text"
     separator: Literal[",", ";", "\t", " "] = ","
-    """What stands between cells; a space stands for any number of spaces and tabs."""
+    """Separator of cells; a space stands for any number of spaces and tabs."""
     columns: tuple[str, ...] | None = None
     """Names of the columns in order; without them, a line of names is waited for."""
     prefix: str = ""
-    """What every line of samples begins with, as in "$IMU,"."""
+    """Beginning of every line of samples, as in "$IMU,"."""
     checksum: Literal["nmea"] | None = None
     """Checksum at the end of a line."""
     channels: Annotated[Mapping[str, TextColumn], Field(min_length=1)]
-    """Which columns are which channels."""
+    """Channels of the columns."""
     counter: DeviceCounter | None = None
     """The column by which the device counts."""
 

@@ -54,9 +54,9 @@ class XsensMtdata2(Framing):
 
     kind: Literal["xsens_mtdata2"] = "xsens_mtdata2"
     channels: Annotated[tuple[Channel, ...], Field(min_length=1)] = ("gyro", "accel", "temperature")
-    """What to read; leave out what the unit is not set to send."""
+    """Items to read; leave out those that the unit is not set to send."""
     clock: Literal["sample_time", "packet_counter"] = "sample_time"
-    """Which item tells the time: the sample time in 0.1 ms, or the counter of messages."""
+    """Item that has the time: the sample time in 0.1 ms, or the counter of messages."""
 
     @classmethod
     def examples(cls) -> Iterable[Self]:

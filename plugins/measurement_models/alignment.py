@@ -29,7 +29,7 @@ LARGE = 2e-2  # of gravity: the bias that one may have all the same
 
 
 def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
-    """Whether the unit was at rest over the epochs of `window`."""
+    """Return True if the unit was at rest over the epochs of `window`."""
     for sensor in sensors:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
@@ -46,7 +46,7 @@ def steepest(sensor: Sensor) -> Array:
 
 
 def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
-    """Whether a sensor shows a curve over temperature and time, and white noise.
+    """Return True if a sensor shows a curve over temperature and time, and white noise.
 
     The curve is a polynomial of the time and the temperature itself; it may go as far as the steepest bias does over
     what the temperature moves, and no farther. What it leaves stands beside its own differences: a step of which the
@@ -145,7 +145,7 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
         return ()
     each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
     return (
-        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical is one with "
+        f"{accel.section}.bias.sigma_0: is missing, and an accelerometer's bias across the vertical is one with "
         f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
         f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
     )

@@ -65,11 +65,11 @@ class Held(contracts.MeasurementModel):
     noise: Annotated[PerAxis, Unit("bias/sqrt(Hz)", positive=True, example="0.06 ppm/sqrt(Hz)")]
     """Density of the white noise; its unit, less 1/sqrt(Hz), is that of the sensor."""
     bias: Annotated[contracts.BiasModel, Installed()]
-    """How the bias moves."""
+    """Model of the bias."""
     reference: Reference | None = None
-    """What an ideal sensor would show: a channel, or a constant; zero where nothing is said."""
+    """Reading of an ideal sensor: a channel, or a constant; zero by default."""
     range: Annotated[float, Unit("bias", positive=True, example="10 V")] | None = None
-    """Where the sensor is saturated."""
+    """Range of the sensor, beyond which it is saturated."""
     calibration: Annotated[contracts.ThermalMap, Installed()] | None = None
     """The map that is subtracted before the filter."""
     false_alarm: Annotated[float, pydantic.Field(gt=0, lt=0.1)] = 1e-7
@@ -182,7 +182,7 @@ class Held(contracts.MeasurementModel):
         return quantities.along_axes(0.0 if self.reference is None else self.reference, len(self.tracked.axes))
 
     def still(self, window: Chunk) -> bool:
-        """Whether nothing moves: always."""
+        """Return True: nothing ever moves."""
         return True
 
     def aligned(self, window: Chunk, site: contracts.Site) -> contracts.Alignment:

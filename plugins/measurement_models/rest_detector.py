@@ -166,7 +166,7 @@ def _departs(
     x: float, w: float, age: float, j: int, limit: float, steep: float, means: Array, of: Array, warm: Array,
     rate: float, tau: float,
 ) -> bool:  # fmt: skip
-    """Whether x, of weight w and so old, is farther off a level than noise and temperature take it."""
+    """Return True if x, of weight w and so old, is farther off a level than noise and temperature take it."""
     variance, level, lead, span = 1 / w + 1 / of[0], means[0, j], of[2] - age, of[3] - of[2]
     off = x - level
     if off * off <= limit * variance:
@@ -192,7 +192,7 @@ def _departs(
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, fast: Array) -> bool:
-    """Whether all axes are as near their levels as noise alone takes them, or have none: nearly always."""
+    """Return True if all axes are as near their levels as noise alone takes them, or have none: nearly always."""
     if of[0] == 0:
         return True
     of_level, before, late = 1 / of[0], 0.0, 0.0
@@ -211,7 +211,7 @@ def _stands_out(
     x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
     rate: float, out: Flags,
 ) -> bool:  # fmt: skip
-    """Whether an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
+    """Return True if an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
     stands = False
     for j in range(x.shape[1]):
         w = fast[1, j]
@@ -227,7 +227,7 @@ def _stands_out(
 def _leaves(
     x: Array, k: int, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
 ) -> bool:
-    """Whether an axis leaves the level at which it has settled; that begins anew then."""
+    """Return True if an axis leaves the level at which it has settled; that begins anew then."""
     if of[0] == 0:
         return False
     left = False

@@ -64,9 +64,9 @@ class Gyro(_Corrected):
     noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]
     """Density of the white noise."""
     range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None
-    """Where the sensor is saturated."""
+    """Range of the sensor, beyond which it is saturated."""
     bias: Annotated[contracts.BiasModel, Installed(bias="rad/s")]
-    """How the bias moves."""
+    """Model of the bias."""
 
 
 class Accel(_Corrected):
@@ -75,9 +75,9 @@ class Accel(_Corrected):
     noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]
     """Density of the white noise."""
     range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None
-    """Where the sensor is saturated."""
+    """Range of the sensor, beyond which it is saturated."""
     bias: Annotated[contracts.BiasModel, Installed(bias="m/s^2")]
-    """How the bias moves."""
+    """Model of the bias."""
 
 
 class Rest(Settings):
@@ -104,7 +104,7 @@ class Zupt(contracts.MeasurementModel):
     track: Literal["gyro", "accel"] = "gyro"
     """The triad whose bias is looked for: that of maps, tables and figures."""
     rest: Rest = Rest()
-    """How still the unit is at rest, and when it is taken to move."""
+    """Detection of motion, by the scatter and the level of the sensors."""
 
     @classmethod
     def examples(cls) -> Iterable[Self]:
@@ -217,7 +217,7 @@ class Zupt(contracts.MeasurementModel):
         return self._motion.white(chunk)
 
     def still(self, window: Chunk) -> bool:
-        """Whether no epoch stands out, and the scatter is not far beyond the declared noise."""
+        """Return True if no epoch stands out, and the scatter is not far beyond the declared noise."""
         return at_rest(window, self._watched)
 
     def check(self, window: Chunk, site: contracts.Site) -> None:

@@ -49,9 +49,9 @@ class BinaryLog(contracts.FileSource):
 
     kind: Literal["binary_log"] = "binary_log"
     framing: Annotated[contracts.Framing, Installed()]
-    """How the device puts samples into bytes."""
+    """Format of the device's bytes."""
     channels: Mapping[str, contracts.Channel] = Field(default_factory=dict)
-    """Which of the framing's channels to read, under which names; every one where nothing is said."""
+    """Channels of the framing to read, by name; all by default."""
 
     def check_time(self) -> None:
         """Take the channels from the framing where none are named, and see that it can tell the time.

@@ -48,7 +48,7 @@ class Csv(FileSource):
 
     kind: Literal["csv"] = "csv"
     separator: Literal[",", ";", "\t"] = ","
-    """What stands between the cells of a line."""
+    """Separator of the cells of a line."""
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
@@ -250,7 +250,7 @@ class CsvLines(Table):
         return row
 
     def _torn(self, line: str, at: dict[str, int], *, closed: bool) -> bool:
-        """Whether the last line of the file was not written to its end."""
+        """Return True if the last line of the file was not written to its end."""
         fields, n = self._fields(line), len(self.columns)
         if len(fields) < n or closed:
             return len(fields) < n

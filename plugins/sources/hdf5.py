@@ -72,7 +72,7 @@ class DataSets(Table):
             return [name.decode("utf-8", "backslashreplace") for name in names_of(self.path, self.file)]
 
     def has(self, path: str) -> bool:
-        """Whether `path` is a data set; it may begin with a slash."""
+        """Return True if `path` is a data set; it may begin with a slash."""
         with _translated(self.path):
             return path.strip("/") in self.names and path in self.file
 

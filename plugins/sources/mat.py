@@ -192,7 +192,7 @@ class Variables(Table):
         return [path for name, node in self.file.tops.items() for path in self._leaves(name, node)]
 
     def has(self, path: str) -> bool:
-        """Whether `path` is a variable, or a field of a struct."""
+        """Return True if `path` is a variable, or a field of a struct."""
         return self._node(path) is not None
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
@@ -290,7 +290,7 @@ class Variables(Table):
 
 
 def _version_4(first: bytes) -> bool:
-    """Whether a file begins as one of version 4: type (MOPT), rows, columns, whether complex, length of the name."""
+    """Return True if a file begins as version 4: type (MOPT), rows, columns, complex or not, length of the name."""
     for order in ("<i4", ">i4"):
         if len(first) > 20:
             kind, rows, columns, imaginary, name = np.frombuffer(first[:20], order).tolist()

@@ -83,7 +83,7 @@ class ParquetColumns(Table):
         return [path for name, kind in self.schema.items() for path in _field_paths(name, kind)]
 
     def has(self, path: str) -> bool:
-        """Whether `path` is a column, or a field of a struct."""
+        """Return True if `path` is a column, or a field of a struct."""
         return self._column(path) is not None
 
     def unit(self, path: str) -> str | None:

@@ -90,11 +90,11 @@ class _Seekable(io.RawIOBase):
     at = 0
 
     def readable(self) -> bool:
-        """Whether it can be read."""
+        """Return True if it can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Whether `seek` is possible."""
+        """Return True, since `seek` is possible."""
         return True
 
 

@@ -1,6 +1,5 @@
 """The commands as functions: the content of the command's files, arrays in memory, no file that nobody asked for."""
 
-import inspect
 import json
 import subprocess
 import sys
@@ -376,28 +375,3 @@ def test_the_loop_is_closed_in_memory_as_in_files(files, unit):
     assert Path("explained/explained.yaml").read_text() == result.config
     with pytest.raises(ConfigError, match=r"^holdout .*overlaps .*, which was given for fitting"):
         driftlab.explain(config, first, first, first)
-
-
-def test_the_reference_has_every_function_with_its_arguments_and_every_error():
-    page = (Path(__file__).parents[2] / "docs" / "reference" / "python_api.md").read_text()
-    for name in (
-        "allan",
-        "check",
-        "compare",
-        "explain",
-        "export",
-        "fit_map",
-        "fleet",
-        "import_map",
-        "init",
-        "plan",
-        "run",
-        "simulate",
-    ):
-        words = []
-        for item in inspect.signature(getattr(driftlab, name)).parameters.values():
-            if item.kind is item.KEYWORD_ONLY and "*" not in words:
-                words.append("*")
-            words.append(item.name if item.default is item.empty else f"{item.name}={item.default!r}")
-        assert f"`driftlab.{name}({', '.join(words)})`" in page
-    assert all(f"`{name}`" in page for name in driftlab.errors.__all__)

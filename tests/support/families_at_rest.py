@@ -11,9 +11,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from driftlab.family.basis import STEP
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.candidates import installed
+from driftlab.soak.blocks import SoakRows
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 

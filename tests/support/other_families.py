@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows
 
 LOW, HIGH = -20.0, 60.0  # degC
 GRID = np.linspace(LOW, HIGH, 81)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from driftlab.config import load_config, understood
-from driftlab.family.rows import rows_of, soaked_of
+from driftlab.family.unit_noise import soaked_of
 from driftlab.maps.fit import gather
 from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.faults import Faults
@@ -44,7 +44,7 @@ def soaked(recording, config=None):
     if isinstance(config, str):
         config = understood(document_of(config))
     name = in_memory(recording) if isinstance(recording, dict) else recording
-    rows = rows_of(gather(config, [name], Faults(), keep=True), config.filter.tracked.channel)
+    rows = gather(config, [name], Faults(), keep=True).rows(config.filter.tracked.channel)
     return soaked_of("unit", config.filter.tracked.axes, rows)[0]
 
 

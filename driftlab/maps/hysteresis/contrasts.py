@@ -25,9 +25,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.blocks import SoakSummary
+from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
+from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about
 MIN_CONTRASTS = 24  # with which slow noise can be told from white noise
@@ -45,47 +46,6 @@ PARTS = 6  # directions in which it is free
 SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
-
-
-@dataclass(frozen=True, eq=False)
-class Slots:
-    """Means of slots that follow one another.
-
-    Attributes
-    ----------
-    of_slot : (S,) array of int
-        Block of each slot.
-    n : (K,) array
-        Samples in each.
-    t, span : (K,) array and float
-        Middle of each, and how long one is, s.
-    recording : (K,) array of int
-    weights : (S,) array
-        Share of each slot in its block.
-    """
-
-    of_slot: Index
-    n: Array
-    t: Array
-    span: float
-    recording: Index
-    weights: Array
-
-    @classmethod
-    def of(cls, soak: SoakSummary) -> Slots:
-        """Return the blocks of a soak."""
-        size = max(1, -(-len(soak.T) // BLOCKS))
-        first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
-        since = np.arange(len(soak.T)) - np.repeat(first, np.diff(np.append(first, len(soak.T))))
-        starts = since % size == 0
-        of_slot = np.cumsum(starts, dtype=np.int64) - 1
-        n = np.bincount(of_slot, soak.n).astype(np.float64)
-        t = np.bincount(of_slot, soak.n * soak.t) / n * soak.interval
-        return cls(of_slot, n, t, float(np.median(n)) * soak.interval, soak.recording[starts], soak.n / n[of_slot])
-
-    def means(self, values: Array) -> Array:
-        """Return the means (K, q) of values of the slots (S, q)."""
-        return np.add.reduceat(values * self.weights[:, None], np.flatnonzero(np.diff(self.of_slot, prepend=-1)))
 
 
 class FreeCurve:
@@ -111,24 +71,18 @@ class FreeCurve:
         return np.asarray(BSpline.design_matrix(np.clip(T, *self.domain), self.knots, 3).toarray())
 
 
-def laws_of(blocks: Slots) -> list[Array]:
+def laws_of(blocks: SoakRows, recording: Index) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
-    whole = max(float(np.ptp(blocks.t[blocks.recording == k])) for k in np.unique(blocks.recording)) + blocks.span
+    lasted = float(np.median(blocks.span))
+    whole = max(float(np.ptp(blocks.t[recording == k])) for k in np.unique(recording)) + lasted
     apart = np.abs(blocks.t[:, None] - blocks.t)
-    together = blocks.recording[:, None] == blocks.recording
-    cascade = blocks.span * CASCADE ** np.arange(np.log(WALK * whole / blocks.span) / np.log(CASCADE))
-    flicker = np.mean([_gauss_markov(apart, blocks.span, tau) for tau in cascade], axis=0)
-    wandering = [*(_gauss_markov(apart, blocks.span, share * whole) for share in SPANS), flicker]
+    together = recording[:, None] == recording
+    cascade = lasted * CASCADE ** np.arange(np.log(WALK * whole / lasted) / np.log(CASCADE))
+    flicker = np.mean([gauss_markov(apart, lasted, tau) for tau in cascade], axis=0)
+    wandering = [*(gauss_markov(apart, lasted, share * whole) for share in SPANS), flicker]
     t = (blocks.t - np.mean(blocks.t)) / np.ptp(blocks.t)
     drift = np.outer(t, t)
     return [*(C * together + 2 * (C[0, 0] - C[0, -1]) * drift for C in wandering), drift]
-
-
-def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
-    x = span / tau
-    own = 2 * (x + np.expm1(-x)) / x**2
-    beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - span, 0.0) / tau)
-    return np.asarray(np.where(apart < span / 2, own, beside))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +109,7 @@ class SoakContrasts:
 
     Attributes
     ----------
-    blocks : Blocks
+    blocks : SoakRows
     y : (K, d) array
         The bias, in `scale` (d,).
     Z : (K, m) array
@@ -164,16 +118,17 @@ class SoakContrasts:
     """
 
     def __init__(self, soak: SoakSummary) -> None:
-        self.blocks, self._T = Slots.of(soak), soak.T
-        blocks = self.blocks
-        means = blocks.means(soak.bias)
-        self.scale = np.std(means, axis=0)
+        first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
+        self._starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
+        self.blocks, self._soak, recording = soak.coarsened(self._starts), soak, soak.recording[self._starts]
+        bias = self.blocks.bias
+        self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
-        self.root = np.sqrt(blocks.n / np.mean(blocks.n))[:, None]
-        self.y = (means - means.mean(axis=0)) / self.scale * self.root
-        levels = blocks.recording[:, None] == np.unique(blocks.recording)[1:]
+        self.root = np.sqrt(self.blocks.span / np.mean(self.blocks.span))[:, None]
+        self.y = (bias - bias.mean(axis=0)) / self.scale * self.root
+        levels = recording[:, None] == np.unique(recording)[1:]
         self.more = levels * self.root
-        laws = [self.root * C * self.root.T for C in laws_of(blocks)]
+        laws = [self.root * C * self.root.T for C in laws_of(self.blocks, recording)]
         self.curve, self.splines = self._curve(soak, laws[0])
         self.X = np.column_stack([self.splines * self.root, self.more])
         U, s, _ = np.linalg.svd(self.X)
@@ -195,7 +150,7 @@ class SoakContrasts:
             if chosen and count * GROUP > len(self.y):
                 break
             curve = FreeCurve(soak.domain, count)
-            splines = self.blocks.means(curve(soak.T))
+            splines = self.means(curve(soak.T))
             X = np.column_stack([V.T @ (splines * self.root), more])
             costs = np.array([_cost(X * w[:, None], y * w[:, None]) - 2 * np.sum(np.log(w)) for w in weights])
             cost = np.sum(costs.min(axis=0)) + 2 * y.shape[1] * X.shape[1]
@@ -204,6 +159,10 @@ class SoakContrasts:
             best = cost
             chosen.append((curve, splines))
         return chosen[-1]
+
+    def means(self, values: Array) -> Array:
+        """Return the means (K, ...) of values of the slots (S, ...) over the blocks."""
+        return means(values, self._starts, self._soak.span)
 
     @cached_property
     def u(self) -> Array:
@@ -222,7 +181,7 @@ class SoakContrasts:
 
     def of(self, values: Array) -> Array:
         """Return values of slots (S, ...) in the contrasts (m, ...)."""
-        z = self.Z.T @ (self.blocks.means(values.reshape(len(values), -1)) * self.root)
+        z = self.Z.T @ (self.means(values.reshape(len(values), -1)) * self.root)
         return np.asarray(z.reshape(len(z), *values.shape[1:]))
 
     @staticmethod
@@ -276,7 +235,7 @@ class SoakContrasts:
     def late(self, inputs: Array) -> tuple[Array, Array]:
         """Return the splines where the curve sees inputs (S, J): of slots (J, S, p), and X of the blocks (J, K, P)."""
         there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
-        return there, np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
+        return there, np.stack([np.column_stack([self.means(one) * self.root, self.more]) for one in there])
 
     def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
         """Return the bias that is added where the curve sees other temperatures (S, J).
@@ -295,7 +254,7 @@ class SoakContrasts:
         there, late = self.late(inputs)
         each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
-        here, p = self.curve(self._T), self.splines.shape[1]
+        here, p = self.curve(self._soak.T), self.splines.shape[1]
         slots = np.stack([(one - here) @ bent[:p] for one in there], axis=1)
         J, d = slots.shape[1:]
         regressors = self.Z.T @ late  # (J, m, P)

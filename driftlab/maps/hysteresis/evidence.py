@@ -132,7 +132,7 @@ class ShapeEvidence:
 
     @property
     def added(self) -> int:
-        """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
+        """Number of shapes that add to the bias: two inputs of one curve at once look like a sharp bend of it."""
         return int(self.A.shape[1] - self.followed.shape[2])
 
     @cached_property
@@ -171,7 +171,7 @@ class ShapeEvidence:
 
     @cached_property
     def weights(self) -> Array:
-        """How probable each shape is, if there is a memory (J,)."""
+        """Probability of each shape, if there is a memory (J,)."""
         return shares(self.of_shapes + np.log(self.prior))
 
     def tempered(self, power: float) -> Array:
@@ -201,7 +201,7 @@ class ShapeEvidence:
 
     @cached_property
     def noises(self) -> Array:
-        """How probable each noise is (R, d)."""
+        """Probability of each noise (R, d)."""
         like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
         return shares(np.where(np.isnan(like), -np.inf, like))
 
@@ -264,7 +264,7 @@ class Pairs:
 
     @property
     def weights(self) -> Array:
-        """How probable each pair is, if there are two (P,)."""
+        """Probability of each pair, if there are two (P,)."""
         return shares(self.power * self.likelihoods)
 
     @classmethod

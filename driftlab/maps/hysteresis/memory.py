@@ -15,7 +15,7 @@ from driftlab.soak.blocks import WAYS, SoakSummary
 from fusion_core.chunk import Array
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
-ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be told from it
+ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be distinguished from it
 PAIRS = 24
 HINT = 1.0  # of the evidence: more is worth a mention (Kass and Raftery, 1995)
 CLEAR = 1.96  # deviations of a size, on one axis at least: with less a size is not signed
@@ -25,14 +25,14 @@ WHY = {
     "cools": "only ever cools: hysteresis cannot be seen; come back up by the same steps",
     "no way": "the temperature goes neither up nor down in the order of the samples: hysteresis cannot be seen",
     "apart": "warming and cooling share too few temperatures: hysteresis cannot be seen; come back by the same steps",
-    "short": "too short on its way up or down: hysteresis cannot be told from noise; go slower, or up and down again",
+    "short": "too short on its way up or down to distinguish hysteresis from noise; go slower, or up and down again",
     "levels": "each recording or placement goes one way and has a level of its own: a hysteresis that is alike at "
     "all temperatures cannot be seen; warm and cool within one",
     "weak": "only a hysteresis larger than all that the bias does here would be seen; go up and down again, or slower",
     "hint": "more is there than a soak without hysteresis usually shows, and less than is taken for one; go up and "
     "down again, by the same steps",
     "brief": "up and down differ as where the sensor follows its thermometer by less than a minute, which may be their "
-    "places or when they are read: whether it remembers more, cannot be told; go up and down faster, and slower",
+    "places or when they are read: whether it remembers more is not known; go up and down faster, and slower",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
     "none": "what is between up and down is no more than noise",
@@ -49,7 +49,7 @@ class MemoryVerdict:
     Attributes
     ----------
     answer : str
-        "seen", "none" (larger than `none_larger_than`), or "undecided" (cannot be told on this soak).
+        "seen", "none" (larger than `none_larger_than`), or "undecided" (not known from this soak).
     kinds : tuple of str
         Kinds of effects that the soak cannot tell from one another, the likeliest first; empty unless seen.
     size, sigma : (d,) arrays
@@ -84,13 +84,13 @@ class MemoryVerdict:
 
     @classmethod
     def unknown(cls, d: int, why: str) -> MemoryVerdict:
-        """Return the verdict that nothing can be told on d axes, and why."""
+        """Return the undecided verdict on d axes, and why."""
         nothing = np.full(d, np.nan)
         return cls("undecided", (), nothing, nothing, np.full(d, np.inf), nothing, why)
 
     @property
     def probability(self) -> float:
-        """How probable a memory is, where as much spoke for one beforehand as against; 0 where it is unknown."""
+        """Posterior probability of a memory, from equal prior odds; 0 where it is unknown."""
         return float(1 / (1 + np.exp(-np.clip(self.evidence, -500, 500)))) if np.isfinite(self.evidence) else 0.0
 
     @property
@@ -177,7 +177,7 @@ class _MemoryTest:
         total = self.evidence.total
         seen = total > SEEN
         unseen = self._larger()
-        reach = np.ptp(self.contrasts.blocks.means(self.soak.bias), axis=0)
+        reach = np.ptp(self.contrasts.blocks.bias, axis=0)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         sized = self if total <= HINT else self._following()
         noise = np.argmax(self.evidence.noises, axis=0)
@@ -207,7 +207,7 @@ class _MemoryTest:
 
     @property
     def _divided(self) -> bool:
-        """Whether each recording goes one way only."""
+        """True if each recording goes one way only."""
         ways, recordings = self.soak.way, self.soak.recording
         return all(len(np.unique(ways[(recordings == k) & (ways != 0)])) < 2 for k in np.unique(recordings))
 

@@ -118,7 +118,7 @@ def _offered(
 
 
 def remembers(forward: Sequence[Array], backward: Sequence[Array]) -> bool:
-    """Whether what was shown of recordings differs from what is shown of them run backwards."""
+    """Return True if what was shown of recordings differs from what is shown of them run backwards."""
     return any(
         bool(np.max(np.abs(one - other[::-1])) > SAME * max(float(np.ptp(one)), 1e-300))
         for one, other in zip(forward, backward, strict=True)
@@ -130,7 +130,7 @@ def _recordings(soak: SoakSummary, *, backward: bool = False) -> list[Chunk]:
     chunks = []
     for number in np.unique(soak.recording):
         own = soak.recording == number
-        t, T = soak.t[own] * soak.interval, soak.T[own][::step]
+        t, T = soak.t[own], soak.T[own][::step]
         chunks.append(Chunk(t, {SUBJECT: T, "residual": np.zeros((len(T), 1))}))
     return chunks
 

@@ -54,7 +54,7 @@ const driftlab = (() => {
     }
 
     legend() {
-      const seen = new Map();
+      const seen = new Map(), bands = new Map(); // of bands of one role that overlap, the inner ones are darker
       for (const panel of this.content.panels) {
         for (const line of panel.lines) if (line.name && !seen.has(line.name)) seen.set(line.name, line);
         for (const s of panel.shades) if (s.text && !seen.has(s.text)) seen.set(s.text, { ...s, style: "shade" });
@@ -69,6 +69,7 @@ const driftlab = (() => {
         mark.style.setProperty("--light", look.light);
         mark.style.setProperty("--dark", look.dark);
         mark.style.setProperty("--width", Math.max(2, look.width) + "px");
+        if (line.low && !line.y) mark.style.opacity = 0.3 * bands.set(line.role, (bands.get(line.role) || 0) + 1).get(line.role);
         key.append(mark, name);
         key.title = "show or hide";
         key.setAttribute("aria-pressed", "true");

@@ -189,7 +189,7 @@
     find("ended").hidden = false;
     find("ended").classList.add(failed ? "fail" : "pass");
     state(failed ? "bad" : "good", failed ? "ended with an error" : "finished");
-    say("how", failed ? "What went wrong" : `Finished, results are in ${out}`);
+    say("how", failed ? "The run failed" : `Finished, results are in ${out}`);
     list("found", lines);
   }
 

@@ -1,4 +1,4 @@
-"""What the plugins say of the physics, which no law knows."""
+"""Physics of the plugins, which no law knows."""
 
 import numpy as np
 import pytest

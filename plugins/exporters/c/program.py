@@ -71,7 +71,7 @@ class Program:
 
     @property
     def remembers(self) -> bool:
-        """Whether there is anything but tables of the temperature."""
+        """True if there is anything but tables of the temperature."""
         return bool(self.signals) or any(table.of != TEMPERATURE for table in self.tables)
 
     def limits(self, reading: Reading) -> tuple[np.float32, np.float32, np.float32]:
@@ -139,7 +139,7 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
 
 
 def why_not(effect: Effect) -> str | None:
-    """Return why an effect cannot be run by a program; None where it can."""
+    """Return the reason that a program cannot run an effect; None where it can."""
     signals = effect.realised
     if signals is None or effect.realised_input(TEMPERATURE) is None:
         return "it cannot be computed from channels and time since switch-on"

@@ -37,7 +37,7 @@ class DataFlash(FileSource):
 
     kind: Literal["dataflash"] = "dataflash"
     imu: Annotated[int, Field(ge=0)] = 0
-    """Which inertial unit, from 0: paths that begin with IMU, GYR or ACC and name none are of this one."""
+    """Number of the inertial unit, from 0: paths that begin with IMU, GYR or ACC and name none are of this one."""
     compensated: Literal["undo", "refuse", "keep"] = "undo"
     """Of what the autopilot corrected: undo it, refuse a log with a learned polynomial, or keep all as logged."""
 

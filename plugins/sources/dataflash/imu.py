@@ -171,7 +171,7 @@ class ImuCorrections:
         return raw
 
     def polynomial(self, at: Places) -> bool:
-        """Whether a learned polynomial was applied to one of the rows."""
+        """Return True if a learned polynomial was applied to one of the rows."""
         return any(correction.coefficients is not None for _, correction in self._spans(at))
 
     def unknown(self, at: Places) -> int | None:

@@ -137,7 +137,7 @@ def _walk(data: Bytes, stop: int, wanted: NDArray[np.bool_], lengths: Places, in
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _follows(data: Bytes, end: int, length: int) -> bool:
-    """Whether a record of `length` that ends at `end` is whole: the file ends there, or the next one begins."""
+    """Return True if a record of `length` that ends at `end` is whole: the file ends there, or the next one begins."""
     n = len(data)
     if length < 3 or end > n:
         return False
@@ -228,7 +228,7 @@ class Message:
         return None
 
     def has(self, **fields: str) -> bool:
-        """Whether it has fields of these names, each of one of the letters."""
+        """Return True if it has fields of these names, each of one of the letters."""
         letters_of = dict(zip(self.labels, self.letters, strict=True))
         return all(letters_of.get(label, " ") in letters for label, letters in fields.items())
 

@@ -50,7 +50,7 @@ class Messages(Table):
         ]
 
     def has(self, path: str) -> bool:
-        """Whether the log has this field; raises MissingChannel where it has not its message or unit."""
+        """Return True if the log has this field; raises MissingChannel where it has not its message or unit."""
         return self._find(path) is not None
 
     def unit(self, path: str) -> str | None:

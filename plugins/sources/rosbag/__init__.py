@@ -52,7 +52,7 @@ class Rosbag(FileSource):
 
     kind: Literal["rosbag"] = "rosbag"
     stamp: Literal["header", "log"] = "header"
-    """Whose time: of the stamps in the messages' headers, or of when they were recorded."""
+    """Clock: the stamps in the messages' headers, or the times of recording."""
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
@@ -95,7 +95,7 @@ class Topics(Table):
         return paths
 
     def has(self, path: str) -> bool:
-        """Whether `path` can be read; raises MissingChannel that lists topics or fields where it cannot."""
+        """Return True if `path` can be read; raises MissingChannel that lists topics or fields where it cannot."""
         self._field(path)
         return True
 
@@ -256,7 +256,7 @@ class TopicStream:
         return f"({self.t[0]:.3f} to {self.t[-1]:.3f} s)" if len(self.t) else "(no message)"
 
     def meets(self, t: Array) -> bool:
-        """Whether the times of the topic and t (N,), both rising, overlap."""
+        """Return True if the times of the topic and t (N,), both rising, overlap."""
         return len(self.t) > 0 and bool(self.t[0] <= t[-1] and self.t[-1] >= t[0])
 
     def add(self, batch: Batch, connection: Connection) -> None:

@@ -390,7 +390,7 @@ class Types:
                 inside.append((f"{path}.", iter(self.fields.get(node[1], ()))))
 
     def has_header(self, kind: str) -> bool:
-        """Whether messages of a type begin with a header, which has a stamp and a frame."""
+        """Return True if messages of a type begin with a header, which has a stamp and a frame."""
         return next(iter(self.fields.get(kind, ())), None) == ("header", (NAME, HEADER))
 
     def _readable(self, node: Definition, path: str, unit: str | None) -> Field | None:

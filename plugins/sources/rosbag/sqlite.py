@@ -47,7 +47,7 @@ class Sqlite:
             ) from None
 
     def count(self, connection: int) -> int | None:
-        """Return how many messages a connection has, None where a damaged file does not tell."""
+        """Return the number of messages of a connection, None if a damaged file does not have it."""
         try:
             with self.clock, closing(self._connect()) as base:
                 query = "SELECT COUNT(*) FROM messages WHERE topic_id = ?"
@@ -142,7 +142,7 @@ class Sqlite:
         return base
 
     def _late(self) -> bool:
-        """Whether a query is to be ended."""
+        """Return True if a query is to be ended."""
         try:
             self.clock.check()
         except UnreadableFile:

@@ -62,17 +62,17 @@ class Serial(Source):
     baudrate: Annotated[int, Field(gt=0, le=100_000_000)] = 115200
     """Bits a second."""
     framing: Annotated[Framing, Installed()]
-    """How the device puts samples into bytes."""
+    """Format of the device's bytes."""
     interval: Annotated[float, Unit("s", positive=True, example="10 ms")]
     """Time between samples, as the device is set."""
     clock: Literal["device", "host"] | None = None
-    """Whose clock stamps the samples; by default the device's where it sends a counter."""
+    """Clock that stamps the samples; by default the device's where it sends a counter."""
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
     """Window over which the host's clock is smoothed."""
     buffer: Annotated[int, Field(ge=4096, le=1 << 30)] = 1 << 20
     """Bytes kept for a filter that is late."""
     silent_after: Annotated[float, Unit("s", positive=True, example="5 s")] = Quantity(5.0, "5 s")
-    """How long the device may be silent before it is reported."""
+    """Longest silence of the device before it is reported."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

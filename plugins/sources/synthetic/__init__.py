@@ -58,7 +58,7 @@ class SmoothStep(Settings):
     at: Reading
     """Temperature of the middle."""
     height: Annotated[float, Unit("rad/s", example="0.02 deg/s")]
-    """How much the bias changes."""
+    """Change of the bias."""
     width: Annotated[float, Unit("delta_degC", positive=True, example="0.8 K"), DIFFERENCE]
     """Width from 10 % to 90 % of the height."""
 
@@ -146,7 +146,7 @@ class SimulatedThermometer(Settings):
     """The unit's thermometer."""
 
     at: Literal["body", "chamber"] = "body"
-    """What it measures; with `chamber`, the gyros lag behind it."""
+    """Temperature that the thermometer measures; with `chamber`, the gyros lag behind it."""
     noise: Annotated[float, Unit("delta_degC", example="0.02 K"), DIFFERENCE, NOT_NEGATIVE, default("0.02 K")]
     """Deviation of a reading."""
     resolution: Annotated[float, Unit("delta_degC", example="0.01 K"), DIFFERENCE, NOT_NEGATIVE, default("0.01 K")]

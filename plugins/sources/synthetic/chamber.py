@@ -48,11 +48,11 @@ class ChamberSoak(_Profile):
     step: Annotated[float, Unit("delta_degC", positive=True, example="5 K"), DIFFERENCE, default("5 K")]
     """From one temperature to the next."""
     hold: Annotated[float, Unit("s", positive=True, example="2.5 h"), default("2.5 h")]
-    """How long it stays at each."""
+    """Time at each temperature."""
     ramp: Annotated[float, Rate, default("2 K/min")]
-    """How fast it goes from one to the next."""
+    """Rate from one temperature to the next."""
     down: bool = False
-    """Whether it comes back by the same steps."""
+    """True if it comes back by the same steps."""
 
     def plateaus(self) -> Array:
         """Return their temperatures (M,) in degC, in order."""
@@ -81,11 +81,11 @@ class Ramp(_Profile):
     high: Annotated[Reading, default("34.08 degC")]
     """Highest temperature."""
     rate: Annotated[float, Rate, default("2 K/min")]
-    """How fast the temperature changes."""
+    """Rate of the temperature."""
     hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]
-    """How long it stays at either end."""
+    """Time at either end."""
     cycles: Annotated[int, Field(ge=1, le=10_000)] = 1
-    """How many times up and down."""
+    """Number of sweeps up and down."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

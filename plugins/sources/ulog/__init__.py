@@ -57,7 +57,7 @@ class Ulog(FileSource):
 
     kind: Literal["ulog"] = "ulog"
     device_id: Annotated[int, BeforeValidator(_number)] | None = None
-    """Of the gyro to read, as in CAL_GYROn_ID: `1310988` or `"0x14010C"`; the first where nothing is said."""
+    """Of the gyro to read, as in CAL_GYROn_ID: `1310988` or `"0x14010C"`; the first by default."""
     instance: Annotated[int, Field(ge=0)] | None = None
     """Of the gyro to read: 1 is `sensor_gyro[1]`."""
 

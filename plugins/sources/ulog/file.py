@@ -377,7 +377,7 @@ def _status(data, p, shortest, longest, least, most):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True)
 def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[no-untyped-def]
-    """Whether the message at p is whole, and what follows it can be `count` more."""
+    """Return True if the message at p is whole, and what follows it can be `count` more."""
     if _status(data, p, shortest, longest, least, most) != WHOLE:
         return False
     for _ in range(count):
@@ -453,11 +453,11 @@ def described(device: int | None) -> str:
 
 
 def same_place(one: int | None, other: int | None) -> bool:
-    """Whether two devices answer at the same bus and address."""
+    """Return True if two devices answer at the same bus and address."""
     return bool(one and other) and (one or 0) & 0xFFFF == (other or 0) & 0xFFFF
 
 
 def same_part(one: int | None, other: int | None) -> bool:
-    """Whether two devices are halves of one part, as the gyro and the accelerometer of a BMI088 on one bus."""
+    """Return True if two devices are halves of one part, as the gyro and the accelerometer of a BMI088 on one bus."""
     name, other_name = (PARTS.get((device or 0) >> 16 & 0xFF) for device in (one, other))
     return name is not None and name == other_name and (one or 0) & 0xFF == (other or 0) & 0xFF

@@ -75,7 +75,7 @@ class ULogTopics(Table):
         ]
 
     def has(self, path: str) -> bool:
-        """Whether there is such a topic with such a field."""
+        """Return True if there is such a topic with such a field."""
         instance = self.instance(path)
         return instance is not None and taken_apart(path).field in _fields(instance)
 
@@ -248,7 +248,7 @@ def taken_apart(path: str) -> ColumnPath:
 
 
 def before_1_11(instance: Instance) -> bool:
-    """Whether a raw topic is of firmware whose drivers applied the calibration, by its fields."""
+    """Return True if a raw topic is of firmware whose drivers applied the calibration, by its fields."""
     return "integral_dt" in instance.samples or "error_count" not in instance.samples
 
 
@@ -261,7 +261,7 @@ def _order(topic: str) -> tuple[bool, bool, str]:
 
 
 def _times(data: Mapping[str, Array]) -> Array:
-    """Return when the samples were taken [us]; when the messages were sent where that is not in the log."""
+    """Return the times of the samples [us]; those of the messages where the log has no others."""
     sent = np.asarray(data["timestamp"], dtype=np.float64)
     if "timestamp_sample" not in data:
         return sent

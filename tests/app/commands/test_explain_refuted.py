@@ -48,13 +48,13 @@ def test_what_predicts_the_test_recording_worse_is_refuted_in_the_first_line(ref
     assert result.exit_code == 0, result.output
     first, second, *_ = result.output.splitlines()
     assert first == "verdict: refuted"
-    assert second.startswith("  holdout.csv: predicted worse with what was found than without (")
+    assert second.startswith("  holdout.csv: predicted worse with the identified effects than without (")
     content = json.loads((folder / "out" / "loop.json").read_text())
     assert content["verdict"] == "refuted"
     change = content["holdout_change"]
     assert change["after"] > change["before"]
     assert change["sigma"] > 1.645
-    assert "What was found predicts the test recording worse" in (folder / "out" / "report.html").read_text()
+    assert "The identified effects predict the test recording worse" in (folder / "out" / "report.html").read_text()
 
 
 def test_the_declared_config_stays_to_the_byte_and_what_was_found_is_the_candidate(refuted):

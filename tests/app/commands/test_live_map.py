@@ -113,7 +113,7 @@ def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording
     (["--sigma", "3 deg/h"], "--sigma: is of a map that is fitted meanwhile; add --fit-map MAP"),
     (["--fit-map", "m.json"], "no thermal map is named in the config; add one under filter.gyro, or give --kind ("),
     (["--fit-map", "m.json", "--kind", "spline", "--until-reached"],
-     "--until-reached: what is to be reached is not said; give --sigma and --range"),
+     "--until-reached: has no target, a sigma over a range was expected; give --sigma and --range"),
     (["--fit-map", "m.json", "--kind", "spline", "--sigma", "0 deg/h"],
      "--sigma '0 deg/h': is not above zero; write one like '3 deg/h'"),
     (["--fit-map", "m.json", "--kind", "spline", "--range", "35..5 degC"],

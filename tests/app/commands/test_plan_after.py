@@ -47,7 +47,7 @@ def test_a_recording_becomes_what_is_missing(folder, monkeypatch):
     assert done.exit_code == 0, done.output
     said = done.stdout
     assert "were seen, the rest of the range is not known" in said
-    assert "so far, hysteresis: cannot be told at all, temperature has not turned back" in said
+    assert "so far, hysteresis: not known, temperature has not turned back" in said
     written = json.loads((folder / "out" / "plan.json").read_text())
     assert {item["kind"] for item in written["effects"]} == {"hysteresis", "thermal_rate"}
     assert written["enough"] is None

@@ -6,7 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from driftlab.config import Limits
-from driftlab.evaluation.limits import EXIT, MEASURED_BY, NAMES, Measured, check_limits, outcome, verdict, worst
+from driftlab.evaluation.limits import (
+    EXIT,
+    MEASURED_BY,
+    NAMES,
+    Measured,
+    check_limits,
+    outcome,
+    verdict,
+    verdict_of_units,
+    worst,
+)
 from driftlab.units import RATE, BiasUnit
 
 AXES = ("x", "y", "z")
@@ -161,6 +171,23 @@ def test_a_unit_is_said_to_be_what_its_worst_limit_is():
     for k, word in enumerate(order):
         assert worst([{"verdict": said} for said in order[: k + 1]]) == word
     assert worst([]) is None
+
+
+def test_units_are_counted_with_the_limits_that_decide():
+    def unit(**verdicts):
+        return [{"name": name, "verdict": said} for name, said in verdicts.items()]
+
+    units = [
+        unit(noise="pass", coast="pass"), unit(noise="fail", coast="fail"), unit(noise="pass", coast="fail"),
+        unit(noise="undecided", coast="fail"), unit(noise="undecided", coast="pass"), [],
+        unit(noise="pass", coast="not measured"),
+    ]  # fmt: skip
+    assert verdict_of_units(units) == (
+        "limits: 1 pass; 3 fail (coast over 10 min (rms) 3, white noise 1); 1 undecided (white noise 1); "
+        "1 not measured (coast over 10 min (rms) 1)"
+    )
+    assert verdict_of_units([unit(noise="fail")]) == "limits: 0 pass; 1 fail (white noise 1)"
+    assert verdict_of_units([[], []]) == ""
 
 
 def test_a_row_is_shown_in_the_unit_of_the_sensor():

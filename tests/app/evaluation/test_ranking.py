@@ -38,7 +38,7 @@ def test_the_best_is_named_with_its_error_whatever_the_order():
     for order in permutations(runs):
         assert of({name: runs[name] for name in order}) == (
             "On this one recording tczupt coasts best: to the end (40 min) 12.31 deg/h rms over the axes, "
-            "standard 34.10, plain 90.00; they differ by more than the sigma (5.00), and all axes agree. "
+            "standard 34.10, plain 90.00 deg/h; they differ by more than the sigma (5.00 deg/h), and all axes agree. "
             "Itself it is off by 2.5 times its sigma, which is too small to tell chance by. Over 10 min the same."
         )
 
@@ -49,7 +49,7 @@ def test_within_the_sigma_is_no_difference_whatever_the_order():
     for order in (["a", "b"], ["b", "a"]):
         text = of({name: runs[name] for name in order})
         assert "no difference between b and a: to the end (40 min) 3.00 and 7.00 deg/h rms over the axes" in text
-        assert "within the sigma (5.00)" in text
+        assert "within the sigma (5.00 deg/h)" in text
         assert "best" not in text
 
 
@@ -67,13 +67,13 @@ def test_the_same_config_twice_is_a_tie():
 def test_a_third_that_is_worse_is_named_beside_a_tie():
     text = of({"a": coasting(30.0), "b": coasting(3.0), "c": coasting(4.0)})
     assert "no difference between b and c" in text
-    assert "; worse: a 30.00." in text
+    assert "; worse: a 30.00 deg/h." in text
 
 
 def test_axes_that_do_not_agree_are_named():
     text = of({"a": coasting([2.0, 2.0, 20.0]), "b": coasting([60.0, 6.0, 2.0])})
     assert "a coasts best" in text
-    assert "more than the sigma (5.00), but not on y and on z b is better." in text
+    assert "more than the sigma (5.00 deg/h), but not on y and on z b is better." in text
     tied = of({"a": coasting([10.0, 2.0, 0.0]), "b": coasting([2.0, 10.0, 0.0])})
     assert "no difference" in tied
     assert ", but a is better on y and b is better on x." in tied
@@ -96,14 +96,17 @@ def test_a_horizon_that_one_run_has_no_score_for_decides_nothing():
     assert found is not None
     assert found.horizon == "5 min"
     nothing = replace(a, coast=dict.fromkeys(HORIZONS, none))
-    assert of({"a": nothing, "b": b}).startswith("Which config coasts best is not known")
+    assert of({"a": nothing, "b": b}).startswith("The config that coasts best is not known")
 
 
 def test_one_axis_has_no_axes_to_agree():
     ppm = BiasUnit("1", "ppm")
     one, other = (coasting(v, sigma=1.0, axes=("R",), unit=1e-6) for v in (1.5, 20.0))
     text = of({"one": one, "other": other}, unit=ppm)
-    assert "one coasts best: to the end (40 min) 1.5 ppm, other 20; they differ by more than the sigma (1)." in text
+    assert (
+        "one coasts best: to the end (40 min) 1.5 ppm, other 20 ppm; they differ by more than the sigma (1 ppm)."
+        in text
+    )
 
 
 def test_one_config_has_nothing_to_compare_with():

@@ -17,8 +17,9 @@ from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, fi
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.tail_law import TailLaw, standardised
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
+from driftlab.soak.blocks import SoakRows
 from driftlab.units import RATE, BiasUnit
 
 SIZE = 1e-4

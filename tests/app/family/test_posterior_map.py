@@ -14,7 +14,8 @@ from driftlab.family.bands import LEVELS
 from driftlab.family.file import load_family, save_family
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.posterior_map import UnitPosterior, unit_posterior, with_pooled_noise
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
+from driftlab.soak.blocks import SoakRows
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
 

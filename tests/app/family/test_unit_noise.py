@@ -1,14 +1,18 @@
 """White noise and walk about a free curve: against the dense likelihood, and against what was planted."""
 
+from dataclasses import replace
+
 import family
 import numpy as np
 import pytest
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
 
 from driftlab.family.basis import SplineBasis
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import common_walk, densities_of, walk_from_repeated_sweeps
-from driftlab.noise.local_level import log_determinant
+from driftlab.soak.blocks import SoakRows
 
 STEP = 2.5
 
@@ -23,19 +27,10 @@ def rows(seed, *, R=300, white=2.0, walk=0.02, swing=60.0, curve=lambda T: 0.05 
     return SoakRows(t, T, bias, np.full(R, 10.0), {})
 
 
-def dense(recordings, white, walk):
-    """The covariance of rows as a matrix, each further recording with a level that may be anything."""
-    blocks = []
-    for k, own in enumerate(recordings):
-        noise, steps = own.variances(white, walk, free=k > 0)
-        sums = np.cumsum(steps)
-        blocks.append(np.minimum(sums[:, None], sums[None, :]) + np.diag(noise))
-    size = sum(map(len, blocks))
-    S, at = np.zeros((size, size)), 0
-    for block in blocks:
-        S[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return S
+def dense(own, white, walk):
+    """The covariance of rows as a matrix, the level that of the curve at the first one."""
+    since = own.t - own.t[0]
+    return walk**2 * np.minimum.outer(since, since) + np.diag(white**2 / own.span)
 
 
 def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() -> None:
@@ -45,7 +40,7 @@ def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() 
     U = U[:, s > 1e-5 * s[0]]
 
     def cost(logs):
-        S = dense([own], *np.exp(logs))
+        S = dense(own, *np.exp(logs))
         weighted = np.linalg.solve(S, np.column_stack([U, y]))
         A = U.T @ weighted[:, :-1]
         left = y @ weighted[:, -1] - (U.T @ weighted[:, -1]) @ np.linalg.solve(A, U.T @ weighted[:, -1])
@@ -65,6 +60,40 @@ def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() 
     np.testing.assert_allclose(
         [found.white_sigma[0] / found.white[0], found.walk_sigma[0] / found.walk[0]], deviations, rtol=0.05
     )
+
+
+def test_a_curve_that_levels_can_make_is_theirs():
+    """The second recording shares no temperature with the first: how far apart their curves are, nobody knows."""
+    first, other = rows(4, R=120, swing=15.0), rows(5, R=120, swing=15.0, start=1e5)
+    own = [first, replace(other, T=other.T + 45)]
+    T, y = np.concatenate([part.T for part in own]), np.concatenate([part.bias[:, 0] for part in own])
+    level = np.repeat([0.0, 1.0], 120)[:, None]
+    K = null_space(np.hstack([SplineBasis.over(T, STEP).values(T), level]).T, rcond=1e-5)
+
+    def cost(logs):
+        S = K.T @ block_diag(*(dense(part, *np.exp(logs)) for part in own)) @ K
+        return -multivariate_normal.logpdf(K.T @ y, cov=(S + S.T) / 2)
+
+    found = densities_of(own, STEP)
+    best = minimize(cost, np.log([2.0, 0.02]), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9})
+    np.testing.assert_allclose([found.white[0], found.walk[0]], np.exp(best.x), rtol=3e-3)
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.02, 0.5])
+def test_the_likely_walk_is_the_mean_under_the_dense_restricted_likelihood(walk) -> None:
+    own = rows(6, R=80, walk=walk)
+    U, s, _ = np.linalg.svd(SplineBasis.covering(own.T.min(), own.T.max(), STEP).values(own.T), full_matrices=False)
+    U, y, nu = U[:, s > 1e-5 * s[0]], own.bias[:, 0], 80 - int(np.sum(s > 1e-5 * s[0]))
+    at, costs, white = np.arange(-18.0, 14.01, 0.2), [], []  # of the variances of walk and of white noise in a row
+    logs = (at - np.log(10.0 * np.ptp(own.t))) / 2  # of the densities
+    for log in logs:
+        inverse = np.linalg.inv(dense(own, 1.0, np.exp(log)))
+        A, b = U.T @ inverse @ U, U.T @ inverse @ y
+        white.append((y @ inverse @ y - b @ np.linalg.solve(A, b)) / nu)
+        costs.append(nu * np.log(white[-1]) - np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(A)[1])
+    weight = np.exp(-(np.array(costs) - np.min(costs)) / 2 + logs)  # even in the walk
+    mean = np.trapezoid(weight * np.array(white) * np.exp(2 * logs)) / np.trapezoid(weight)
+    assert densities_of([own], STEP).likely[0] == pytest.approx(np.sqrt(mean), rel=2e-3)
 
 
 def test_the_densities_of_a_family_are_within_their_deviations() -> None:
@@ -93,14 +122,14 @@ def test_a_walk_that_does_not_show_has_an_upper_limit() -> None:
 def test_information_is_that_of_dense_generalised_least_squares() -> None:
     recordings = [rows(1), rows(2, R=120, swing=20.0, start=5e4)]
     soaked = UnitInformation.of("a", ("x",), recordings, np.array([2.0]), np.array([0.02]), STEP)
-    S = dense(recordings, 2.0, 0.02)
+    W = np.zeros((420, 420))
+    first, second = (np.linalg.inv(dense(own, 2.0, 0.02)) for own in recordings)
+    W[:300, :300] = first
+    W[300:, 300:] = second - second.sum(axis=1)[:, None] * second.sum(axis=0) / second.sum()  # a level of its own
     B = soaked.knots.values(np.concatenate([own.T for own in recordings]))
     y = np.concatenate([own.bias[:, 0] for own in recordings])
-    np.testing.assert_allclose(soaked.J[0], B.T @ np.linalg.solve(S, B), rtol=1e-6, atol=1e-6 * soaked.J.max())
-    np.testing.assert_allclose(soaked.h[0], B.T @ np.linalg.solve(S, y), rtol=1e-6, atol=1e-6 * np.abs(soaked.h).max())
-    np.testing.assert_allclose(soaked.log_det[0], np.linalg.slogdet(S)[1], rtol=1e-6)
-    noise, steps = recordings[0].variances(2.0, 0.02, free=False)
-    np.testing.assert_allclose(log_determinant(noise, steps), np.linalg.slogdet(dense(recordings[:1], 2.0, 0.02))[1])
+    np.testing.assert_allclose(soaked.J[0], B.T @ W @ B, rtol=1e-9, atol=1e-9 * soaked.J.max())
+    np.testing.assert_allclose(soaked.h[0], B.T @ W @ y, rtol=1e-9, atol=1e-9 * np.abs(soaked.h).max())
 
 
 def test_passes_that_agree_leave_the_walk_as_it_is() -> None:

@@ -5,7 +5,6 @@ import pytest
 
 from driftlab.maps.kind_selection import ErrorScale, candidates, compare, divide
 from driftlab.reports.map_selection import comparison_document, config_line, failures, rows, verdict
-from driftlab.soak.blocks import GrowingBlocks
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, SwingTooSmall
@@ -175,27 +174,3 @@ def test_the_table_begins_with_the_chosen_one_and_ends_with_no_map(of_step):
     table = rows(of_step, RATE)
     assert table[0][0] == "spline *"
     assert table[-1][0] == "no map"
-
-
-@pytest.mark.parametrize("N", [5, 64, 1000, 4097])
-def test_blocks_are_means_of_all_samples_in_equal_numbers(N):
-    rng = np.random.default_rng(0)
-    T, bias = rng.normal(size=N), 5 + rng.normal(size=(N, 2))
-    growing = GrowingBlocks(most=64)
-    at = 0
-    while at < N:
-        size = int(rng.integers(1, 90))
-        growing.add(np.arange(at, at + size)[: N - at] * 1.0, T[at : at + size], bias[at : at + size])
-        at += size
-    found = growing.blocks()
-    assert growing.samples == N
-    assert len(found.T) <= 64
-    n = found.n
-    whole = N // n
-    assert len(found.T) in (whole, whole + 1)
-    np.testing.assert_allclose(found.bias[:whole], bias[: whole * n].reshape(whole, n, 2).mean(axis=1), rtol=1e-12)
-    assert (found.T.min(), found.T.max()) == (T.min(), T.max())
-    # the spread about a straight line through the means is what the samples have about it in their blocks
-    slope = np.full((len(found.T), 2), 0.3)
-    left = (bias - 0.3 * T[:, None])[: whole * n].reshape(whole, n, 2)
-    np.testing.assert_allclose(found.within(slope)[0], left.var(axis=1).mean(axis=0)[0], rtol=0.1, atol=1e-12)

@@ -2,8 +2,42 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag, null_space
+from scipy.stats import multivariate_normal
 
-from driftlab.noise.local_level import effective, fit_local_level
+from driftlab.noise.local_level import LevelLikelihood, effective, fit_local_level
+
+
+def test_the_restricted_likelihood_is_that_of_the_dense_distribution_of_all_contrasts():
+    """Two recordings with rows that were not read, a level that begins anew, and columns free beside."""
+    rng, parts, covariances, free, signals = np.random.default_rng(8), [], [], [], []
+    for n, unknown in ((60, [20]), (45, [0])):
+        w, dt, X, y = rng.uniform(0.5, 2, n), rng.uniform(1, 4, n), rng.normal(size=(n, 3)), rng.normal(size=(n, 2))
+        missing, dt[0] = rng.random(n) < 0.2, 0.0
+        level = np.cumsum(np.isin(np.arange(n), unknown))
+        together = level[:, None] == level
+        since = np.cumsum(dt)
+        walk = np.where(together, np.minimum.outer(since, since), 0.0)
+        levels = (level[:, None] == np.unique(level[np.isin(np.arange(n), unknown)])).astype(float)
+        read = ~missing
+        covariances.append((np.diag(w[read]), walk[np.ix_(read, read)]))
+        free.append((X[read], levels[read]))
+        signals.append(y[read])
+        dt[unknown] = np.inf
+        parts.append((np.where(missing[:, None], np.nan, np.hstack([X, y])), np.where(missing, np.inf, w), dt))
+    white, walk = (block_diag(*each) for each in zip(*covariances, strict=True))
+    columns = np.hstack([np.concatenate([X for X, _ in free]), block_diag(*(levels for _, levels in free))])
+    K = null_space(columns.T)
+    u = K.T @ np.concatenate(signals)
+    likelihood, costs, dense = LevelLikelihood(parts, 3), [], []
+    for ratio in (0.0, 1e-3, 0.1, 5.0):
+        cost, s2, nu = likelihood.at(ratio)
+        S = K.T @ (white + ratio * walk) @ K
+        assert nu == len(u)
+        np.testing.assert_allclose(s2, np.sum(u * np.linalg.solve(S, u), axis=0) / nu, rtol=1e-9)
+        costs.append(cost)
+        dense.append([-2 * multivariate_normal.logpdf(v, cov=s * S) for v, s in zip(u.T, s2, strict=True)])
+    np.testing.assert_allclose(np.diff(costs, axis=0), np.diff(dense, axis=0), rtol=1e-8)
 
 
 @pytest.mark.parametrize(("walk", "white"), [(0.05, 1.0), (0.3, 1.0), (2.0, 1.0)])

@@ -9,10 +9,11 @@ import pytest
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.mixed_model import Family
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.planning.chamber import Chamber
 from driftlab.planning.search import RatedProfile
 from driftlab.planning.short_soak import expected, shortened
+from driftlab.soak.blocks import SoakRows
 
 LOW, HIGH = -10.0, 40.0
 CHAMBER = Chamber(LOW, HIGH, 15.0, 5 / 60, 120.0)

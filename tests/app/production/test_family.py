@@ -4,8 +4,9 @@ import numpy as np
 
 from driftlab.family.basis import STEP
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import _levels
+from driftlab.soak.blocks import SoakRows
 
 
 def test_the_level_of_a_unit_is_the_mean_of_its_bias_over_the_range():

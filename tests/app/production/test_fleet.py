@@ -144,7 +144,7 @@ def test_a_recording_that_is_gone_does_not_take_its_results_along(fleet):
     Path("units/0001/soak.h5").unlink()
     result, asked = fleet()
     assert asked == []
-    assert any("0001" in line and "--force lets it go" in line for line in result.lines())
+    assert any("0001" in line and "--force drops them" in line for line in result.lines())
     assert table().filter(unit="0001")["state"].to_list() == ["done"] * 3
     result, _ = fleet(force=True)
     assert sorted(result.failed) == ["0001", "0003"]

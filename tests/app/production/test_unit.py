@@ -200,7 +200,7 @@ def test_what_nobody_expected_is_in_the_record_and_its_traceback_where_it_is_ask
     def broken(*_):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr(module, "rows_of", broken)
+    monkeypatch.setattr(module, "soaked_of", broken)
     monkeypatch.delenv("DRIFTLAB_DEBUG", raising=False)
     assert work(task(folder)).record.error == "RuntimeError: a defect"
     assert capsys.readouterr().err == ""

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from driftlab.family.basis import STEP
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.maps.residual import AVERAGED
 from driftlab.production.unit_map import residual_sigma
+from driftlab.soak.blocks import SoakRows
 
 
 @pytest.mark.parametrize("walk", [0.0, 0.01, 0.03])

@@ -11,10 +11,11 @@ from driftlab.family.basis import STEP
 from driftlab.family.parallel import serial
 from driftlab.family.shared_effect import EffectDistribution, SharedEffect
 from driftlab.family.shared_effects import SharedEffects
-from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import UnitSpool
 from driftlab.production.store import UNITS, UnitStore
 from driftlab.production.workers import Pool
+from driftlab.soak.blocks import SoakRows
 from fusion_core.errors import DataError
 
 COUNT = 12

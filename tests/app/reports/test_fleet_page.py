@@ -9,6 +9,7 @@ from browsers import assert_drawn_everywhere, overflow
 from lines import AXES, DEG_H, line
 
 from driftlab.config import Limits
+from driftlab.evaluation.limits import verdict_of_units
 from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES
 from driftlab.reports import fleet as fleet_rows
@@ -57,7 +58,7 @@ def fleet(count, seed=0, failed=(), odd=(), **more):
 @pytest.fixture(scope="module")
 def overview():
     effect = SharedEffectRow("hysteresis", "hysteresis: 2.1 deg/h a K", "deg/h/K", (("L00", 12, "x", 2.1, 0.2),))
-    return fleet(120, failed=(7, 30), odd=(11, 45), effects=(effect,), numbers=[("took", "3 s")], remarks=("a remark",))
+    return fleet(120, failed=(7, 30), odd=(11, 45), effects=(effect,), remarks=("a remark",))
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +81,11 @@ def test_it_says_what_the_fleet_is(path, overview, opened):
     text = shown.locator("body").inner_text()
     for said in (
         "120 units: 118 done, 2 failed", "2 odd", *overview.line.sentences, "z bends at 41 degC; noise as the family",
-        "no file of unit 7", "hysteresis: 2.1 deg/h a K", "a remark", "took", "240.0 h",
+        "no file of unit 7", "hysteresis: 2.1 deg/h a K", "a remark", "240.0 h",
+        verdict_of_units(one.limits for one in overview.records).capitalize(),
     ):  # fmt: skip
         assert said in text
+    assert shown.locator(".verdict.fail").inner_text().startswith("Limits: ")
     assert shown.title() == "line"  # no text of a file is taken for a part of the page
     noise = next(row for row in overview.line.capability if (row.quantity, row.axis) == ("noise", "x"))
     assert f"{noise.ppk_low:.2f} to {noise.ppk_high:.2f}" in text

@@ -198,7 +198,7 @@ def test_the_end_is_told_and_stays(shown, opened, failed):
     expect(page.locator("#words")).to_have_text("at rest")
     shown.watch.end(["what one should know"], "out", failed=failed)
     expect(page.locator("#words")).to_have_text("ended with an error" if failed else "finished")
-    expect(page.locator("#how")).to_have_text("What went wrong" if failed else "Finished, results are in out")
+    expect(page.locator("#how")).to_have_text("The run failed" if failed else "Finished, results are in out")
     expect(page.locator("#found li")).to_have_text(["what one should know"])
     until(page, lambda: not shown.server.tabs)
 

@@ -13,7 +13,7 @@ from units_at_rest import thermal_bias, unit_at_rest
 
 import driftlab
 from driftlab.commands.run import show
-from driftlab.evaluation.overview import POINTS
+from driftlab.evaluation.overview import POINTS, STRETCHES
 from driftlab.reports.charts import content
 from driftlab.reports.run import bias_chart, error_chart, map_chart, nis_chart
 from driftlab.units import RATE
@@ -165,7 +165,7 @@ def test_a_page_stays_small(run):
     for chart in (bias_chart, error_chart):
         for x in content(chart(found.overview, found.model, found.journal))["x"]:
             assert len(x) <= POINTS
-    assert len(nis_chart(found.overview, found.model.m).panels[0].lines[1].x) <= 400
+    assert len(nis_chart(found.overview, found.model.m).panels[0].lines[1].x) <= 2 * STRETCHES
     assert (out / "report.html").stat().st_size < 1.5e6
 
 

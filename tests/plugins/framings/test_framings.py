@@ -214,7 +214,7 @@ def test_kvh_1775(message):
     np.testing.assert_array_equal(np.flatnonzero(channels["valid"] == 0), [3])
     assert decoder.device_counter.tick == (1e-6 if message == "B" else None)
     np.testing.assert_array_equal(count, np.arange(130) * 10_000 if message == "B" else np.arange(130) % 128)
-    with pytest.raises(ValidationError, match="the unit sends angles and not rates unless told otherwise"):
+    with pytest.raises(ValidationError, match="the unit sends angles and not rates unless configured otherwise"):
         framing(kind="kvh_1775")
     fahrenheit = framing(kind="kvh_1775", output="rate", angle="deg", temperature="0.01 degF", message=message)
     channels = decoded(fahrenheit, [kvh(0, message, 7700)])[0]

@@ -24,7 +24,7 @@ def test_the_form_of_a_curve_is_as_uncertain_as_least_squares_with_its_size_give
 
     own, _ = contrasts.laws[1]
     C = RATIOS[12] / np.mean(own) * contrasts.covariances[1] + np.eye(len(contrasts.y))
-    late = contrasts.blocks.means(contrasts.curve(inputs[:, 0])) * contrasts.root
+    late = contrasts.means(contrasts.curve(inputs[:, 0])) * contrasts.root
     for axis in range(d):
         A = np.column_stack([late, contrasts.X]) if partly else late
         M = A.T @ np.linalg.solve(C, A) / s2[axis]
