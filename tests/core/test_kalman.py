@@ -107,16 +107,8 @@ def test_one_sample_at_a_time_equals_the_readable_twin(which):
 @pytest.mark.parametrize("of", ["z", "H", "u", "F", "P", "Q"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_one_sample_that_is_not_finite_is_refused(of, value):
-    arrays = {name: np.eye(2) for name in ("F", "P", "Q")} | {"z": np.zeros((1, 1)), "H": np.eye(1, 2), "u": np.zeros(2)}
-        "z": np.zeros((1, 1)),
-        "H": np.eye(1, 2),
-        "u": np.zeros(2),
-        "F": np.eye(2),
-        "P": np.eye(2),
-        "Q": np.eye(2),
-    }
-    arrays[of][0] = value
-    F, P, Q, z, H, u = arrays.values()
+    F, P, Q, z, H, u = np.eye(2), np.eye(2), np.eye(2), np.zeros((1, 1)), np.eye(1, 2), np.zeros(2)
+    {"F": F, "P": P, "Q": Q, "z": z, "H": H, "u": u}[of][0] = value
     with pytest.raises(ValueError, match=r"finite|NaN"):
         estimate(State(np.zeros(2), P), Transition(F, Q, u), Measurement(z, H, np.eye(1), np.ones(1, dtype=bool)))
 
