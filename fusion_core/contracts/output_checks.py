@@ -9,6 +9,8 @@ a grid. A defect of a plugin is reported by its name, and never becomes an estim
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from math import isfinite
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ from fusion_core.thermal.soak_noise import Blocks, Smoother
 ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
 MAX_DEPTH = 8  # containers of a memory within one another, in which arrays are looked for
 MAX_MATRICES = 8  # of N, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
+COUNTED = (Chunk, np.ndarray, int)  # arguments that say what N is
 KINDS = {"fiu": "numbers", "iu": "whole numbers", "b": "true or false"}
 
 Shape = tuple[int, ...]
@@ -44,21 +47,22 @@ class Sizes(dict[str, Any]):
         self.plugin, self.arguments = plugin, arguments
 
     def __missing__(self, letter: str) -> int | str:
-        plugin = self.plugin
-        model = isinstance(plugin, MeasurementModel)
+        plugin, size = self.plugin, 0
         match letter:
             case "N":
-                given = next(given for given in self.arguments if isinstance(given, Chunk | np.ndarray | int))
-                return given if isinstance(given, int) else len(given)
+                given = next(given for given in self.arguments if isinstance(given, COUNTED))
+                size = given if isinstance(given, int) else len(given)
             case "n" | "p":
-                return len(plugin.labels)
+                size = len(plugin.labels)
             case "m":
-                return int(plugin.m)
+                size = int(plugin.m)
             case "states":
-                return "states" if model else "labels"
+                return "states" if isinstance(plugin, MeasurementModel) else "labels"
             case _:  # axes
-                map_or_sensor = plugin.tracked if model else plugin
-                return int(plugin.record.d) if isinstance(plugin, FittedMap) else len(map_or_sensor.axes)
+                of = plugin.tracked if isinstance(plugin, MeasurementModel) else plugin
+                size = int(plugin.record.d) if isinstance(plugin, FittedMap) else len(of.axes)
+        self[letter] = size
+        return size
 
 
 def array(
@@ -71,12 +75,13 @@ def array(
     optional: bool = False,
 ) -> Check:
     """Return the check of an array of one of the shapes; with `optional`, None will do too."""
+    letters = [shape.split() for shape in shapes]
 
     def check(plugin: Any, values: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and values is None):
             size = Sizes(plugin, (*arguments, *named.values()))
-            expected = tuple(tuple(size[letter] for letter in shape.split()) for shape in shapes)
-            expect_array(plugin, name, values, expected, why.format_map(size), kinds, finite=finite)
+            expected = tuple([tuple([size[letter] for letter in shape]) for shape in letters])
+            expect_array(plugin, name, values, expected, why, kinds, size, finite=finite)
             if covariance:
                 expect_covariance(plugin, name, values)
         return values
@@ -394,23 +399,26 @@ def expect_array(
     expected: tuple[Shape, ...],
     why: str = "expected ",
     kinds: str = "fiu",
+    words: Mapping[str, Any] = MappingProxyType({}),
     *,
     finite: bool = True,
 ) -> None:
-    """Raise PluginError where a value is not an array of finite numbers with one of the shapes."""
+    """Raise PluginError where a value is not an array of finite numbers with one of the shapes; `words` are of why."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or np.ma.isMaskedArray(array):
         plain = isinstance(array, np.ndarray) and not np.ma.isMaskedArray(array)
         what = f"an array of {array.dtype}" if plain else a_type(array)
         raise plugin_error(plugin, f"{name} is {what}, an array of {KINDS[kinds]} was expected")
     if array.shape not in expected:
-        raise plugin_error(plugin, f"{name} has shape {array.shape}, {why}{' or '.join(map(str, expected))}")
+        raise plugin_error(
+            plugin, f"{name} has shape {array.shape}, {why.format_map(words)}{' or '.join(map(str, expected))}"
+        )
     if finite and "f" in kinds:
         expect_finite(plugin, name, array)
 
 
 def expect_finite(plugin: Any, name: str, array: Array) -> None:
     """Raise PluginError where an array holds NaN or infinity."""
-    if not np.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first in one pass, unwarned
+    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first in one pass, unwarned
         raise plugin_error(plugin, f"{name} is not finite")
 
 

@@ -61,10 +61,10 @@ def alone(
     n, m = np.size(x), np.size(z)
     shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
     for array, shape in zip(given, shapes, strict=True):
-        usable = type(array) is np.ndarray and array.dtype is FLOAT and array.flags.carray
-        if not usable or array.shape not in (shape, (1, *shape)):
+        plain = type(array) is np.ndarray and array.dtype is FLOAT
+        if not plain or array.shape not in (shape, (1, *shape)):
             return None
-        arrays.append(array.reshape(shape))
+        arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
     if (x.ndim, P.ndim, z.ndim, transition.C) != (1, 2, 2, None) or not (measured and n and m):
