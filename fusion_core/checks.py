@@ -110,8 +110,7 @@ def numbers(name: str, value: object, *expected: Shape | str) -> Array:
 
 def flags(name: str, value: object, *expected: Shape | str) -> Flags:
     """Return an array of bool of one of the expected shapes."""
-    array = _array(name, value, "b", *expected)
-    return array if array.flags.carray else np.require(array, np.bool_, ["C", "W"])
+    return np.require(_array(name, value, "b", *expected), np.bool_, ["C", "W"])
 
 
 def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArray[Any]:

@@ -9,8 +9,6 @@ a grid. A defect of a plugin is reported by its name, and never becomes an estim
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from math import isfinite
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,9 +29,7 @@ from fusion_core.thermal.penalised import Basis
 from fusion_core.thermal.soak_noise import Blocks, Smoother
 
 ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
-MAX_DEPTH = 8  # containers of a memory within one another, in which arrays are looked for
 MAX_MATRICES = 8  # of N, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
-COUNTED = (Chunk, np.ndarray, int)  # arguments that say what N is
 KINDS = {"fiu": "numbers", "iu": "whole numbers", "b": "true or false"}
 
 Shape = tuple[int, ...]
@@ -50,8 +46,8 @@ class Sizes(dict[str, Any]):
         plugin, size = self.plugin, 0
         match letter:
             case "N":
-                given = next(given for given in self.arguments if isinstance(given, COUNTED))
-                size = given if isinstance(given, int) else len(given)
+                counted = (a for a in self.arguments if isinstance(a, (Chunk, np.ndarray, int)))
+                size = next(a if isinstance(a, int) else len(a) for a in counted)
             case "n" | "p":
                 size = len(plugin.labels)
             case "m":
@@ -66,22 +62,17 @@ class Sizes(dict[str, Any]):
 
 
 def array(
-    name: str,
-    *shapes: str,
-    why: str = "expected ",
-    kinds: str = "fiu",
-    finite: bool = True,
-    covariance: bool = False,
+    name: str, *shapes: str, why: str = "expected ", kinds: str = "fiu", finite: bool = True, covariance: bool = False,
     optional: bool = False,
-) -> Check:
+) -> Check:  # fmt: skip
     """Return the check of an array of one of the shapes; with `optional`, None will do too."""
-    letters = [shape.split() for shape in shapes]
 
     def check(plugin: Any, values: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and values is None):
             size = Sizes(plugin, (*arguments, *named.values()))
-            expected = tuple([tuple([size[letter] for letter in shape]) for shape in letters])
-            expect_array(plugin, name, values, expected, why, kinds, size, finite=finite)
+            expected = tuple([tuple([size[letter] for letter in shape.split()]) for shape in shapes])
+            reason = why if np.shape(values) in expected else why.format_map(size)
+            expect_array(plugin, name, values, expected, reason, kinds, finite=finite)
             if covariance:
                 expect_covariance(plugin, name, values)
         return values
@@ -94,7 +85,7 @@ def with_memory(name: str, check: Check) -> Check:
 
     def check_both(plugin: Any, answer: Any, *arguments: Any, **named: Any) -> tuple[Any, Memory]:
         first, memory = _pair(plugin, name, answer, "what was asked and the memory")
-        _lock(memory, MAX_DEPTH)
+        _lock(memory)
         return check(plugin, first, *arguments, **named), memory
 
     return check_both
@@ -283,7 +274,7 @@ def look(detector: Detector, answer: Any, chunk: Chunk, memory: Memory) -> tuple
         raise plugin_error(detector, f"look answers {a_type(answer)}, three were expected: still, standing out, memory")
     _AT_REST(detector, answer[0], chunk)
     _STANDING_OUT(detector, answer[1], chunk)
-    _lock(answer[2], MAX_DEPTH)
+    _lock(answer[2])
     return answer
 
 
@@ -384,7 +375,8 @@ def _pair(plugin: Any, name: str, answer: Any, what: str) -> tuple[Any, Any]:
     return answer
 
 
-def _lock(memory: Memory, depth: int) -> None:
+def _lock(memory: Memory, depth: int = 8) -> None:
+    """Lock the arrays of a memory, in containers within one another up to a depth."""
     if isinstance(memory, np.ndarray):
         memory.flags.writeable = False
     elif depth and isinstance(memory, tuple | list | dict):
@@ -399,26 +391,23 @@ def expect_array(
     expected: tuple[Shape, ...],
     why: str = "expected ",
     kinds: str = "fiu",
-    words: Mapping[str, Any] = MappingProxyType({}),
     *,
     finite: bool = True,
 ) -> None:
-    """Raise PluginError where a value is not an array of finite numbers with one of the shapes; `words` are of why."""
+    """Raise PluginError where a value is not an array of finite numbers with one of the shapes."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or np.ma.isMaskedArray(array):
         plain = isinstance(array, np.ndarray) and not np.ma.isMaskedArray(array)
         what = f"an array of {array.dtype}" if plain else a_type(array)
         raise plugin_error(plugin, f"{name} is {what}, an array of {KINDS[kinds]} was expected")
     if array.shape not in expected:
-        raise plugin_error(
-            plugin, f"{name} has shape {array.shape}, {why.format_map(words)}{' or '.join(map(str, expected))}"
-        )
+        raise plugin_error(plugin, f"{name} has shape {array.shape}, {why}{' or '.join(map(str, expected))}")
     if finite and "f" in kinds:
         expect_finite(plugin, name, array)
 
 
 def expect_finite(plugin: Any, name: str, array: Array) -> None:
     """Raise PluginError where an array holds NaN or infinity."""
-    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first in one pass, unwarned
+    if not np.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first in one pass, unwarned
         raise plugin_error(plugin, f"{name} is not finite")
 
 

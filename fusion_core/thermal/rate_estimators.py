@@ -77,8 +77,6 @@ class Kalman(Settings):
 CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
 """Channels that a temperature gets with its smoothing: its rate, the measured values, the window in s."""
 
-PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
-
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 
@@ -116,11 +114,8 @@ def with_rate(
     if isinstance(estimator, Regression):
         from fusion_core.recursions import regression_value
 
-        steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known[0])
-        # q^2 / 12, or less with noise before the rounding, that lasts for a sixth of the time of a step
-        left = np.where(steps == known[0], known[1], steps**2 / 12)
-        density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
-        smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
+        steps = chunk.channels.get("temperature_step", np.zeros(len(T)))
+        smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, Kalman().walk)
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])
     smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
