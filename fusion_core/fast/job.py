@@ -67,9 +67,8 @@ def alone(
         arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
-    if (x.ndim, P.ndim, z.ndim, transition.C) != (1, 2, 2, None) or not (measured and n and m):
-        return None
-    if not single(*arrays, gate, of_x, of_z, sums):
+    sound = measured and n and m and (x.ndim, P.ndim, z.ndim, transition.C) == (1, 2, 2, None)
+    if not (sound and single(*arrays, gate, of_x, of_z, sums)):
         return None
     after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])
     kept = after.P[None].copy() if keep_P else None
@@ -171,7 +170,7 @@ class Job:
             x_lanes, y, white = out.x.reshape(x_lanes.shape), out.y.reshape(z.shape), out.white.reshape(z.shape)
         lanes = out._replace(x=x_lanes, y=y, white=white)
         x = self.x.T.copy()
-        steady(groups.size, x, known.F, known.H, gains.kinds, gains.K, gains.root, u, z, lanes)
+        steady(groups.size, x, known.F, known.H, tuple(gains.kind.tolist()), gains.K, gains.root, u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))

@@ -105,7 +105,8 @@ def uneven(Q: Array) -> bool:
         if not Q[i, i] >= 0:
             return True
         for j in range(i):
-            if Q[i, j] != Q[j, i] and not abs(Q[i, j] - Q[j, i]) <= 1e-9 * np.sqrt(Q[i, i]) * np.sqrt(Q[j, j]):
+            apart = abs(Q[i, j] - Q[j, i])
+            if apart != 0 and not apart <= 1e-9 * np.sqrt(Q[i, i]) * np.sqrt(Q[j, j]):
                 return True
     return False
 
@@ -284,24 +285,29 @@ def single(
     Ordinary are covariances P and Q, R diagonal, nothing refused, all finite. The results are x, sigma, x again and P
     after the sample in `of_x` (n + 3, n), y and white in `of_z` (2, m), nis and log_det in `sums` (2,).
     """
-    m, n = H.shape
-    if uneven(P) or uneven(Q) or np.count_nonzero(R) > m or not np.all(np.diag(R) > 0):
+    (m, n), ordinary = H.shape, not (uneven(P) or uneven(Q))
+    for i in range(m):
+        for j in range(m):
+            ordinary &= R[i, j] > 0 if i == j else R[i, j] == 0
+    if not ordinary:
         return False
-    predicted, w, x_, P_ = of_x[0], of_x[1], of_x[2], of_x[3:]
+    w, x_, P_ = of_x[1], of_x[2], of_x[3:]
     predict(x, x, P, F, Q, u, x_, P_, w)
-    predicted[:] = x_
-    sums[:] = 0.0
     for i in range(m):
         of_z[0, i] = z[i]
         for j in range(n):
-            of_z[0, i] -= H[i, j] * predicted[j]
+            of_z[0, i] -= H[i, j] * x_[j]
+    sums[0] = sums[1] = 0.0
+    for i in range(m):
         y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w)
         of_z[1, i] = y * np.sqrt(inverse)
         sums[0] += of_z[1, i] ** 2
         sums[1] -= np.log(inverse)
+    check = sums[0] + sums[1]
     for i in range(n):
         of_x[0, i], of_x[1, i] = x_[i], np.sqrt(P_[i, i])
-    return bool(np.isfinite(np.sum(of_x) + np.sum(sums)) and sums[0] <= gate)
+        check += of_x[0, i] + of_x[1, i]
+    return bool(np.isfinite(check) and sums[0] <= gate)
 
 
 @compiled  # type: ignore[untyped-decorator]

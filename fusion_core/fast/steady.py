@@ -101,11 +101,6 @@ class Gains:
         """Covariances (G, s, s) of the groups after the last step."""
         return np.ascontiguousarray(self.P[-1, self.kind])
 
-    @property
-    def kinds(self) -> tuple[int, ...]:
-        """`kind` as the compiled loops want it: values, which no store into an array can change."""
-        return tuple(self.kind.tolist())
-
     def sigma(self, groups: IndependentGroups) -> Array:
         """Return the deviations (N, n) of all states."""
         deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
