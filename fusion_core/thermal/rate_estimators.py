@@ -16,6 +16,8 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit
 
+WALK = Quantity(2e-4, "2e-4 K/s/sqrt(s)")  # density of the random walk of a temperature's rate
+
 
 class Regression(Settings):
     """A straight line through the recent past, older samples counting less (weight exp(-2 age / window)).
@@ -53,9 +55,7 @@ class Kalman(Settings):
     kind: Literal["kalman"] = "kalman"
     noise: Annotated[float, Unit("delta_degC", positive=True, example="0.1 K")] = Quantity(0.1, "0.1 K")
     """Deviation of a reading of the thermometer."""
-    walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = Quantity(
-        2e-4, "2e-4 K/s/sqrt(s)"
-    )
+    walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = WALK
     """Density of the random walk of the temperature's rate."""
 
     @property
@@ -115,7 +115,7 @@ def with_rate(
         from fusion_core.recursions import regression_value
 
         steps = chunk.channels.get("temperature_step", np.zeros(len(T)))
-        smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, Kalman().walk)
+        smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, float(WALK))
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])
     smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
