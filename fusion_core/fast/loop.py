@@ -123,16 +123,15 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
     for i in range(len(places.s)):
         if states[i] < n:
             step.u[g, i] = model.u[min(k, len(model.u) - 1), states[i]]
-    if k == 0 or len(model.F) + len(model.Q) > 2:
-        k_F, k_Q = min(k, len(model.F) - 1), min(k, len(model.Q) - 1)
+    F_anew, Q_anew = k == 0 or len(model.F) > 1, k == 0 or len(model.Q) > 1
+    if F_anew or Q_anew:
         for i in range(len(places.s)):
             for j in range(len(places.s)):
-                if states[i] < n and states[j] < n:
-                    step.F[g, i, j], step.Q[g, i, j] = (
-                        model.F[k_F, states[i], states[j]],
-                        model.Q[k_Q, states[i], states[j]],
-                    )
-                    symmetric &= step.Q[g, i, j] == model.Q[k_Q, states[j], states[i]]
+                if F_anew and states[i] < n and states[j] < n:
+                    step.F[g, i, j] = model.F[k, states[i], states[j]]
+                if Q_anew and j <= i and states[i] < n and states[j] < n:
+                    step.Q[g, i, j] = model.Q[k, states[i], states[j]]
+                    symmetric &= step.Q[g, i, j] == model.Q[k, states[j], states[i]]
     if k == 0 or len(model.H) > 1:
         for i in range(len(places.c)):
             for j in range(len(places.s)):
