@@ -62,7 +62,7 @@ def alone(
     shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
     for array, shape in zip(given, shapes, strict=True):
         plain = type(array) is np.ndarray and array.dtype is FLOAT
-        if not plain or array.shape not in (shape, (1, *shape)):
+        if not plain or (array.shape != shape and array.shape != (1, *shape)):
             return None
         arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
