@@ -14,7 +14,8 @@ from common import Row, best, filterpy_run, limit, problem, ratio, show, statsmo
 
 from driftlab.commands.console import keep_freed_memory
 from fusion_core.contracts import Transition
-from fusion_core.kalman import estimate
+from fusion_core.feedback import feed_back
+from fusion_core.kalman import correct, estimate, predict
 from fusion_core.model import Measurement, State
 
 HERE = Path(__file__).parent
@@ -99,9 +100,37 @@ def steady() -> list[Row]:
     ]
 
 
+def error_state(n: int = 15, m: int = 3, N: int = 500) -> list[Row]:
+    """An error that is fed back at every sample, with an H of its own, beside `predict` and `correct` as written."""
+    rng = np.random.default_rng(0)
+    F, H = 0.98 * (np.eye(n) + 0.01 * rng.normal(size=(N, n, n))), rng.normal(size=(N, m, n))
+    Q, R, u, z = 1e-4 * np.eye(n), 0.1 * np.eye(m), np.zeros(n), rng.normal(size=(N, m))
+    begin, ends, one = State(np.zeros(n), np.eye(n)), np.ones(N, dtype=bool), np.ones(1, dtype=bool)
+
+    def propagate(nominal: np.ndarray, rows: slice) -> tuple[np.ndarray, Transition, Measurement]:
+        k = rows.start
+        return nominal, Transition(F[k], Q, u), Measurement(z[rows] - nominal @ H[k].T, H[k], R, one)
+
+    def fed_back() -> np.ndarray:
+        return list(feed_back(begin, np.zeros(n), ends, propagate, lambda nominal, x: nominal + x))[-1].state.P
+
+    def written_out() -> np.ndarray:
+        state, nominal = begin, np.zeros(n)
+        for k in range(N):
+            state = correct(predict(state, F[k], Q, u), z[k] - H[k] @ nominal, H[k], R)[0]
+            nominal, state = nominal + state.x, State(np.zeros(n), state.P)
+        return state.P
+
+    assert np.allclose(fed_back(), written_out(), rtol=1e-9, atol=1e-12)
+    ours, theirs = (t / N for t in best(fed_back, written_out, turns=20))
+    name = f"error state fed back at every sample, n = {n}, m = {m}"
+    return [limit(name, ours * 1e6, "µs a sample"), ratio(f"{name}: NumPy, predict and correct", ours, theirs, 1)]
+
+
 def main() -> None:
     keep_freed_memory()  # as `driftlab run` does
     show("Steady gains", steady())
+    show("Error state", error_state())
     with tempfile.TemporaryDirectory() as folder:
         show("Recursion", recursive(eigen(Path(folder))))
 

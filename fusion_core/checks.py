@@ -110,8 +110,7 @@ def numbers(name: str, value: object, *expected: Shape | str) -> Array:
 
 def flags(name: str, value: object, *expected: Shape | str) -> Flags:
     """Return an array of bool of one of the expected shapes."""
-    array = _array(name, value, "b", *expected)
-    return array if array.flags.carray else np.require(array, np.bool_, ["C", "W"])
+    return np.require(_array(name, value, "b", *expected), np.bool_, ["C", "W"])
 
 
 def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArray[Any]:
@@ -135,15 +134,10 @@ def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArr
 
 def finite(name: str, array: Array) -> Array:
     """Return the array, or raise ValueError where it is not finite."""
-    if not _quickly_finite(array) and not np.isfinite(array).all():
+    # in one pass that never warns, but where squares are too large
+    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
         raise ValueError(f"estimate: {name} has NaN or infinity, numbers were expected; leave a sample out by used")
     return array
-
-
-def _quickly_finite(array: Array) -> bool:
-    """Return False where anything is not finite, or so large that its square is not; vdot never warns."""
-    flat = array.ravel()
-    return isfinite(np.vdot(flat, flat))
 
 
 def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
@@ -151,7 +145,7 @@ def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
 
     NotFinite where that is of a `sample`, else ValueError.
     """
-    sound = min(matrix.diagonal().tolist(), default=0.0) >= 0 and _quickly_finite(matrix)
+    sound = min(matrix.diagonal().tolist(), default=0.0) >= 0 and isfinite(np.vdot(matrix, matrix))
     if sound and matrix.tobytes() == matrix.T.tobytes():
         return matrix  # nearly always, and quickly
     if sample is not None and not np.isfinite(matrix).all():

@@ -73,10 +73,10 @@ class Chunk:
         if "dt" in self.channels:
             return constant(self.channels["dt"])
         before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        steps = np.diff(self.t, prepend=before)
+        steps = self.t - np.concatenate([before, self.t[:-1]])
         begins = 1 if self.previous is None and len(self) > 1 else 0
         if len(self) > begins:
-            usual = nominal(steps[begins:], float(np.max(np.abs(self.t[[0, -1]]))))
+            usual = nominal(steps[begins:], float(max(abs(self.t[0]), abs(self.t[-1]))))
             if usual is not None:
                 steps[begins:] = usual
         return constant(steps)
@@ -93,8 +93,7 @@ class Chunk:
         return self._rows(slice(len(self) - 1, len(self)), None)
 
     def _rows(self, rows: slice | NDArray[np.bool_], previous: Chunk | None) -> Chunk:
-        channels = {name: values[rows] for name, values in self.channels.items()}
-        return Chunk(self.t[rows], channels, previous, self.sensors)
+        return Chunk(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
@@ -126,7 +125,7 @@ def nominal(steps: Array, t: float) -> float | None:
     the same whatever part of a recording is looked at.
     """
     rounding = 2 * float(np.spacing(t))  # of two time stamps, each read or multiplied
-    low, high = float(np.max(steps)) - rounding, float(np.min(steps)) + rounding
+    low, high = float(steps.max()) - rounding, float(steps.min()) + rounding
     middle = (low + high) / 2
     if not low <= high or middle <= rounding:
         return None

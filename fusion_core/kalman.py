@@ -104,18 +104,21 @@ def estimate(
         raise ValueError(f"estimate: method is {method!r}, one of {', '.join(METHODS)} was expected")
     if not gate >= 0:
         raise ValueError(f"estimate: gate is {gate}, a nis from 0 to infinity was expected")
+    from fusion_core.fast.job import alone, run
+
+    n = np.size(state.x)
+    reset = checked_reset(reset, n)
+    if method in ("auto", "recursive") and (one := alone(state, transition, measurement, gate, keep_P)) is not None:
+        return one
     state = checked_state(state)
-    n = len(state.x)
     measurement = checked_measurement(measurement, n)
     transition = checked_transition(transition, n, len(measurement.z))
     steady = transition.invariant and measurement.invariant and measurement.z.shape[1] > 0
     if method == "steady" and not steady:
         raise ValueError("estimate: steady gains need F, Q, H and R without a leading N, and every component measured")
-    given = state, transition, measurement, _gates(gate, measurement.used), checked_reset(reset, n)
+    given = state, transition, measurement, _gates(gate, measurement.used), reset
     if method == "plain":
         return _plain(*given, keep_P=keep_P)
-    from fusion_core.fast.job import run
-
     steady = method == "steady" or (method == "auto" and steady and len(measurement.z) > SHORT)
     return run(*given, steady=steady, keep_P=keep_P)
 

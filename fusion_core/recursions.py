@@ -20,6 +20,8 @@ from numba import njit
 
 from fusion_core.chunk import Array
 
+PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
+
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def play(x: Array, width: float, y: float) -> Array:
@@ -98,32 +100,36 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def regression_value(
-    dt: Array, T: Array, density: Array, memory: Array, longest: float, walk: float
+    dt: Array, T: Array, rate: Array, steps: Array, known: tuple[float, ...], memory: Array, longest: float, walk: float
 ) -> tuple[Array, Array, Array]:
     """Return values (N,) of a straight line, its windows (N,) in s, and the memory; the noisier T, the longer these.
 
     A rate that is a random walk of the density `walk`, seen through noise of a density n, is followed in sqrt(n / walk)
-    s. n^2 is that of T itself, by its second differences, and `density` (N,) squared.
+    s. n^2 is that of T itself, by its second differences, and of what the thermometer's steps q leave: q^2 / 12, or
+    less with noise before the rounding, that lasts for a sixth of the time of a step, which T goes through at `rate`
+    (N,). `steps` (N,) are those seen so far, `known` a larger one and the variance that it leaves in means.
     """
     T_0, w, wt, wtt, wT, wtT, one, two, count, noise = memory
     smooth, windows = np.empty(len(T)), np.empty(len(T))
-    known, usual, keep = -1.0, -1.0, 0.0  # what was worked out last
+    worked, usual, keep = -1.0, -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
         h = dt[k]
         if count >= 2:
             noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = T[k], one, count + 1
-        tau = min(longest / 2, np.sqrt(np.sqrt(density[k] ** 2 + noise * h) / walk))
+        q = max(steps[k], known[0])
+        density = np.sqrt((known[1] if q == known[0] else q**2 / 12) * q / (6 * max(abs(rate[k]), PASSED)))
+        tau = min(longest / 2, np.sqrt(np.sqrt(density**2 + noise * h) / walk))
         wtt += h * (h * w - 2 * wt)
         wt -= h * w
         wtT -= h * wT
-        if tau != known or h != usual:
-            known, usual, keep = tau, h, np.exp(-h / tau) if tau > 0 else 0.0
+        if tau != worked or h != usual:
+            worked, usual, keep = tau, h, np.exp(-h / tau) if tau > 0 else 0.0
         w, wt, wtt, wT, wtT = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT
         # two samples do not make a rate: while it is young the slope is drawn towards zero
         spread = wtt - wt * wt / w + tau * tau * max(1 - (count - 1) * h / max(2 * tau, h), 0.0)
-        rate = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
-        smooth[k], windows[k] = T_0 + (wT - rate * wt) / w, 2 * tau
+        slope = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
+        smooth[k], windows[k] = T_0 + (wT - slope * wt) / w, 2 * tau
     return smooth, windows, np.array([T_0, w, wt, wtt, wT, wtT, one, two, count, noise])
 
 
@@ -172,7 +178,7 @@ def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, 
         one, two, count = T[k], one, count + 1
         steps[k] = step if step <= largest else 0.0
         variances[k] = variance
-    memory[:] = np.array([one, two, count, step, variance])
+    memory[0], memory[1], memory[2], memory[3], memory[4] = one, two, count, step, variance
     return steps, variances
 
 

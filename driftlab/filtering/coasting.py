@@ -33,8 +33,8 @@ from driftlab.filtering.setup import RunSetup
 from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
-from fusion_core.kalman import expected
 from fusion_core.model import Estimates
+from fusion_core.recursions import drift
 from fusion_core.thermal.thermometer import NO_STEPS
 
 FINE = 2001  # temperatures of the tables
@@ -53,7 +53,8 @@ class Coast:
 
     def advance(self, N: int, step: Transition) -> tuple[Array, Array]:
         """Return the bias (N, d) that is predicted for the next N epochs, and its variance (N, d)."""
-        x = expected(self.x, step, N)
+        F = step.F if step.F.ndim == 3 else step.F[None]
+        x = drift(self.x, F, np.ascontiguousarray(np.broadcast_to(step.u, (N, len(self.x)))))
         self.x = x[-1]
         variance, self.P = spread(self.P, step, N)
         return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x), variance
@@ -62,27 +63,28 @@ class Coast:
 def spread(P: Array, step: Transition, N: int) -> tuple[Array, Array]:
     """Return the variance (N, d) of C x over N steps from covariance P (n, n), and P after them."""
     F, Q = (a if a.ndim == 3 else a[None] for a in (step.F, step.Q))
-    if step.C is None and _diagonal(F) and _diagonal(Q) and _diagonal(P[None]):
-        f, q = (np.ascontiguousarray(np.diagonal(a, axis1=1, axis2=2)) for a in (F, Q))
-        variance = np.empty((N, len(P)))
-        _alone(np.diag(P).copy(), f, q, variance)
-        return variance, np.diag(variance[-1])
+    after, variance = P.copy(), np.empty((N, len(P)))
+    if step.C is None and _alone(after, F, Q, variance):
+        return variance, after
     C = np.eye(len(P))[None] if step.C is None else step.C if step.C.ndim == 3 else step.C[None]
     variance, after = np.empty((N, C.shape[1])), P.copy()
     _together(after, np.ascontiguousarray(F), np.ascontiguousarray(Q), np.ascontiguousarray(C), variance)
     return variance, after
 
 
-def _diagonal(matrices: Array) -> bool:
-    return bool(np.count_nonzero(matrices) == np.count_nonzero(np.diagonal(matrices, axis1=1, axis2=2)))
-
-
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _alone(P: Array, f: Array, q: Array, variance: Array) -> None:
+def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
+    """Go on from P, state by state; return whether all of them are alone (P, F and Q diagonal), else nothing counts."""
+    n = len(P)
     for k in range(len(variance)):
-        for j in range(len(P)):
-            P[j] = f[min(k, len(f) - 1), j] ** 2 * P[j] + q[min(k, len(q) - 1), j]
-            variance[k, j] = P[j]
+        F_k, Q_k = F[min(k, len(F) - 1)], Q[min(k, len(Q) - 1)]
+        for i in range(n):
+            for j in range(n):
+                if i != j and (F_k[i, j] != 0 or Q_k[i, j] != 0 or P[i, j] != 0):
+                    return False
+        for i in range(n):
+            P[i, i] = variance[k, i] = F_k[i, i] ** 2 * P[i, i] + Q_k[i, i]
+    return True
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -348,8 +350,9 @@ class Prediction:
         x = self.extrapolation.look(done)
         left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
         sigma = sigma if left is None else np.hypot(sigma, left)
-        coast = coast_sigma = np.full_like(bias, np.nan)
-        if self.coast is not None:
+        if self.coast is None:
+            coast = coast_sigma = np.full_like(bias, np.nan)
+        else:
             coast, variance = self.coast.advance(len(done), step)
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):

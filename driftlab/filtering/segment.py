@@ -101,10 +101,10 @@ class Stretches:
 
     def note(self, t: Array, flags: Flags, causes: NDArray[np.bool_], names: Sequence[str]) -> None:
         """Note where flags (N,) are true over consecutive epochs at t (N,), and their causes (N, D)."""
-        for name, count in zip(names, np.sum(causes[flags], axis=0), strict=True):
-            if count:
-                self.axes[name] = self.axes.get(name, 0) + int(count)
         for start, stop in runs(flags):
+            for name, count in zip(names, np.sum(causes[start:stop], axis=0), strict=True):
+                if count:
+                    self.axes[name] = self.axes.get(name, 0) + int(count)
             begin = self.spans.pop()[0] if start == 0 and self.open else float(t[start])
             self.spans.append((begin, float(t[stop - 1])))
         if len(flags):
@@ -118,7 +118,7 @@ class Stretches:
 
 def runs(flags: Flags) -> list[tuple[int, int]]:
     """Return start and stop of each run of true values."""
-    if not np.any(flags):
+    if not flags.any():
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

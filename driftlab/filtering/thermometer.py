@@ -92,7 +92,7 @@ class ThermometerError:
         steps = np.maximum(step, self.known.size)
         table, which = self._sawteeth(steps, variance)
         error = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
-        dt = np.broadcast_to(np.asarray(chunk.dt, dtype=np.float64), T.shape)
+        dt = np.full(T.shape, chunk.dt)
         windows = chunk.channels.get("temperature_window")
         windows = np.full(T.shape, self.window) if windows is None else windows
         _look(T, raw, dt, steps, table, which, windows, self.memory, *error)

@@ -58,7 +58,7 @@ class _Piece(NamedTuple):
 
     def rows(self, start: int, stop: int) -> tuple[Chunk, list[Transition]]:
         """Return the epochs and steps from start to stop."""
-        return self.corrected.part(start, stop), [_rows(step, start, stop) for step in self.steps]
+        return self.corrected.part(start, stop), [step.part(slice(start, stop)) for step in self.steps]
 
 
 class Tracker:
@@ -117,10 +117,10 @@ class Tracker:
                 began = self.state if self.fresh else None
                 estimates = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
                 N = len(estimates.x)
-                own = _rows(steps[self.tracked], 0, N)
+                own = steps[self.tracked].part(slice(N))
                 equations = None
                 if self.plan.keep_model:
-                    equations = replace(_rows(transition, 0, N), C=own.C), _measured(measurement, 0, N)
+                    equations = replace(transition.part(slice(N)), C=own.C), measurement.part(slice(N))
                 done = piece.epochs.part(start, start + N)
                 self.state, self.fresh = estimates.state, False
                 calibration = piece.calibration[start : start + N]
@@ -132,16 +132,15 @@ class Tracker:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
         for regular in regular_pieces(chunk, self.first.dt):
             at = int(np.searchsorted(regular.t, self.first.t, side="right"))
-            for epochs in (regular.part(0, at), regular.part(at, len(regular))):
-                if len(epochs) == 0:
-                    continue
+            for epochs in (regular.part(*ends) for ends in ((0, at), (at, len(regular))) if ends[0] < ends[1]):
                 if epochs.t[0] > self.first.t and self.prediction.coast is None:
                     self.state = self.prediction.depart(self.state, epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
                 maps = self.plan.calibrations.items()
                 less = {channel: fitted.bias(epochs["temperature"], epochs.t) for channel, fitted in maps}
-                corrected = epochs.having(**{channel: epochs[channel] - part for channel, part in less.items()})
+                parts = {channel: epochs[channel] - part for channel, part in less.items()}
+                corrected = epochs.having(**parts) if parts else epochs
                 channel = self.model.tracked.channel
                 yield _Piece(epochs, corrected, less.get(channel, np.zeros_like(epochs[channel])), steps, before)
 
@@ -150,7 +149,7 @@ class Tracker:
         gate = self.plan.gate * self.alignment.gate_scale
         N = len(part)
         while True:
-            steps, measured = _rows(transition, 0, N), _measured(measurement, 0, N)
+            steps, measured = transition.part(slice(N)), measurement.part(slice(N))
             try:
                 estimates = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
             except (NotFinite, TooWide) as lost:
@@ -199,33 +198,15 @@ class Tracker:
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
-    dt, tau = np.full(len(chunk), chunk.dt), chunk["tau"].copy()
+    dt, tau = chunk.dt, chunk["tau"]
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
-    dt[regular] = tau[regular] = usual
-    chunk = chunk.having(dt=dt, tau=tau)
+    chunk = chunk.having(dt=np.where(regular, usual, dt), tau=np.where(regular, usual, tau))
     if len(chunk) == 1:
         yield chunk
         return
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
-
-
-def _rows(step: Transition, start: int, stop: int) -> Transition:
-    """Return the steps from start to stop; what is the same for every step stays so."""
-    F, Q = (_part(a, 2, start, stop) for a in (step.F, step.Q))
-    C = None if step.C is None else _part(step.C, 2, start, stop)
-    return Transition(F, Q, _part(step.u, 1, start, stop), C)
-
-
-def _measured(one: Measurement, start: int, stop: int) -> Measurement:
-    """Return the measurements from start to stop."""
-    H, R = (_part(a, 2, start, stop) for a in (one.H, one.R))
-    return Measurement(one.z[start:stop], H, R, one.used[start:stop])
-
-
-def _part(array: Array, constant: int, start: int, stop: int) -> Array:
-    return array if array.ndim == constant else array[start:stop]
 
 
 class RestMonitor:
@@ -235,16 +216,18 @@ class RestMonitor:
         self.journal = journal
         self.detector = plan.model.detector(journal.alignments[0])
         self.memory: Any = self.detector.start()
+        self.axes = [" ".join(axis) for axis in self.detector.axes]
         self.components = [axis_name(channel, axis) for channel, axis, _ in plan.model.components]
 
     def look(self, done: Chunk, estimates: Estimates) -> Flags:
         """Return the epochs at which the unit stood still (N,)."""
         still, out, self.memory = self.detector.look(done, self.memory)
-        self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
+        self.journal.moving.note(done.t, ~still, out, self.axes)
         refused = still & ~estimates.used
         causes = np.zeros(estimates.white.shape, dtype=np.bool_)
-        size = estimates.white[refused] ** 2
-        causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
+        if refused.any():
+            size = estimates.white[refused] ** 2
+            causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
         self.journal.refused.note(done.t, refused, causes, self.components)
         return still
 

@@ -29,7 +29,6 @@ from fusion_core.thermal.penalised import Basis
 from fusion_core.thermal.soak_noise import Blocks, Smoother
 
 ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
-MAX_DEPTH = 8  # containers of a memory within one another, in which arrays are looked for
 MAX_MATRICES = 8  # of N, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
 KINDS = {"fiu": "numbers", "iu": "whole numbers", "b": "true or false"}
 
@@ -44,39 +43,36 @@ class Sizes(dict[str, Any]):
         self.plugin, self.arguments = plugin, arguments
 
     def __missing__(self, letter: str) -> int | str:
-        plugin = self.plugin
-        model = isinstance(plugin, MeasurementModel)
+        plugin, size = self.plugin, 0
         match letter:
             case "N":
-                given = next(given for given in self.arguments if isinstance(given, Chunk | np.ndarray | int))
-                return given if isinstance(given, int) else len(given)
+                counted = (a for a in self.arguments if isinstance(a, (Chunk, np.ndarray, int)))
+                size = next(a if isinstance(a, int) else len(a) for a in counted)
             case "n" | "p":
-                return len(plugin.labels)
+                size = len(plugin.labels)
             case "m":
-                return int(plugin.m)
+                size = int(plugin.m)
             case "states":
-                return "states" if model else "labels"
+                return "states" if isinstance(plugin, MeasurementModel) else "labels"
             case _:  # axes
-                map_or_sensor = plugin.tracked if model else plugin
-                return int(plugin.record.d) if isinstance(plugin, FittedMap) else len(map_or_sensor.axes)
+                of = plugin.tracked if isinstance(plugin, MeasurementModel) else plugin
+                size = int(plugin.record.d) if isinstance(plugin, FittedMap) else len(of.axes)
+        self[letter] = size
+        return size
 
 
 def array(
-    name: str,
-    *shapes: str,
-    why: str = "expected ",
-    kinds: str = "fiu",
-    finite: bool = True,
-    covariance: bool = False,
+    name: str, *shapes: str, why: str = "expected ", kinds: str = "fiu", finite: bool = True, covariance: bool = False,
     optional: bool = False,
-) -> Check:
+) -> Check:  # fmt: skip
     """Return the check of an array of one of the shapes; with `optional`, None will do too."""
 
     def check(plugin: Any, values: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and values is None):
             size = Sizes(plugin, (*arguments, *named.values()))
-            expected = tuple(tuple(size[letter] for letter in shape.split()) for shape in shapes)
-            expect_array(plugin, name, values, expected, why.format_map(size), kinds, finite=finite)
+            expected = tuple([tuple([size[letter] for letter in shape.split()]) for shape in shapes])
+            reason = why if np.shape(values) in expected else why.format_map(size)
+            expect_array(plugin, name, values, expected, reason, kinds, finite=finite)
             if covariance:
                 expect_covariance(plugin, name, values)
         return values
@@ -89,7 +85,7 @@ def with_memory(name: str, check: Check) -> Check:
 
     def check_both(plugin: Any, answer: Any, *arguments: Any, **named: Any) -> tuple[Any, Memory]:
         first, memory = _pair(plugin, name, answer, "what was asked and the memory")
-        _lock(memory, MAX_DEPTH)
+        _lock(memory)
         return check(plugin, first, *arguments, **named), memory
 
     return check_both
@@ -278,7 +274,7 @@ def look(detector: Detector, answer: Any, chunk: Chunk, memory: Memory) -> tuple
         raise plugin_error(detector, f"look answers {a_type(answer)}, three were expected: still, standing out, memory")
     _AT_REST(detector, answer[0], chunk)
     _STANDING_OUT(detector, answer[1], chunk)
-    _lock(answer[2], MAX_DEPTH)
+    _lock(answer[2])
     return answer
 
 
@@ -379,7 +375,8 @@ def _pair(plugin: Any, name: str, answer: Any, what: str) -> tuple[Any, Any]:
     return answer
 
 
-def _lock(memory: Memory, depth: int) -> None:
+def _lock(memory: Memory, depth: int = 8) -> None:
+    """Lock the arrays of a memory, in containers within one another up to a depth."""
     if isinstance(memory, np.ndarray):
         memory.flags.writeable = False
     elif depth and isinstance(memory, tuple | list | dict):

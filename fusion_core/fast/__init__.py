@@ -6,6 +6,8 @@ way                  when                                        factor    price
 `plain`              asked for                                   1         nothing compiled
 `loop`               anything varies, or a sample lacks a        over 500  a compilation for each size of group, kept
                      component or is refused                     on plain  for the next time
+`single`             one sample in a call, all of it measured    4 on      one compilation, for models of any size
+                     and taken, R diagonal                       `loop`
 `groups`             always, under `loop` and `lanes`            7         a look for zeros in F and Q, a tenth of the
                                                                            time where they vary
 `factored`           P is over 1e12 times R                      0.5       NumPy, for the samples until P is narrow

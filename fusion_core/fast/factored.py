@@ -106,13 +106,8 @@ def wide(
         sigma = np.sqrt(np.diagonal(P))
         if not np.isfinite(np.sum(x) + np.sum(sigma) + squares + logs):
             raise NotFinite(first + k)
-        out.x[k], out.sigma[k], out.nis[k], out.log_det[k], out.used[k] = (
-            x,
-            sigma,
-            squares,
-            logs,
-            used,
-        )
+        out.x[k], out.sigma[k] = x, sigma
+        out.nis[k], out.log_det[k], out.used[k] = squares, logs, used
         if len(out.P):
             out.P[k] = groups.blocks(P, groups.states, groups.states)
         if np.all(widths <= NARROW):

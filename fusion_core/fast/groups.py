@@ -47,11 +47,6 @@ class IndependentGroups:
         return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1], (0.0,) * len(self.states)
 
     @cached_property
-    def unsigned(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-        """`states` and `rows` as the recursion wants them."""
-        return self.states.astype(np.uint64), self.rows.astype(np.uint64)
-
-    @cached_property
     def ordered(self) -> bool:
         """True if the model has state i of every group, then state i + 1, and components so too: lanes as they are."""
         lists = (self.states, self.n), (self.rows, self.m)

@@ -11,16 +11,14 @@ the compiler to put several groups into one instruction: half the time of groups
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numba.cpython.unsafe.tuple import tuple_setitem
 
-from fusion_core.checks import covariance
+from fusion_core.checks import FLOAT, covariance
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import IndependentGroups, find_groups
-from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
+from fusion_core.fast.groups import IndependentGroups, Size, find_groups
+from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive, single
 from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
@@ -50,6 +48,33 @@ def run(
     return job.estimates(root)
 
 
+def alone(
+    state: State, transition: Transition, measurement: Measurement, gate: float, keep_P: bool
+) -> Estimates | None:
+    """Return the estimates of one sample, checked and filtered by one compiled call; None where `run` has to look.
+
+    That is where it is not ordinary (`fusion_core.fast.loop.single`), or an array is not as `fusion_core.checks` would
+    leave it. Checks one by one, groups and a job cost four times as much as the sample.
+    """
+    x, P, z, used = state.x, state.P, measurement.z, measurement.used
+    given = z, x, P, transition.F, transition.Q, transition.u, measurement.H, measurement.R
+    n, m = np.size(x), np.size(z)
+    shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
+    for array, shape in zip(given, shapes, strict=True):
+        plain = type(array) is np.ndarray and array.dtype is FLOAT
+        if not plain or (array.shape != shape and array.shape != (1, *shape)):
+            return None
+        arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
+    measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
+    of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
+    sound = measured and n and m and (x.ndim, P.ndim, z.ndim, transition.C) == (1, 2, 2, None)
+    if not (sound and single(*arrays, gate, of_x, of_z, sums)):
+        return None
+    after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])
+    kept = after.P[None].copy() if keep_P else None
+    return Estimates(of_x[:1], of_x[1:2], of_z[:1], of_z[1:], sums[:1], sums[1:], dof, all_used, after, kept)
+
+
 def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, Array, Array | None]:
     """Return a model with R diagonal, z for it, and the root of R that undoes it on the innovations.
 
@@ -74,17 +99,11 @@ class Job:
     """One call in progress: the groups' states x (G, s), P (G, s, s), and the results so far."""
 
     def __init__(
-        self,
-        state: State,
-        model: Model,
-        groups: IndependentGroups,
-        data: Data,
-        *,
-        keep_P: bool = False,
-        keep_K: bool = False,
+        self, state: State, model: Model, groups: IndependentGroups, data: Data, *, keep_P: bool, keep_K: bool = False
     ) -> None:
         self.groups, self.model, self.data = groups, model, data
-        self.places = Places(*groups.unsigned, *groups.size[:2], (0.0,) if keep_K else ())
+        states, rows = groups.states.astype(np.uint64), groups.rows.astype(np.uint64)
+        self.places = Places(states, rows, *groups.size[:2], (0.0,) if keep_K else ())
         self.complete = bool(data.used.all())
         self.x, self.P = self._by_groups(state)
         (N, m), n = data.z.shape, len(state.x)
@@ -143,16 +162,15 @@ class Job:
     def steady(self, start: int, stop: int, known: Invariant, gains: Gains) -> int:
         """Run up to `stop`, or to the first sample that the gate refuses or that is not finite; return which."""
         groups, results, rows, N = self.groups, self.results, slice(start, stop), len(self.results.nis)
-        states, places, model = groups.states, groups.rows, self.model
-        u = groups.lanes(model.u if len(model.u) == 1 else model.u[rows], states)
-        z = groups.lanes(self.data.z[rows], places)
-        out = Lanes._make(a[rows] for a in (results.x, results.y, results.white, results.nis))
+        states, places = groups.states, groups.rows
+        model, data, out = self._part(start, stop)
+        u, z = groups.lanes(model.u, states), groups.lanes(data.z, places)
+        x_lanes, y, white = np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z)
         if groups.ordered:  # lanes are views of the results
-            lanes = Lanes(out.x.reshape(-1, *u.shape[1:]), out.y.reshape(z.shape), out.white.reshape(z.shape), out.nis)
-        else:
-            lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
+            x_lanes, y, white = out.x.reshape(x_lanes.shape), out.y.reshape(z.shape), out.white.reshape(z.shape)
+        lanes = out._replace(x=x_lanes, y=y, white=white)
         x = self.x.T.copy()
-        steady(GroupSizes(*groups.size), x, GroupModel(known.F, known.H, gains.kinds, gains.K, gains.root), u, z, lanes)
+        steady(groups.size, x, known.F, known.H, tuple(gains.kind.tolist()), gains.K, gains.root, u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
@@ -162,9 +180,8 @@ class Job:
                 return stop
             x, gains, rows = lanes.x[stop - start - 1], gains.first(stop - start), slice(start, stop)
         if not groups.ordered:
-            n, m = len(model.F[0]), out.y.shape[1]
-            out.x[:] = groups.from_lanes(lanes.x, states, n)
-            out.y[:], out.white[:] = (groups.from_lanes(a, places, m) for a in (lanes.y, lanes.white))
+            out.x[:] = groups.from_lanes(lanes.x, states, groups.n)
+            out.y[:], out.white[:] = (groups.from_lanes(a, places, groups.m) for a in (lanes.y, lanes.white))
         self.x, self.P = np.ascontiguousarray(x.T), gains.last
         results.used[rows] = True
         if len(gains.P) == 1 and stop - start == N:  # all of it: nothing to write down for each sample
@@ -193,42 +210,18 @@ class Job:
         )  # fmt: skip
 
 
-Size = tuple[float, ...]
-
-
-class GroupSizes(NamedTuple):
-    """Number of states and components of a group, and of groups, as lengths."""
-
-    s: Size
-    c: Size
-    G: Size
-
-
-class GroupModel(NamedTuple):
-    """The groups' model, and the gains of their kinds; K is N, or 1 for those that stay."""
-
-    F: Array  # (G, s, s)
-    H: Array  # (G, c, s)
-    kind: tuple[int, ...]  # (G,) values, which no store into an array can change
-    K: Array  # (K, D, c, s)
-    root: Array  # (K, D, c)
-
-
-class Lanes(NamedTuple):
-    """The results of each sample."""
-
-    x: Array  # (N, s, G)
-    y: Array  # (N, c, G)
-    white: Array  # (N, c, G)
-    nis: Array  # (N,)
-
-
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def steady(size: GroupSizes, x: Array, known: GroupModel, u: Array, z: Array, out: Lanes) -> None:
-    """Run the filter over N samples: x (s, G) is changed in place; u (N or 1, s, G), z (N, c, G)."""
+def steady(
+    size: tuple[Size, Size, Size], x: Array, F: Array, H: Array, kind: tuple[int, ...], K: Array, root: Array,
+    u: Array, z: Array, out: SampleArrays,
+) -> None:  # fmt: skip
+    """Run the filter over N samples: x (s, G) is changed in place; u (N or 1, s, G), z (N, c, G).
+
+    Of `out` x is (N, s, G), y and white (N, c, G). F (G, s, s), H (G, c, s); K (N or 1, D, c, s), root (N or 1, D, c)
+    of the D kinds of groups, `kind` (G,) in values, which no store into an array can change.
+    """
     s, c, G = size
-    F, H, kind, K, root = known
     for k in range(len(z)):
         k_u, k_K = min(k, len(u) - 1), min(k, len(K) - 1)
         nis = 0.0

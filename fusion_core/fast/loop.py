@@ -19,10 +19,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.fast.groups import Size
+from fusion_core.model import Flags
 
-Flags = NDArray[np.bool_]
 Index = NDArray[np.uint64]  # unsigned: no index counts from the end, which would cost a comparison each
-Size = tuple[float, ...]
 
 
 class Places(NamedTuple):
@@ -100,9 +100,15 @@ inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 @compiled  # type: ignore[untyped-decorator]
 def uneven(Q: Array) -> bool:
-    """Return True if a covariance is not symmetric, by more than rounding."""
-    sigma = np.sqrt(np.diag(Q))
-    return not np.all(np.abs(Q - Q.T) <= 1e-9 * np.outer(sigma, sigma))
+    """Return True if a matrix has a variance below zero or is not symmetric by more than rounding."""
+    for i in range(len(Q)):
+        if not Q[i, i] >= 0:
+            return True
+        for j in range(i):
+            apart = abs(Q[i, j] - Q[j, i])
+            if apart != 0 and not apart <= 1e-9 * np.sqrt(Q[i, i]) * np.sqrt(Q[j, j]):
+                return True
+    return False
 
 
 @inlined  # type: ignore[untyped-decorator]
@@ -117,15 +123,13 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
     for i in range(len(places.s)):
         if states[i] < n:
             step.u[g, i] = model.u[min(k, len(model.u) - 1), states[i]]
-    if k == 0 or len(model.F) > 1:
+    F_anew, Q_anew = k == 0 or len(model.F) > 1, k == 0 or len(model.Q) > 1
+    if F_anew or Q_anew:
         for i in range(len(places.s)):
             for j in range(len(places.s)):
-                if states[i] < n and states[j] < n:
+                if F_anew and states[i] < n and states[j] < n:
                     step.F[g, i, j] = model.F[k, states[i], states[j]]
-    if k == 0 or len(model.Q) > 1:
-        for i in range(len(places.s)):
-            for j in range(i + 1):
-                if states[i] < n and states[j] < n:
+                if Q_anew and j <= i and states[i] < n and states[j] < n:
                     step.Q[g, i, j] = model.Q[k, states[i], states[j]]
                     symmetric &= step.Q[g, i, j] == model.Q[k, states[j], states[i]]
     if k == 0 or len(model.H) > 1:
@@ -235,8 +239,8 @@ def recursive(
     (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
     x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
     x, P = x.copy(), P.copy()
-    F, H, u = np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s))
-    step = SampleStep(F, F.copy(), H, u, np.zeros(s), np.zeros(s))
+    F, H = np.zeros((G, s, s)), np.zeros((G, len(places.c), s))
+    step = SampleStep(F, F.copy(), H, np.zeros((G, s)), np.zeros(s), np.zeros(s))
     for k in range(len(data.z)):
         sums = InnovationSums(0.0, 0.0, 1.0, 0)
         for g in range(G):
@@ -270,40 +274,61 @@ def recursive(
     return x, P, len(data.z)
 
 
-class Alike(NamedTuple):
-    """The model of D groups that is the same at every sample: F, Q (D, s, s), H (D, c, s), r (D, c)."""
+@compiled  # type: ignore[untyped-decorator]
+def single(
+    z: Array, x: Array, P: Array, F: Array, Q: Array, u: Array, H: Array, R: Array, gate: float,
+    of_x: Array, of_z: Array, sums: Array,
+) -> bool:  # fmt: skip
+    """Do one sample of n states as one group; return whether it is an ordinary one, else nothing of it counts.
 
-    F: Array
-    Q: Array
-    H: Array
-    r: Array
-
-
-class GainArrays(NamedTuple):
-    """Results of N samples that do not depend on the data: P after each, gain and 1 / deviation of each innovation."""
-
-    P: Array  # (N, D, s, s)
-    K: Array  # (N, D, c, s)
-    root: Array  # (N, D, c)
-    log_det: Array  # (N, D)
+    Ordinary are covariances P and Q, R diagonal, nothing refused, all finite. The results are x, sigma, x again and P
+    after the sample in `of_x` (n + 3, n), y and white in `of_z` (2, m), nis and log_det in `sums` (2,).
+    """
+    (m, n), ordinary = H.shape, not (uneven(P) or uneven(Q))
+    for i in range(m):
+        for j in range(m):
+            ordinary &= R[i, j] > 0 if i == j else R[i, j] == 0
+    if not ordinary:
+        return False
+    w, x_, P_ = of_x[1], of_x[2], of_x[3:]
+    predict(x, x, P, F, Q, u, x_, P_, w)
+    for i in range(m):
+        of_z[0, i] = z[i]
+        for j in range(n):
+            of_z[0, i] -= H[i, j] * x_[j]
+    sums[0] = sums[1] = 0.0
+    for i in range(m):
+        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w)
+        of_z[1, i] = y * np.sqrt(inverse)
+        sums[0] += of_z[1, i] ** 2
+        sums[1] -= np.log(inverse)
+    check = sums[0] + sums[1]
+    for i in range(n):
+        of_x[0, i], of_x[1, i] = x_[i], np.sqrt(P_[i, i])
+        check += of_x[0, i] + of_x[1, i]
+    return bool(np.isfinite(check) and sums[0] <= gate)
 
 
 @compiled  # type: ignore[untyped-decorator]
-def gains(s: Size, c: Size, P: Array, model: Alike, out: GainArrays) -> None:
-    """Run the covariance alone over N steps, from P (D, s, s)."""
+def gains(
+    s: Size, c: Size, N: int, P: Array, F: Array, Q: Array, H: Array, r: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Run the covariance alone over N steps, from P (D, s, s); F, Q (D, s, s), H (D, c, s), r (D, c) stay the same.
+
+    Returned are P after each step (N, D, s, s), the gain of each scalar update (N, D, c, s), one over the deviation of
+    its innovation (N, D, c), and log_det (N, D).
+    """
     nothing, p, w = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s))
-    x, u = np.zeros(len(s)), np.zeros(len(s))
-    for k in range(len(out.P)):
+    x, u, log_det = np.zeros(len(s)), np.zeros(len(s)), np.zeros((N, len(P)))
+    all_P, all_K, root = np.empty((N, *P.shape)), np.empty((N, *H.shape)), np.empty((N, *r.shape))
+    for k in range(N):
         for g in range(len(P)):
-            before, after = P[g] if k == 0 else out.P[k - 1, g], out.P[k, g]
-            predict(s, nothing, before, model.F[g], model.Q[g], u, x, after, w)
-            log_det, det = 0.0, 1.0
+            before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
+            predict(s, nothing, before, F[g], Q[g], u, x, after, w)
             for i in range(len(c)):
-                inverse = correct(s, x, after, model.H[g, i], model.r[g, i], 0.0, p)[1]
+                inverse = correct(s, x, after, H[g, i], r[g, i], 0.0, p)[1]
                 for j in range(len(s)):
-                    out.K[k, g, i, j] = p[j] * inverse
-                out.root[k, g, i] = np.sqrt(inverse)
-                det *= inverse
-                if not 1e-200 < det < 1e200:
-                    log_det, det = log_det - np.log(det), 1.0
-            out.log_det[k, g] = log_det - np.log(det)
+                    all_K[k, g, i, j] = p[j] * inverse
+                root[k, g, i] = np.sqrt(inverse)
+                log_det[k, g] -= np.log(inverse)
+    return all_P, all_K, root, log_det

@@ -23,21 +23,13 @@ MAX_TRANSIENTS = 8  # of a model in the cache: recordings begin alike, and so do
 SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a tenth of what is promised of P
 
 
-@dataclass(frozen=True)
-class Steady:
-    """The steady state of a time-invariant model: posterior P, predicted P_."""
-
-    P: Array
-    P_: Array
-
-
-def steady_state(F: Array, Q: Array, H: Array, R: Array) -> Steady | None:
-    """Return the steady covariances of a model, or None where there is none (an undriven or unobserved state)."""
+def steady_state(F: Array, Q: Array, H: Array, R: Array) -> tuple[Array, Array] | None:
+    """Return the steady posterior P and predicted P_ of a model, or None (an undriven or unobserved state)."""
     return _steady_state(*((np.ascontiguousarray(a).tobytes(), a.shape) for a in (F, Q, H, R)))
 
 
 @lru_cache(maxsize=256)
-def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> Steady | None:
+def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> tuple[Array, Array] | None:
     F, Q, H, R = (np.frombuffer(data).reshape(shape) for data, shape in matrices)
     try:
         P_ = _riccati(F, Q, H, R)
@@ -49,7 +41,7 @@ def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> Steady | None:
     K = np.asarray(np.linalg.solve(S, H @ P_).T, dtype=np.float64)
     B = np.eye(len(F)) - K @ H
     P = B @ P_ @ B.T + K @ R @ K.T
-    return Steady((P + P.T) / 2, P_)
+    return (P + P.T) / 2, P_
 
 
 def _riccati(F: Array, Q: Array, H: Array, R: Array) -> Array | None:
@@ -109,11 +101,6 @@ class Gains:
         """Covariances (G, s, s) of the groups after the last step."""
         return np.ascontiguousarray(self.P[-1, self.kind])
 
-    @property
-    def kinds(self) -> tuple[int, ...]:
-        """`kind` as the compiled loops want it: values, which no store into an array can change."""
-        return tuple(self.kind.tolist())
-
     def sigma(self, groups: IndependentGroups) -> Array:
         """Return the deviations (N, n) of all states."""
         deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
@@ -149,7 +136,7 @@ class Invariant:
             limit = steady_state(self.F[g][square], self.Q[g][square], self.H[g][np.ix_(b, a)], np.diag(self.r[g][b]))
             if limit is None:
                 return None
-            P[g][square] = limit.P
+            P[g][square] = limit[0]
         gains = self._gains(P, 1)
         return gains if np.all(np.isfinite(gains.log_det)) else None
 
@@ -168,21 +155,16 @@ class Invariant:
         return self._gains(np.frombuffer(P).reshape(self.F.shape), N)
 
     def _gains(self, P: Array, N: int) -> Gains:
-        from fusion_core.fast.loop import Alike, GainArrays, gains
+        from fusion_core.fast.loop import gains
 
         parts = self.F, self.Q, self.H, self.r, P
         first: dict[bytes, int] = {}  # group of each kind
         alike = [first.setdefault(b"".join(a[g].tobytes() for a in parts), g) for g in range(len(P))]
         leaders = list(first.values())
         s, c, _ = self.groups.size
-        D = len(leaders)
-        out = GainArrays(
-            np.empty((N, D, len(s), len(s))), np.empty((N, D, len(c), len(s))), np.empty((N, D, len(c))),
-            np.empty((N, D)),
-        )  # fmt: skip
-        gains(s, c, P[leaders], Alike(*(a[leaders] for a in parts[:-1])), out)
+        P, K, root, log_det = gains(s, c, N, P[leaders], *(a[leaders] for a in parts[:-1]))
         kind = np.searchsorted(leaders, alike)
-        return Gains(kind, out.P, out.K, out.root, out.log_det @ np.bincount(kind).astype(np.float64))
+        return Gains(kind, P, K, root, log_det @ np.bincount(kind).astype(np.float64))
 
 
 def invariant(F: Array, Q: Array, H: Array, r: Array, P: Array) -> Invariant:

@@ -56,12 +56,8 @@ def _wrapped(member: Any, name: str, check: Check | None) -> Any:
     """Return a method or property with the boundary about it; None where there is none to put."""
     if inspect.isfunction(member):
         return None if hasattr(member, "__guarded__") else _call(member, name, check)
-    if isinstance(member, property) and member.fget is not None:
-        return (
-            None
-            if hasattr(member.fget, "__guarded__")
-            else property(_call(member.fget, name, check), doc=member.__doc__)
-        )
+    if isinstance(member, property) and not hasattr(member.fget, "__guarded__"):
+        return member.fget and property(_call(member.fget, name, check), doc=member.__doc__)
     if isinstance(member, cached_property) and not hasattr(member.func, "__guarded__"):
         cached: cached_property[Any] = cached_property(_call(member.func, name, check))
         cached.__set_name__(None, name)  # type: ignore[arg-type]
@@ -72,11 +68,13 @@ def _wrapped(member: Any, name: str, check: Check | None) -> Any:
 def _call(method: Callable[..., Any], name: str, check: Check | None) -> Callable[..., Any]:
     @wraps(method)
     def call(self: Any, *given: Any, **named: Any) -> Any:
-        given = tuple(read_only(a) if isinstance(a, np.ndarray) else a for a in given)
-        named = {key: read_only(a) if isinstance(a, np.ndarray) else a for key, a in named.items()}
+        given = tuple([read_only(a) if isinstance(a, np.ndarray) else a for a in given])
+        named = named and {key: read_only(a) if isinstance(a, np.ndarray) else a for key, a in named.items()}
         try:
             answer = method(self, *given, **named)
-            if isinstance(answer, Iterator):
+            if isinstance(answer, tuple | np.ndarray):  # nearly always; the look at a class of an ABC takes long
+                pass
+            elif isinstance(answer, Iterator):
                 answer = _one_by_one(self, name, answer)
             elif isinstance(answer, tuple(PARTS)):
                 _guard_part(type(answer), self)

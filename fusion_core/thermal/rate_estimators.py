@@ -16,6 +16,8 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit
 
+WALK = Quantity(2e-4, "2e-4 K/s/sqrt(s)")  # density of the random walk of a temperature's rate
+
 
 class Regression(Settings):
     """A straight line through the recent past, older samples counting less (weight exp(-2 age / window)).
@@ -53,9 +55,7 @@ class Kalman(Settings):
     kind: Literal["kalman"] = "kalman"
     noise: Annotated[float, Unit("delta_degC", positive=True, example="0.1 K")] = Quantity(0.1, "0.1 K")
     """Deviation of a reading of the thermometer."""
-    walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = Quantity(
-        2e-4, "2e-4 K/s/sqrt(s)"
-    )
+    walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = WALK
     """Density of the random walk of the temperature's rate."""
 
     @property
@@ -76,8 +76,6 @@ class Kalman(Settings):
 
 CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
 """Channels that a temperature gets with its smoothing: its rate, the measured values, the window in s."""
-
-PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
 
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
@@ -115,11 +113,8 @@ def with_rate(
     if isinstance(estimator, Regression):
         from fusion_core.recursions import regression_value
 
-        steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known[0])
-        # q^2 / 12, or less with noise before the rounding, that lasts for a sixth of the time of a step
-        left = np.where(steps == known[0], known[1], steps**2 / 12)
-        density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
-        smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
+        steps = chunk.channels.get("temperature_step", np.zeros(len(T)))
+        smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, float(WALK))
     low, high = memory.range
     if np.min(smooth) < domain[0] or np.max(smooth) > domain[1]:
         lows, highs = np.minimum(np.minimum.accumulate(T), low), np.maximum(np.maximum.accumulate(T), high)

@@ -80,7 +80,7 @@ class ThermalDerivative(ThermalBias):
         rate = ("temperature_rate",) if self.map and self.form == "slope" else ()
         return (*temperature, *rate, *(name for effect in self.effects for name in effect.requires))
 
-    @property
+    @cached_property
     def labels(self) -> tuple[str, ...]:
         """The axes, the coefficients that are estimated, and what memories began at."""
         effects = list(enumerate(self.effects))
@@ -96,7 +96,7 @@ class ThermalDerivative(ThermalBias):
         estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units_of(bias))
         return (*(bias,) * d, *estimated, *(bias,) * (d * len(self._starts)))
 
-    @property
+    @cached_property
     def _starts(self) -> list[int]:
         """Places of the effects that began at a state that is not known."""
         return [k for k, effect in enumerate(self.effects) if effect.fades and any(effect.initial or ())]

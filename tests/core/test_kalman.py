@@ -13,7 +13,7 @@ from fusion_core.contracts import Transition
 from fusion_core.fast.groups import find_groups
 from fusion_core.fast.steady import invariant, steady_state
 from fusion_core.kalman import correct, estimate, expected, predict
-from fusion_core.model import Measurement, State
+from fusion_core.model import Measurement, State, join
 from fusion_core.smoother import smooth
 
 
@@ -79,6 +79,38 @@ def test_the_recursion_equals_its_readable_twin():
     plain = estimate(start, transition, measurement, method="plain", keep_P=True, **kwargs)
     assert 0 < np.sum(~plain.used) < 60
     assert_same(fast, plain, 1e-9)
+
+
+@pytest.mark.parametrize("which", ["ordinary", "not quite symmetric", "correlated", "missing", "refused"])
+def test_one_sample_at_a_time_equals_the_readable_twin(which):
+    """Each in a call of its own, as a live run and an error state ask: most by one compiled call, the others by all."""
+    transition, measured = random_model(np.random.default_rng(1), N=60, n=5, m=3)
+    state, gate = State(np.arange(5.0), np.diag([1.0, 2.0, 0.0, 3.0, 4.0])), 4.0 if which == "refused" else np.inf
+    R = measured.R if which == "correlated" else measured.R * np.eye(3)
+    used = np.random.default_rng(2).random((60, 3)) > (0.3 if which == "missing" else -1)
+    measured, reset = Measurement(measured.z, measured.H, R, used), np.array([True, False, False, False, True])
+    plain = estimate(state, transition, measured, method="plain", keep_P=True, gate=gate, reset=reset)
+    parts = []
+    for k in range(60):
+        rows = slice(k, k + 1)
+        if which == "not quite symmetric":
+            state.P[0, 1] *= 1 + 1e-12
+        given = transition.part(rows), measured.part(rows)
+        parts.append(estimate(state, *given, keep_P=True, gate=gate, reset=reset))
+        state = parts[-1].state
+    found = join(parts)
+    assert_same(found, plain, 1e-9)
+    np.testing.assert_array_equal(found.dof, plain.dof)
+    np.testing.assert_allclose(found.sigma, plain.sigma, rtol=1e-9)
+
+
+@pytest.mark.parametrize("of", ["z", "H", "u", "F", "P", "Q"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_one_sample_that_is_not_finite_is_refused(of, value):
+    F, P, Q, z, H, u = np.eye(2), np.eye(2), np.eye(2), np.zeros((1, 1)), np.eye(1, 2), np.zeros(2)
+    {"F": F, "P": P, "Q": Q, "z": z, "H": H, "u": u}[of][0] = value
+    with pytest.raises(ValueError, match=r"finite|NaN"):
+        estimate(State(np.zeros(2), P), Transition(F, Q, u), Measurement(z, H, np.eye(1), np.ones(1, dtype=bool)))
 
 
 def test_the_recursion_equals_filterpy():
@@ -244,7 +276,7 @@ def test_steady_state_solves_the_riccati_equation():
     found = steady_state(F, Q, H, R)
     expected = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
     sigma = np.sqrt(np.diag(expected))
-    assert np.max(np.abs(found.P_ - expected) / np.outer(sigma, sigma)) < 1e-9
+    assert np.max(np.abs(found[1] - expected) / np.outer(sigma, sigma)) < 1e-9
 
 
 def test_gains_ahead_of_the_data_are_those_of_the_textbook():
@@ -293,7 +325,7 @@ def test_covariance_stays_positive_over_ten_million_steps():
         state = estimate(state, Transition(F, Q, u), Measurement(z, H, R, used), method="recursive").state
     np.testing.assert_array_equal(state.P, state.P.T)
     assert np.linalg.eigvalsh(state.P).min() > 0
-    expected = steady_state(F, Q, H, R).P
+    expected = steady_state(F, Q, H, R)[0]
     sigma = np.sqrt(np.diag(expected))
     assert np.max(np.abs(state.P - expected) / np.outer(sigma, sigma)) < 1e-8
 
