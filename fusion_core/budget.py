@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Protocol, Self, TypeVar
+from typing import IO, Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -45,9 +45,6 @@ DEEPEST = 32  # of them within one another
 UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
 NAME = 64  # characters of a channel, a kind, a unit
 TEXT = 100_000  # characters of another text in the record of a map
-
-
-T = TypeVar("T")
 
 
 class Decompressor(Protocol):
@@ -276,7 +273,7 @@ class TimeBudget:
                 "write the recording anew"
             )
 
-    def over(self, items: Iterable[T]) -> Iterator[T]:
+    def over(self, items: Iterable[Any]) -> Iterator[Any]:
         """Yield items; while each is made this is the clock of all steps, and what is done with them takes no time."""
         iterator = iter(items)
         while True:

@@ -152,7 +152,7 @@ def _named(unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Whether two units are of one dimension; False where one is not known."""
+    """Return True if two units are of one dimension; False where one is not known."""
     try:
         return _known(unit).dimensionality == _known(other).dimensionality
     except UnitError:
