@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.model import Flags
@@ -173,31 +174,45 @@ class Cells:
 
     def __init__(self, d: int) -> None:
         self.d = d
-        self.size = 0  # cells so far
-        self._sums = np.zeros((0, 1 + 3 * d))  # time at rest [s], integrals of error, of its square, and of c - rate
+        self.size = 0.0  # cells so far, those without a row too
+        self._at: list[Array] = []  # numbers of cells with rows at rest, one array for each call of `add`
+        self._sums: list[Array] = []  # of each: time at rest [s], integrals of error, of its square, and of c - rate
 
     def add(self, t: Array, tau: Array, error: Array, raw: Array) -> None:
         """Take the next rows: times t (N,) from the start, s, at rest for tau (N,), with their errors (N, d)."""
-        self.size = max(int(t[-1] / CELL), 0) + 1
-        if self.size > len(self._sums):  # room for those to come, too
-            self._sums = np.concatenate([self._sums, np.zeros((self.size, self._sums.shape[1]))])
-        _sum_cells(t, tau, error, raw, self._sums)
+        cells = np.maximum(np.floor(t / CELL), 0.0)
+        self.size, rest = float(cells[-1]) + 1, tau > 0
+        new = np.diff(cells[rest], prepend=-1.0) > 0  # time only moves on
+        at = cells[rest][new]
+        sums = np.zeros((len(at), 1 + 3 * self.d))
+        _sum_cells(np.cumsum(new) - 1, tau[rest], error[rest], raw[rest], sums)
+        if len(at) and self._at and self._at[-1][-1] == at[0]:
+            self._sums[-1][-1] += sums[0]
+            at, sums = at[1:], sums[1:]
+        if len(at):
+            self._at.append(at)
+            self._sums.append(sums)
+
+    def _joined(self) -> tuple[Array, Array]:
+        """Return the numbers (K,) of the cells with rows at rest, and their sums (K, 1 + 3 d)."""
+        return np.concatenate([np.zeros(0), *self._at]), np.concatenate([np.zeros((0, 1 + 3 * self.d)), *self._sums])
 
     def errors(self) -> Array:
         """Return time, s, and mean of prediction less rate (K, 1 + d) of the cells that were at rest."""
-        sums = self._sums[: self.size]
+        at, sums = self._joined()
         rest = sums[:, 0] >= MEASURED * CELL
         means = sums[rest, 1 + 2 * self.d :] / sums[rest, :1]
-        return np.column_stack([(np.flatnonzero(rest) + 0.5) * CELL, means])
+        return np.column_stack([(at[rest] + 0.5) * CELL, means])
 
     def coasts(self, length: float, align: float, first: Array) -> Array:
         """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
         coasts = [first] if np.all(np.isfinite(first)) else []
-        for start in range(n, self.size - n + 1, n):
-            aligned, coast = (
-                np.sum(self._sums[part], axis=0) for part in (slice(start - m, start), slice(start, start + n))
-            )
+        at, sums = self._joined()
+        starts = np.unique(at // n) * n
+        for start in starts[(starts >= n) & (starts + n <= self.size)]:
+            before, begin, end = np.searchsorted(at, [start - m, start, start + n])
+            aligned, coast = (np.sum(sums[part], axis=0) for part in (slice(before, begin), slice(begin, end)))
             if min(aligned[0] / (m * CELL), coast[0] / (n * CELL)) >= MEASURED:
                 level = aligned[1 + 2 * d :] / aligned[0]
                 mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]
@@ -206,16 +221,15 @@ class Cells:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _sum_cells(t: Array, tau: Array, error: Array, raw: Array, sums: Array) -> None:
+def _sum_cells(rows: NDArray[np.int64], tau: Array, error: Array, raw: Array, sums: Array) -> None:
     d = error.shape[1]
-    for k in range(len(t)):
-        if tau[k] > 0:
-            cell = sums[max(int(t[k] / CELL), 0)]
-            cell[0] += tau[k]
-            for j in range(d):
-                cell[1 + j] += tau[k] * error[k, j]
-                cell[1 + d + j] += tau[k] * error[k, j] ** 2
-                cell[1 + 2 * d + j] += tau[k] * raw[k, j]
+    for k in range(len(rows)):
+        cell = sums[rows[k]]
+        cell[0] += tau[k]
+        for j in range(d):
+            cell[1 + j] += tau[k] * error[k, j]
+            cell[1 + d + j] += tau[k] * error[k, j] ** 2
+            cell[1 + 2 * d + j] += tau[k] * raw[k, j]
 
 
 class Integral:

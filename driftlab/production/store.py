@@ -15,6 +15,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,14 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, matches, refusals, remove
+from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
 from driftlab.storage.ownership import digest, document, foreign, signed
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
-OF_A_UNIT = {  # what driftlab writes there, beside the map that the record names
-    "": ("unit.json", "unit.npz", "family_map.json"),
-    "page": ("report.html", "map.report.html"),
-    "explained": FILES["explain"],
-}
+INSIDE = ("page", "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
 LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 PAGE = "page"  # folder of a unit's pages
@@ -58,8 +55,9 @@ class FleetFolder:
         self.mark = mark_of(self.path)
         if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
-        there = {TABLE, FAMILY, REPORT} & set(names) if self.mark.get("complete") else ()
-        if self.mark and (changed := foreign(self.path, MARK, [MARK, *there])):
+        there = {TABLE, FAMILY, REPORT} & set(names)
+        changed = foreign(self.path, MARK, [MARK, *there]) if self.mark else []
+        if changed and (self.mark.get("complete") or MARK in changed):
             raise ConfigError(
                 f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
                 "name another folder"
@@ -68,6 +66,8 @@ class FleetFolder:
         check_writable(self.path)
         self.lock = Lock(self.path / LOCK, f"--out {out}")
         self.lock.sign()
+        for name in changed:  # since the last mark, by somebody or by a command that was killed
+            os.rename(self.path / name, _free(self.path / name))
         if not self.mark:
             self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
         self._finish()
@@ -93,7 +93,8 @@ class FleetFolder:
         if self.mark.get("complete"):
             self.mark = {**self.mark, "complete": False}
             self.write_mark(self.mark)
-        self._made(f".{record.unit}{NEW}", {**files, "unit.json": _content(record)})
+        record = record.model_copy(update={"written": _digests(files)})
+        self._made(f".{record.unit}{NEW}", {**files, RECORD: _content(record)})
         self._replace(record.unit)
         self._records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
@@ -101,7 +102,9 @@ class FleetFolder:
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
         """Put the pages among the files of a unit into its folder, whole or not at all."""
         pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items() if name.startswith(f"{PAGE}/")}
-        if pages:
+        record = self.record(unit)
+        if pages and record is not None:
+            self.note(record.model_copy(update={"written": record.written | _digests(files)}))
             os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), self.unit(unit) / PAGE)
 
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
@@ -115,7 +118,7 @@ class FleetFolder:
 
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already."""
-        self.write(f"{UNITS}/{record.unit}/unit.json", _content(record))
+        self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
         self._records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
@@ -133,7 +136,7 @@ class FleetFolder:
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Write `fleet.json` and return its content: it knows itself and the files of all units."""
-        paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
+        paths = (self.path / name for name in (TABLE, FAMILY, REPORT))
         known = {path.name: digest(path) for path in paths if path.is_file()}
         self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
         return {**content, "written": document(self.path / MARK)["written"]}
@@ -168,23 +171,29 @@ class FleetFolder:
 
 
 def _content(record: UnitRecord) -> bytes:
-    return (record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
+    others = {name: value for name, value in record.written.items() if name != RECORD}
+    return signed(record.model_dump(mode="json", by_alias=True), RECORD, others).encode()
+
+
+def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
+    return {name: sha256(content).hexdigest() for name, content in files.items()}
 
 
 def _take_along(old: Path, place: Path) -> None:
-    """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
+    """Remove a unit's folder that was replaced, but for what driftlab did not write so: that goes to the new one."""
     if not old.exists():
         return
-    record = record_of(old) or record_of(place)
-    for inside, ours in OF_A_UNIT.items():
+    for inside in INSIDE:
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
-            for name in set(os.listdir(folder)) - set(OF_A_UNIT):
-                if matches(name, ours) or (not inside and record is not None and name == record.map_file):
-                    remove(folder / name)
+            names = [f"{inside}/{name}" if inside else name for name in set(os.listdir(folder)) - set(INSIDE)]
+            others = foreign(old, RECORD, names)
+            for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
+                if name in others:
+                    os.rename(old / name, _free(place / name.replace("/", "-")))
                 else:
-                    os.rename(folder / name, _free(place / (f"{inside}-{name}" if inside else name)))
-    for inside in filter(None, OF_A_UNIT):
+                    remove(old / name)
+    for inside in filter(None, INSIDE):
         remove(old / inside)
     old.rmdir()
 
@@ -247,7 +256,7 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 MARK = "fleet.json"  # mark of a fleet's folder
 TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
-UNITS = "units"
+UNITS, RECORD = "units", "unit.json"  # folder of the units, and the record in each of theirs
 
 
 @dataclass(frozen=True)
@@ -301,7 +310,7 @@ class UnitStore:
 def record_of(folder: Path) -> UnitRecord | None:
     """Return the record in a unit's folder; None where there is none that can be read."""
     try:
-        return UnitRecord.model_validate_json(read_whole(folder / "unit.json"))
+        return UnitRecord.model_validate_json(read_whole(folder / RECORD))
     except (OSError, ValidationError):
         return None
 

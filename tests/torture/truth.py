@@ -102,6 +102,9 @@ class Truth:
         for values in self.data.values():
             with np.errstate(invalid="ignore"):
                 good &= (np.abs(values) < ABSURD).reshape(len(values), -1).all(axis=1)
+        if "temperature" in self.data:
+            T = self.data["temperature"].reshape(len(good), -1)
+            good &= ~np.any((T < -273.15) | (T > 5000), axis=1)  # degC, as robustness.md says
         return good
 
     def complaint(self, found: Results, clean: Results) -> str | None:

@@ -56,3 +56,36 @@ def test_a_table_of_a_fleet_that_was_edited_is_not_replaced(tmp_path):
         fleet_folder(tmp_path / "fleet"),
     ):
         pass
+
+
+def test_a_file_of_a_unit_that_was_edited_goes_along_with_the_one_that_is_made_anew(tmp_path):
+    record = UnitRecord(key="k", unit="6", state="failed", error="none", map_file="map.json")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"map.json": b"1", "unit.npz": b"1"}, "stamp")
+        folder.put_page("6", {"page/report.html": b"1", "page/map.report.html": b"1"})
+    unit = tmp_path / "fleet" / "units" / "6"
+    (unit / "map.json").write_bytes(b"edited")
+    (unit / "page" / "report.html").write_bytes(b"edited")
+    (unit / "unit.json").write_text((unit / "unit.json").read_text().replace('"none"', '"edited"'))
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"map.json": b"2", "unit.npz": b"2"}, "stamp")
+    left = {path.name: path.read_bytes() for path in unit.iterdir()}
+    assert left.pop("map.json") == left.pop("unit.npz") == b"2"
+    assert b'"none"' in left.pop("unit.json")
+    assert b'"edited"' in left.pop("unit.json.before-1")
+    assert left == {"map.json.before-1": b"edited", "page-report.html": b"edited"}
+
+
+def test_a_table_that_was_edited_while_its_fleet_was_not_complete_is_put_aside(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.write("report.html", b"a")
+        folder.write_mark({**json.loads((folder.path / "fleet.json").read_text()), "complete": True})
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(UnitRecord(key="k", unit="6", state="failed", error="none"), {}, "stamp")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert not folder.mark["complete"]
+        assert (folder.path / "report.html").read_bytes() == b"a"
+    (tmp_path / "fleet" / "report.html").write_text("b")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert (folder.path / "report.html.before-1").read_text() == "b"
+        assert not (folder.path / "report.html").exists()
