@@ -175,44 +175,38 @@ class Cells:
     def __init__(self, d: int) -> None:
         self.d = d
         self.size = 0.0  # cells so far, those without a row too
-        self._at: list[Array] = []  # numbers of cells with rows at rest, one array for each call of `add`
-        self._sums: list[Array] = []  # of each: time at rest [s], integrals of error, of its square, and of c - rate
+        # number, time at rest [s], integrals of error, of its square, and of c - rate, of each cell with rows at rest
+        self._cells = [np.array([[-1.0] + [0.0] * (1 + 3 * d)])]
 
     def add(self, t: Array, tau: Array, error: Array, raw: Array) -> None:
         """Take the next rows: times t (N,) from the start, s, at rest for tau (N,), with their errors (N, d)."""
-        cells = np.maximum(np.floor(t / CELL), 0.0)
-        self.size, rest = float(cells[-1]) + 1, tau > 0
-        new = np.diff(cells[rest], prepend=-1.0) > 0  # time only moves on
-        at = cells[rest][new]
-        sums = np.zeros((len(at), 1 + 3 * self.d))
-        _sum_cells(np.cumsum(new) - 1, tau[rest], error[rest], raw[rest], sums)
-        if len(at) and self._at and self._at[-1][-1] == at[0]:
-            self._sums[-1][-1] += sums[0]
-            at, sums = at[1:], sums[1:]
-        if len(at):
-            self._at.append(at)
-            self._sums.append(sums)
-
-    def _joined(self) -> tuple[Array, Array]:
-        """Return the numbers (K,) of the cells with rows at rest, and their sums (K, 1 + 3 d)."""
-        return np.concatenate([np.zeros(0), *self._at]), np.concatenate([np.zeros((0, 1 + 3 * self.d)), *self._sums])
+        numbers, rest = np.maximum(np.floor(t / CELL), 0.0), tau > 0
+        self.size = float(numbers[-1]) + 1
+        new = np.diff(numbers[rest], prepend=-1.0) > 0  # time only moves on
+        cells = np.zeros((np.count_nonzero(new), 2 + 3 * self.d))
+        cells[:, 0] = numbers[rest][new]
+        _sum_cells(np.cumsum(new) - 1, tau[rest], error[rest], raw[rest], cells[:, 1:])
+        if len(cells) and self._cells[-1][-1, 0] == cells[0, 0]:
+            self._cells[-1][-1, 1:] += cells[0, 1:]
+            cells = cells[1:]
+        if len(cells):
+            self._cells.append(cells)
 
     def errors(self) -> Array:
         """Return time, s, and mean of prediction less rate (K, 1 + d) of the cells that were at rest."""
-        at, sums = self._joined()
-        rest = sums[:, 0] >= MEASURED * CELL
-        means = sums[rest, 1 + 2 * self.d :] / sums[rest, :1]
-        return np.column_stack([(at[rest] + 0.5) * CELL, means])
+        cells = np.concatenate(self._cells)
+        cells = cells[cells[:, 1] >= MEASURED * CELL]
+        return np.column_stack([(cells[:, 0] + 0.5) * CELL, cells[:, 2 + 2 * self.d :] / cells[:, 1:2]])
 
     def coasts(self, length: float, align: float, first: Array) -> Array:
         """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
         coasts = [first] if np.all(np.isfinite(first)) else []
-        at, sums = self._joined()
-        starts = np.unique(at // n) * n
+        cells = np.concatenate(self._cells)
+        starts = np.unique(cells[:, 0] // n) * n
         for start in starts[(starts >= n) & (starts + n <= self.size)]:
-            before, begin, end = np.searchsorted(at, [start - m, start, start + n])
-            aligned, coast = (np.sum(sums[part], axis=0) for part in (slice(before, begin), slice(begin, end)))
+            before, begin, end = np.searchsorted(cells[:, 0], [start - m, start, start + n])
+            aligned, coast = np.sum(cells[before:begin, 1:], axis=0), np.sum(cells[begin:end, 1:], axis=0)
             if min(aligned[0] / (m * CELL), coast[0] / (n * CELL)) >= MEASURED:
                 level = aligned[1 + 2 * d :] / aligned[0]
                 mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]

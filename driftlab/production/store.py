@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -200,12 +201,8 @@ def _take_along(old: Path, place: Path) -> None:
 
 def _free(path: Path) -> Path:
     """Return a path, or one like it, under which nothing is."""
-    number = 0
-    found = path
-    while os.path.lexists(found):
-        number += 1
-        found = path.with_name(f"{path.name}.before-{number}")
-    return found
+    names = chain([path], (path.with_name(f"{path.name}.before-{k}") for k in count(1)))
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
