@@ -19,7 +19,7 @@ from torture.config_mutations import get, leaves, mutate
 from torture.outcome import Outcome, program
 from torture.truth import Results, not_finite
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 10_000, 2, 5.0, True
+CASES, WORKERS, LIMIT, IN_PROCESS = 5_000, 2, 5.0, True
 RUN_EVERY = 10
 QUANTITIES = {
     "latitude", "heading", "update_interval", "align", "noise", "range", "walk", "sigma_0", "tau", "attitude",

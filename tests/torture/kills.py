@@ -16,7 +16,7 @@ from torture import base
 from torture.commands import begin, call, ended, kill
 from torture.outcome import Outcome, program
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 120, 5, 45.0, False
+CASES, WORKERS, LIMIT, IN_PROCESS = 60, 5, 45.0, False
 RNG = np.random.Generator
 LIVE_RATE = 200
 ESTIMATES = ("t", "bias", "bias_sigma", "x", "sigma")

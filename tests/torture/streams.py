@@ -21,7 +21,7 @@ from torture.frames import SYNC, frame, mpeg_2, stream
 from torture.grammar import NUMBER
 from torture.outcome import Outcome, traceback_cause
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 100_000, 2, 5.0, True
+CASES, WORKERS, LIMIT, IN_PROCESS = 60_000, 2, 5.0, True
 MEMORY = 16 << 10  # bytes that may be kept between two pieces
 RNG = np.random.Generator
 NAMES = ("t", "gx", "gy", "gz", "T")

@@ -22,7 +22,7 @@ from torture.commands import MAIN, ended
 from torture.disks import content, disk
 from torture.outcome import Outcome, Said
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 200, 2, 305.0, False
+CASES, WORKERS, LIMIT, IN_PROCESS = 160, 2, 305.0, False
 RNG = np.random.Generator
 POLYNOMIAL = {"kind": "polynomial", "order": 2, "min_swing": "0.5 K"}
 PATIENCE = 300.0  # s by the clock, of a machine with other work: for another processor all is compiled anew, and said

@@ -11,13 +11,13 @@ import pytest
 CAMPAIGN = Path(__file__).with_name("campaign.py")
 DOSES = {
     "disks": 0.125,
-    "kills": 0.034,
-    "configs": 0.02,
+    "kills": 0.067,
+    "configs": 0.04,
     "recordings": 0.03,
     "tables": 0.03,
     "maps": 0.1,
-    "streams": 0.02,
-    "surroundings": 0.1,
+    "streams": 0.033,
+    "surroundings": 0.125,
     "extremes": 0.1,
     "injections": 0.1,
     "bombs": 0.06,
