@@ -248,18 +248,19 @@ class TimeBudget:
 
     def __init__(self, path: Path, what: str, seconds: float = SECONDS, row: float = ROW) -> None:
         self.path, self.what, self.seconds, self.row = path, what, seconds + on_disk(path) / PACE, row
-        self.begun, self.used, self.ticks = time.process_time(), 0.0, 0
+        self.now, self.used, self.ticks = time.process_time, 0.0, 0
+        self.begun = self.now()
         self.all = _ALL.get()
 
     def __enter__(self) -> Self:
-        self.begun = time.process_time()
+        self.begun = self.now()
         self.check()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.check()
-        now = time.process_time()
+        now = self.now()
         self.used, self.begun = self.used + now - self.begun, now
 
     def check(self, rows: int = 0) -> None:
@@ -267,15 +268,18 @@ class TimeBudget:
         self.seconds += rows * self.row
         if self.all is not None:
             self.all.check(rows)
-        if self.used + time.process_time() - self.begun > self.seconds:
+        if self.used + self.now() - self.begun > self.seconds:
             raise UnreadableFile(
                 f"{self.path}: {self.what} took more than {self.seconds:.0f} s of the processor, which is the limit; "
                 "write the recording anew"
             )
 
     def over(self, items: Iterable[Any]) -> Iterator[Any]:
-        """Yield items; while each is made this is the clock of all steps, and what is done with them takes no time."""
-        iterator = iter(items)
+        """Yield items; while each is made this is the clock of all steps, of the thread that makes it alone.
+
+        What is done with them takes no time, nor what other threads do while a pipe is waited for.
+        """
+        iterator, self.now = iter(items), time.thread_time
         while True:
             token = _ALL.set(self)
             try:

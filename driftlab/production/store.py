@@ -53,20 +53,21 @@ class FleetFolder:
     def __init__(self, out: Path) -> None:
         self.out, self.path = out, Path(os.path.realpath(out))
         names = os.listdir(self.path) if self.path.exists() else []
-        self.mark = mark_of(self.path)
-        if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
+        if names and not mark_of(self.path) and set(names) - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
-        there = {TABLE, FAMILY, REPORT} & set(names)
-        changed = foreign(self.path, MARK, [MARK, *there]) if self.mark else []
-        if changed and (self.mark.get("complete") or MARK in changed):
-            raise ConfigError(
-                f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
-                "name another folder"
-            )
         (self.path / UNITS).mkdir(parents=True, exist_ok=True)
         check_writable(self.path)
         self.lock = Lock(self.path / LOCK, f"--out {out}")
         self.lock.sign()
+        self.mark = mark_of(self.path)  # as whoever had the lock has left it
+        there = {TABLE, FAMILY, REPORT} & set(os.listdir(self.path))
+        changed = foreign(self.path, MARK, [MARK, *there]) if self.mark else []
+        if changed and (self.mark.get("complete") or MARK in changed):
+            self.lock.release()
+            raise ConfigError(
+                f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
+                "name another folder"
+            )
         for name in changed:  # since the last mark, by somebody or by a command that was killed
             os.rename(self.path / name, _free(self.path / name))
         if not self.mark:
@@ -106,7 +107,10 @@ class FleetFolder:
         record = self.record(unit)
         if pages and record is not None:
             self.note(record.model_copy(update={"written": record.written | _digests(files)}))
-            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), self.unit(unit) / PAGE)
+            place = self.unit(unit) / PAGE
+            if os.path.lexists(place):  # somebody's, or a page that was not asked for
+                os.rename(place, _free(place))
+            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), place)
 
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
         """Return a new folder beside those of the units, with files in it."""
@@ -187,16 +191,14 @@ def _take_along(old: Path, place: Path) -> None:
     for inside in INSIDE:
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
-            names = [f"{inside}/{name}" if inside else name for name in set(os.listdir(folder)) - set(INSIDE)]
+            names = [f"{inside}/{name}" if inside else name for name in os.listdir(folder)]
             others = foreign(old, RECORD, names)
             for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
                 if name in others:
                     os.rename(old / name, _free(place / name.replace("/", "-")))
                 else:
                     remove(old / name)
-    for inside in filter(None, INSIDE):
-        remove(old / inside)
-    old.rmdir()
+            folder.rmdir()
 
 
 def _free(path: Path) -> Path:

@@ -36,7 +36,8 @@ def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
     All are of equal length, as the laws of a soak's noise have them; what is over at a recording's end belongs to its
     last run.
     """
-    parts = [np.arange(start, max(stop - n, start) + 1, n) for start, stop in pairwise([*starts, count])]
+    ends = [(start, stop) for start, stop in pairwise([*starts, count]) if stop > start]
+    parts = [np.arange(start, max(stop - n, start) + 1, n) for start, stop in ends] or [np.zeros(0)]
     return np.concatenate(parts).astype(np.int64)
 
 

@@ -11,12 +11,11 @@ import hashlib
 import json
 import os
 import re
+import zlib
 from collections.abc import Collection, Mapping
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from driftlab import __version__
 from fusion_core.budget import COPIED, read_whole
@@ -117,17 +116,11 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
 
 
 def _sums(file: BufferedReader) -> str:
-    """Return the SHA-256 of a file's length and of a sum of each of its blocks, of words times odd numbers modulo 2^64.
-
-    Any change within a word changes the sum; one of several words leaves it as it is once in 2^63 times or so.
-    """
-    odd = np.arange(1, BLOCK // 8 + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    odd = (odd ^ odd >> np.uint64(31)) * np.uint64(0xBF58476D1CE4E5B9) | np.uint64(1)
-    block, whole, length = np.zeros(BLOCK // 8, dtype=np.uint64), hashlib.sha256(), 0
-    while count := file.readinto(block.data):
-        block.view(np.uint8)[count:] = 0
-        length += count
-        whole.update(int(np.dot(block, odd)).to_bytes(8, "little"))
+    """Return the SHA-256 of the CRC-32 of each block of a file, and of its length."""
+    whole, length = hashlib.sha256(), 0
+    while block := file.read(BLOCK):
+        whole.update(zlib.crc32(block).to_bytes(4, "little"))
+        length += len(block)
     whole.update(length.to_bytes(8, "little"))
     return whole.hexdigest()
 

@@ -67,7 +67,7 @@ def alone(
         arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
-    sound = measured and n and m and (x.ndim, P.ndim, z.ndim, transition.C) == (1, 2, 2, None)
+    sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None
     if not (sound and single(*arrays, gate, of_x, of_z, sums)):
         return None
     after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])

@@ -2,7 +2,9 @@ import io
 import os
 import time
 import zipfile
+from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -116,6 +118,16 @@ def test_what_is_done_with_rows_takes_no_time_of_their_reader(tmp_path):
         list(clock.over(spend(0.1) or k for k in range(3)))
     clock = TimeBudget(tmp_path, "reading", 0.0)
     assert len(list(clock.over(check_all(10_000_000) or k for k in range(3)))) == 3
+
+
+def test_what_other_threads_do_while_a_pipe_is_waited_for_takes_no_time_of_the_reader(tmp_path):
+    def waited() -> Iterator[int]:
+        busy = Thread(target=spend, args=(0.3,))
+        busy.start()
+        busy.join()
+        yield 1
+
+    assert list(TimeBudget(tmp_path, "reading", 0.2, row=0.0).over(waited())) == [1]
 
 
 def test_an_array_that_declares_more_than_its_file_holds_makes_no_room(tmp_path):

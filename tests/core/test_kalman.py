@@ -113,6 +113,14 @@ def test_one_sample_that_is_not_finite_is_refused(of, value):
         estimate(State(np.zeros(2), P), Transition(F, Q, u), Measurement(z, H, np.eye(1), np.ones(1, dtype=bool)))
 
 
+@pytest.mark.parametrize("C", [np.eye(2), np.ones((1, 1, 2))])
+def test_one_sample_of_a_model_whose_bias_is_a_function_of_states(C):
+    state, F, u = State(np.zeros(2), np.eye(2)), np.eye(2), np.array([1.0, 2.0])
+    measured = Measurement(np.ones((1, 2)), np.eye(2), np.eye(2), np.ones(1, dtype=bool))
+    plain, found = (estimate(state, Transition(F, F, u, of), measured, keep_P=True) for of in (None, C))
+    assert_same(found, plain, 1e-12)
+
+
 def test_the_recursion_equals_filterpy():
     F, Q, H, R = twelve()
     rng = np.random.default_rng(2)

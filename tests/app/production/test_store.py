@@ -89,3 +89,19 @@ def test_a_table_that_was_edited_while_its_fleet_was_not_complete_is_put_aside(t
     with fleet_folder(tmp_path / "fleet") as folder:
         assert (folder.path / "report.html.before-1").read_text() == "b"
         assert not (folder.path / "report.html").exists()
+
+
+def test_what_others_call_as_a_folder_of_pages_stays(tmp_path):
+    record = UnitRecord(key="k", unit="6", state="failed", error="none")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"explained/loop.json": b"1"}, "stamp")
+        unit = folder.unit("6")
+        (unit / "page").write_text("mine")
+        (unit / "explained" / "page").mkdir()
+        (unit / "explained" / "page" / "mine.txt").write_text("mine")
+        folder.put_page("6", {"page/report.html": b"1"})
+        assert (unit / "page.before-1").read_text() == "mine"
+        folder.put(record, {}, "stamp")
+        left = {str(p.relative_to(unit)): p.read_text() for p in unit.rglob("*") if p.is_file()}
+    del left["unit.json"]
+    assert left == {"page.before-1": "mine", "explained-page/mine.txt": "mine"}

@@ -332,6 +332,18 @@ def test_any_edited_byte_of_a_large_file_shows(tmp_path, at):
     assert foreign(tmp_path, "summary.json", ["summary.json", "estimates.h5"]) == edited
 
 
+def test_values_of_a_large_file_that_were_negated_show(tmp_path):
+    values = np.random.default_rng(0).standard_normal(3_000_000)
+    (tmp_path / "summary.json").write_text('{"schema": 1}')
+    for edit in (slice(100, 2001, 1900), slice(None)):
+        (tmp_path / "estimates.h5").write_bytes(values.tobytes())
+        sign(tmp_path, "summary.json", ["estimates.h5"])
+        other = values.copy()
+        other[edit] *= -1
+        (tmp_path / "estimates.h5").write_bytes(other.tobytes())
+        assert foreign(tmp_path, "summary.json", ["estimates.h5"]) == ["estimates.h5"]
+
+
 def test_a_large_file_that_an_earlier_version_hashed_whole_is_known(tmp_path):
     content = bytes(17_000_001)
     (tmp_path / "estimates.h5").write_bytes(content)
