@@ -15,8 +15,6 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from hashlib import sha256
-from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +22,18 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
+from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, matches, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
 from driftlab.storage.ownership import digest, document, foreign, signed
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
-INSIDE = ("page", "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
+OF_A_UNIT = {  # what driftlab writes there, beside the map that the record names
+    "": ("unit.json", "unit.npz", "family_map.json"),
+    "page": ("report.html", "map.report.html"),
+    "explained": FILES["explain"],
+}
 LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 PAGE = "page"  # folder of a unit's pages
@@ -53,23 +55,19 @@ class FleetFolder:
     def __init__(self, out: Path) -> None:
         self.out, self.path = out, Path(os.path.realpath(out))
         names = os.listdir(self.path) if self.path.exists() else []
-        if names and not mark_of(self.path) and set(names) - {LOCK, f".{MARK}{NEW}"}:
+        self.mark = mark_of(self.path)
+        if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
-        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
-        check_writable(self.path)
-        self.lock = Lock(self.path / LOCK, f"--out {out}")
-        self.lock.sign()
-        self.mark = mark_of(self.path)  # as whoever had the lock has left it
-        there = {TABLE, FAMILY, REPORT} & set(os.listdir(self.path))
-        changed = foreign(self.path, MARK, [MARK, *there]) if self.mark else []
-        if changed and (self.mark.get("complete") or MARK in changed):
-            self.lock.release()
+        there = {TABLE, FAMILY, REPORT} & set(names) if self.mark.get("complete") else ()
+        if self.mark and (changed := foreign(self.path, MARK, [MARK, *there])):
             raise ConfigError(
                 f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
                 "name another folder"
             )
-        for name in changed:  # since the last mark, by somebody or by a command that was killed
-            os.rename(self.path / name, _free(self.path / name))
+        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
+        check_writable(self.path)
+        self.lock = Lock(self.path / LOCK, f"--out {out}")
+        self.lock.sign()
         if not self.mark:
             self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
         self._finish()
@@ -95,8 +93,7 @@ class FleetFolder:
         if self.mark.get("complete"):
             self.mark = {**self.mark, "complete": False}
             self.write_mark(self.mark)
-        record = record.model_copy(update={"written": _digests(files)})
-        self._made(f".{record.unit}{NEW}", {**files, RECORD: _content(record)})
+        self._made(f".{record.unit}{NEW}", {**files, "unit.json": _content(record)})
         self._replace(record.unit)
         self._records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
@@ -104,13 +101,8 @@ class FleetFolder:
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
         """Put the pages among the files of a unit into its folder, whole or not at all."""
         pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items() if name.startswith(f"{PAGE}/")}
-        record = self.record(unit)
-        if pages and record is not None:
-            self.note(record.model_copy(update={"written": record.written | _digests(files)}))
-            place = self.unit(unit) / PAGE
-            if os.path.lexists(place):  # somebody's, or a page that was not asked for
-                os.rename(place, _free(place))
-            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), place)
+        if pages:
+            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), self.unit(unit) / PAGE)
 
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
         """Return a new folder beside those of the units, with files in it."""
@@ -123,7 +115,7 @@ class FleetFolder:
 
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already."""
-        self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
+        self.write(f"{UNITS}/{record.unit}/unit.json", _content(record))
         self._records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
@@ -141,7 +133,7 @@ class FleetFolder:
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Write `fleet.json` and return its content: it knows itself and the files of all units."""
-        paths = (self.path / name for name in (TABLE, FAMILY, REPORT))
+        paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
         known = {path.name: digest(path) for path in paths if path.is_file()}
         self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
         return {**content, "written": document(self.path / MARK)["written"]}
@@ -176,35 +168,35 @@ class FleetFolder:
 
 
 def _content(record: UnitRecord) -> bytes:
-    others = {name: value for name, value in record.written.items() if name != RECORD}
-    return signed(record.model_dump(mode="json", by_alias=True), RECORD, others).encode()
-
-
-def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
-    return {name: sha256(content).hexdigest() for name, content in files.items()}
+    return (record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
 
 
 def _take_along(old: Path, place: Path) -> None:
-    """Remove a unit's folder that was replaced, but for what driftlab did not write so: that goes to the new one."""
+    """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
     if not old.exists():
         return
-    for inside in INSIDE:
+    record = record_of(old) or record_of(place)
+    for inside, ours in OF_A_UNIT.items():
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
-            names = [f"{inside}/{name}" if inside else name for name in os.listdir(folder)]
-            others = foreign(old, RECORD, names)
-            for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
-                if name in others:
-                    os.rename(old / name, _free(place / name.replace("/", "-")))
+            for name in set(os.listdir(folder)) - set(OF_A_UNIT):
+                if matches(name, ours) or (not inside and record is not None and name == record.map_file):
+                    remove(folder / name)
                 else:
-                    remove(old / name)
-            folder.rmdir()
+                    os.rename(folder / name, _free(place / (f"{inside}-{name}" if inside else name)))
+    for inside in filter(None, OF_A_UNIT):
+        remove(old / inside)
+    old.rmdir()
 
 
 def _free(path: Path) -> Path:
     """Return a path, or one like it, under which nothing is."""
-    names = chain([path], (path.with_name(f"{path.name}.before-{k}") for k in count(1)))
-    return next(name for name in names if not os.path.lexists(name))
+    number = 0
+    found = path
+    while os.path.lexists(found):
+        number += 1
+        found = path.with_name(f"{path.name}.before-{number}")
+    return found
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
@@ -255,7 +247,7 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 MARK = "fleet.json"  # mark of a fleet's folder
 TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
-UNITS, RECORD = "units", "unit.json"  # folder of the units, and the record in each of theirs
+UNITS = "units"
 
 
 @dataclass(frozen=True)
@@ -309,7 +301,7 @@ class UnitStore:
 def record_of(folder: Path) -> UnitRecord | None:
     """Return the record in a unit's folder; None where there is none that can be read."""
     try:
-        return UnitRecord.model_validate_json(read_whole(folder / RECORD))
+        return UnitRecord.model_validate_json(read_whole(folder / "unit.json"))
     except (OSError, ValidationError):
         return None
 

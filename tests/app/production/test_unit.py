@@ -85,7 +85,7 @@ def test_the_map_is_that_of_fit_map_to_the_byte(folder, tmp_path) -> None:
     own, other = (json.loads(text) for text in (found.files["map.json"], (tmp_path / "map.json").read_bytes()))
     assert own["record"]["provenance"].pop("fitted_at")
     assert other["record"]["provenance"].pop("fitted_at")
-    assert other["record"]["provenance"].pop("written")  # its SHA-256, which in a fleet is in fleet.json's table
+    assert other["record"]["provenance"].pop("written")  # its SHA-256, which a fleet's has not
     assert json.dumps(own) == json.dumps(other)
 
 
