@@ -116,7 +116,7 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
 
 
 def _sums(file: BufferedReader) -> str:
-    """Return the SHA-256 of the CRC-32 of each block of a file, and of its length."""
+    """Return the SHA-256 of the CRC-32 of each block of a file, and of the length of the file."""
     whole, length = hashlib.sha256(), 0
     while block := file.read(BLOCK):
         whole.update(zlib.crc32(block).to_bytes(4, "little"))
