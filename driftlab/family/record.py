@@ -120,6 +120,8 @@ class UnitRecord(BaseModel):
     driftlab : str
         Version.
     plugins : list of dict
+    written : dict of str to str
+        SHA-256 of each file of the unit's folder, by its name.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -151,3 +153,4 @@ class UnitRecord(BaseModel):
     seconds: float = 0.0
     driftlab: str = ""
     plugins: list[dict[str, Any]] = []
+    written: dict[str, str] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.shared_effect import SharedEffect, of_effect
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import FAMILY, NEW, REPORT, TABLE, UNITS, FleetFolder
+from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, FleetFolder
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.tables import Row, posteriors, rows_of, temperatures, write_table
 from driftlab.production.units_pass import FleetStatus
@@ -39,29 +38,25 @@ def write_fleet(
     each: ParallelMap = serial,
 ) -> None:
     """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
-    path = folder.path
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
         common = analysis.common.as_json() if analysis.common.effects else None
         save_family(
-            path / FAMILY, analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
+            folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
             odd_lots=[lot.sentence for lot in analysis.lots],
         )  # fmt: skip
-    else:
-        (path / FAMILY).unlink(missing_ok=True)  # of other units
     curves: list[Array] = []
-    new = path / f".{TABLE}{NEW}"
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
     write_table(
-        new, _rows(folder, status, analysis, curves, progress, each), more,
+        folder.hidden(TABLE), _rows(folder, status, analysis, curves, progress, each), more,
         {"driftlab": __version__, "SI": status.bias_unit},
     )  # fmt: skip
-    os.replace(new, path / TABLE)
     progress(Stage("report"))
-    new = path / f".{REPORT}{NEW}"
-    title = f"Fleet {folder.out.name or path.name}"
-    write_fleet_report(new, _overview(title, status, tracked_unit(config.filter), analysis, pages, curves))
-    os.replace(new, path / REPORT)
+    overview = _overview(
+        f"Fleet {folder.out.name or folder.path.name}", status, tracked_unit(config.filter), analysis, pages, curves
+    )
+    write_fleet_report(folder.hidden(REPORT), overview)
+    folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
 
 def _rows(

@@ -15,6 +15,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,25 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, matches, refusals, remove
+from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
-from driftlab.storage.ownership import digest, document, foreign, signed
+from driftlab.storage.ownership import (
+    OWN,
+    digest,
+    document,
+    foreign,
+    free,
+    is_as,
+    signed,
+    why_not_own,
+    with_own,
+    written,
+)
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
-OF_A_UNIT = {  # what driftlab writes there, beside the map that the record names
-    "": ("unit.json", "unit.npz", "family_map.json"),
-    "page": ("report.html", "map.report.html"),
-    "explained": FILES["explain"],
-}
+INSIDE = ("page", "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
 LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 PAGE = "page"  # folder of a unit's pages
@@ -54,26 +62,44 @@ class FleetFolder:
 
     def __init__(self, out: Path) -> None:
         self.out, self.path = out, Path(os.path.realpath(out))
-        names = os.listdir(self.path) if self.path.exists() else []
-        self.mark = mark_of(self.path)
-        if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
-            raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
-        there = {TABLE, FAMILY, REPORT} & set(names) if self.mark.get("complete") else ()
-        if self.mark and (changed := foreign(self.path, MARK, [MARK, *there])):
-            raise ConfigError(
-                f"--out {out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, or "
-                "name another folder"
-            )
-        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
+        self._read_mark()
+        self.path.mkdir(parents=True, exist_ok=True)
         check_writable(self.path)
         self.lock = Lock(self.path / LOCK, f"--out {out}")
-        self.lock.sign()
-        if not self.mark:
-            self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
-        self._finish()
-        self.stamps = dict(_stamps(self.path / STAMPS))
-        self._records: dict[str, UnitRecord | None] = {}
-        self._journal = (self.path / STAMPS).open("ab")
+        try:
+            self.lock.sign()
+            self._read_mark()  # as whoever had the lock has left it
+            if not self.mark:
+                self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
+            (self.path / UNITS).mkdir(exist_ok=True)
+            self._finish()
+            self.stamps = dict(_stamps(self.path / STAMPS))
+            self._records: dict[str, UnitRecord | None] = {}
+            self._journal = (self.path / STAMPS).open("ab")
+        except BaseException:
+            self.lock.release()
+            raise
+
+    def _read_mark(self) -> None:
+        """Read the mark; raises ConfigError where the folder is no fleet's, or is complete and was edited since."""
+        names = set(os.listdir(self.path)) if self.path.exists() else set()
+        self.mark, self.written = mark_of(self.path), written(self.path / MARK)
+        if not self.mark and names - {LOCK, f".{MARK}{NEW}"}:
+            raise ConfigError(
+                f"--out {self.out}: exists and is not the output of an earlier fleet; move it away, or name another "
+                "folder"
+            )
+        if self.mark and not self.written:
+            raise ConfigError(
+                f"--out {self.out}: is of a version that kept no SHA-256 of its files; move it away, or name another "
+                "folder"
+            )
+        changed = foreign(self.path, MARK, {MARK, *({*OF_ALL} & names)}) if self.mark else []
+        if changed and (self.mark.get("complete") or MARK in changed):
+            raise ConfigError(
+                f"--out {self.out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, "
+                "or name another folder"
+            )
 
     def unit(self, name: str) -> Path:
         """Return the folder of a unit."""
@@ -91,9 +117,9 @@ class FleetFolder:
         What was made of all units is not of these any more, so the mark says first that it is not complete.
         """
         if self.mark.get("complete"):
-            self.mark = {**self.mark, "complete": False}
-            self.write_mark(self.mark)
-        self._made(f".{record.unit}{NEW}", {**files, "unit.json": _content(record)})
+            self.write_mark({**self.mark, "complete": False})
+        record = record.model_copy(update={"written": _digests(files)})
+        self._made(f".{record.unit}{NEW}", {**files, RECORD: _content(record)})
         self._replace(record.unit)
         self._records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
@@ -101,8 +127,12 @@ class FleetFolder:
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
         """Put the pages among the files of a unit into its folder, whole or not at all."""
         pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items() if name.startswith(f"{PAGE}/")}
-        if pages:
-            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), self.unit(unit) / PAGE)
+        record, place = self.record(unit), self.unit(unit) / PAGE
+        if pages and record is not None:
+            self.note(record.model_copy(update={"written": record.written | _digests(files)}))
+            if os.path.lexists(place):  # somebody's
+                os.rename(place, free(place))
+            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), place)
 
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
         """Return a new folder beside those of the units, with files in it."""
@@ -114,8 +144,10 @@ class FleetFolder:
         return folder
 
     def note(self, record: UnitRecord) -> None:
-        """Write the record of a unit anew, which is there already."""
-        self.write(f"{UNITS}/{record.unit}/unit.json", _content(record))
+        """Write the record of a unit anew, which is there already; one that was edited is put aside."""
+        if foreign(self.unit(record.unit), RECORD, [RECORD]):
+            os.rename(self.unit(record.unit) / RECORD, free(self.unit(record.unit) / RECORD))
+        self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
         self._records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
@@ -133,10 +165,28 @@ class FleetFolder:
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Write `fleet.json` and return its content: it knows itself and the files of all units."""
-        paths = (self.path / name for name in ((TABLE, FAMILY, REPORT) if content["complete"] else ()))
-        known = {path.name: digest(path) for path in paths if path.is_file()}
-        self.write(MARK, signed(plain(dict(content)), MARK, known).encode())
-        return {**content, "written": document(self.path / MARK)["written"]}
+        self.write(MARK, signed(plain(dict(content)), MARK, self.written).encode())
+        self.mark = {**content, "written": document(self.path / MARK)["written"]}
+        return self.mark
+
+    def hidden(self, name: str) -> Path:
+        """Return the name of a file of all units until it is published."""
+        return self.path / f".{name}{NEW}"
+
+    def publish(self, names: Collection[str]) -> None:
+        """Put files of all units in their places; others of such names go, or are put aside where they were edited.
+
+        The mark knows them first, as they were written: whatever is there is known at any moment.
+        """
+        for path in (self.path / name for name in OF_ALL):
+            if is_as(path, self.written.get(path.name, "")):
+                remove(path)
+            elif os.path.lexists(path):
+                os.rename(path, free(path))
+        self.written = {name: digest(self.hidden(name)) for name in names}
+        self.write_mark(self.mark)
+        for name in names:
+            os.replace(self.hidden(name), self.path / name)
 
     def _replace(self, unit: str) -> None:
         place = self.unit(unit)
@@ -168,35 +218,29 @@ class FleetFolder:
 
 
 def _content(record: UnitRecord) -> bytes:
-    return (record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
+    record = record.model_copy(update={"written": {**record.written, RECORD: OWN}})
+    return with_own(record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
+
+
+def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
+    return {name: sha256(content).hexdigest() for name, content in files.items()}
 
 
 def _take_along(old: Path, place: Path) -> None:
-    """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
+    """Remove a unit's folder that was replaced, but for what driftlab did not write so: that goes to the new one."""
     if not old.exists():
         return
-    record = record_of(old) or record_of(place)
-    for inside, ours in OF_A_UNIT.items():
+    for inside in INSIDE:
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
-            for name in set(os.listdir(folder)) - set(OF_A_UNIT):
-                if matches(name, ours) or (not inside and record is not None and name == record.map_file):
-                    remove(folder / name)
+            names = [f"{inside}/{name}" if inside else name for name in os.listdir(folder)]
+            others = [n for n in foreign(old, RECORD, names) if n != FAMILY_MAP or why_not_own(old / n, COMMAND)]
+            for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
+                if name in others:
+                    os.rename(old / name, free(place / name.replace("/", "-")))
                 else:
-                    os.rename(folder / name, _free(place / (f"{inside}-{name}" if inside else name)))
-    for inside in filter(None, OF_A_UNIT):
-        remove(old / inside)
-    old.rmdir()
-
-
-def _free(path: Path) -> Path:
-    """Return a path, or one like it, under which nothing is."""
-    number = 0
-    found = path
-    while os.path.lexists(found):
-        number += 1
-        found = path.with_name(f"{path.name}.before-{number}")
-    return found
+                    remove(old / name)
+            folder.rmdir()
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
@@ -247,7 +291,9 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 MARK = "fleet.json"  # mark of a fleet's folder
 TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
-UNITS = "units"
+OF_ALL = (TABLE, FAMILY, REPORT)
+UNITS, RECORD = "units", "unit.json"  # folder of the units, and the record in each of theirs
+FAMILY_MAP, COMMAND = "family_map.json", "fleet"  # in the folder of a unit, which knows itself and this command
 
 
 @dataclass(frozen=True)
@@ -301,7 +347,7 @@ class UnitStore:
 def record_of(folder: Path) -> UnitRecord | None:
     """Return the record in a unit's folder; None where there is none that can be read."""
     try:
-        return UnitRecord.model_validate_json(read_whole(folder / "unit.json"))
+        return UnitRecord.model_validate_json(read_whole(folder / RECORD))
     except (OSError, ValidationError):
         return None
 

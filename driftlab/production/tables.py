@@ -25,7 +25,8 @@ from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
 from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effects import SharedEffects
-from driftlab.production.store import NEW, UNITS, UnitRef
+from driftlab.production.store import COMMAND, FAMILY_MAP, NEW, UNITS, UnitRef
+from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
@@ -188,7 +189,6 @@ def schema(columns: Mapping[str, UnitColumn]) -> dict[str, pl.DataType]:
     return {name: types[column.type] for name, column in columns.items()}
 
 
-MAP = "family_map.json"
 AT_ONCE = 25  # units that a process is given at once, with the family
 
 
@@ -262,10 +262,13 @@ def _of_unit(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) ->
         soaked = informed_where_unknown(soaked, family, record)
     posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
     T = temperatures(family)
-    path = place.folder / UNITS / place.unit / MAP
-    new = path.with_name(f".{MAP}{NEW}")
-    provenance = {"unit": place.unit, "lot": lot}
+    path = place.folder / UNITS / place.unit / FAMILY_MAP
+    new = path.with_name(f".{FAMILY_MAP}{NEW}")
+    provenance = {"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}
     family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
+    seal(new)
+    if why_not_own(path, COMMAND):
+        os.rename(path, free(path))
     os.replace(new, path)
     before = family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]

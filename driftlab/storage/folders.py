@@ -10,7 +10,7 @@ A command writes to `OUT.partial`, which it locks, and renames it to OUT when al
 - What would make the end fail is refused at the beginning.
 
 Where OUT cannot be renamed (a mount point, the working directory), `OUT.partial` is inside it and its files are moved
-one by one, the one that says that all are there last.
+one by one, the one that says that all are there last. The next command does the rest where one was killed meanwhile.
 
 A lock file is locked with `flock` as long as its process lives, and has the mark of its owner. A process that is killed
 leaves no lock, only the file, which the next one takes. On a file system without locks there is the mark alone.
@@ -33,7 +33,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from driftlab.storage.hdf5 import reading, reason, sync
-from driftlab.storage.ownership import document, foreign, sign
+from driftlab.storage.ownership import foreign, is_as, sign, written
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -72,6 +72,8 @@ class Folder:
             if self.folder.is_symlink():
                 raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
             self._check_files(read)
+            if self.inside and (self.partial / BEFORE).exists() and (self.partial / LOCK).exists():
+                self._finish_moving()
             self.check_target()
             home.mkdir(parents=True, exist_ok=True)
             self._check_rights(home)
@@ -107,11 +109,10 @@ class Folder:
             return
         names = set(self._names() if self.folder.is_dir() else [self.folder.name])
         first, second = FILES[self.command][:2]
-        known = document(self.folder / first).get("written")
-        if names and not (isinstance(known, dict) and any(fnmatch(name, second) for name in known)):
+        if names and not any(fnmatch(name, second) for name in written(self.folder / first)):
             raise ConfigError(
                 f"--out {self.out}: exists and is not the output of an earlier {self.command}, or of a version that "
-                "kept no SHA-256 of its files; name another folder"
+                "kept no SHA-256 of its files; move it away, or name another folder"
             )
         names -= {LOCK, BEFORE}
         others = sorted(name for name in names if not matches(name, FILES[self.command]))
@@ -120,13 +121,15 @@ class Folder:
                 f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
                 "name another folder"
             )
-        others = [] if self.force else foreign(self.folder, first, names)
+        self._check_own([] if self.force else foreign(self.folder, first, names))
+        self._check_can_be_computed_again(self.folder)
+
+    def _check_own(self, others: list[str]) -> None:
         if others:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
                 "away, or name another folder"
             )
-        self._check_can_be_computed_again(self.folder)
 
     def _names(self) -> list[str]:
         names = [name for name in os.listdir(self.folder) if name != self.partial.name]
@@ -187,6 +190,8 @@ class Folder:
             raise ConfigError(f"{error}; the new results are in {self.shown}") from None
         if self.inside:
             self._move_in()
+            self.lock.release()
+            shutil.rmtree(self.partial, ignore_errors=True)
             return
         before = self.partial / BEFORE
         if self.folder.exists():
@@ -201,16 +206,35 @@ class Folder:
         self.lock.release(self.folder / LOCK)
 
     def _move_in(self) -> None:
-        first = FILES[self.command][0]
-        remove(self.folder / first)
-        for name in self._names():
-            if matches(name, FILES[self.command]):
-                remove(self.folder / name)
-        names = set(os.listdir(self.partial)) - {LOCK, BEFORE}
-        for name in sorted(names, key=lambda name: name == first):
+        """Move the files in one by one; `BEFORE` in `.partial`, the first of the files before, says that it has begun.
+
+        So after a kill all that is there is known: by the first of the files before, or by that of the new ones.
+        """
+        first, before = FILES[self.command][0], self.partial / BEFORE
+        if not before.exists():
+            if (self.folder / first).exists():
+                os.replace(self.folder / first, before)
+            else:
+                before.touch()
+        old, new = written(before), written(self.partial / first)
+        there = [name for name in {*old, *new} if os.path.lexists(self.folder / name)]
+        there = [name for name in there if not is_as(self.folder / name, new.get(name, ""))]
+        self._check_own(
+            [] if self.force else [n for n in there if n == first or not is_as(self.folder / n, old.get(n, ""))]
+        )
+        for name in there:
+            remove(self.folder / name)
+        for name in sorted(set(os.listdir(self.partial)) - {LOCK, BEFORE}, key=first.__eq__):
             os.replace(self.partial / name, self.folder / name)
-        self.lock.release()
-        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def _finish_moving(self) -> None:
+        """Do the rest where a command was killed while it moved its files in."""
+        lock = Lock(self.partial / LOCK, f"--out {self.out}")
+        try:
+            if written(self.partial / FILES[self.command][0]):
+                self._move_in()
+        finally:
+            lock.release(remove=False)
 
     def leave(self) -> None:
         """Give up: files that were written stay in `.partial`, which goes if there are none."""

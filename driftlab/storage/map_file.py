@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from driftlab.storage.folders import check_writable, refusals
 from driftlab.storage.hdf5 import sync
-from driftlab.storage.ownership import check_own, seal, seal_of
+from driftlab.storage.ownership import check_own, put, seal, seal_of
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, MapError
 
@@ -39,20 +39,20 @@ def check_file(path: Path, command: str, subject: str, remedy: str) -> None:
 
 
 def write_text(path: Path, text: str, command: str) -> None:
-    """Write a page, a figure or a text of JSON whole, in the place that a link leads to; raises Unwritable."""
+    """Write a page, a figure or a text of JSON whole, where a link leads to; raises as `save`."""
     known = (
         f'{{\n  "sha256": "{seal_of(command)}",{text[1:]}' if text[0] == "{" else f"{text}<!-- {seal_of(command)} -->\n"
     )
-    with refusals(str(path), "make room, or name another place", usage=False), _sealed(path) as new:
+    with _sealed(path, command, str(path)) as new:
         new.write_text(known, encoding="utf-8")
 
 
 def save(fitted: FittedMap, path: Path, command: str) -> None:
-    """Write a map's file, in the place that a link leads to; raises MapError or Unwritable."""
+    """Write a map's file, in the place that a link leads to; raises MapError, Unwritable or ConfigError."""
     others = {name: text for name, text in fitted.record.provenance.items() if name != "written"}
     about = {"written": seal_of(command), **others}  # first, so that no other text is taken for it
     record = fitted.record.model_copy(update={"provenance": about})
-    with refusals(f"map {path}", "make room, or name another place", usage=False), _sealed(path) as new:
+    with _sealed(path, command, f"map {path}") as new:
         try:
             replace(fitted, record=record).save(new)
         except MapError as error:
@@ -60,12 +60,15 @@ def save(fitted: FittedMap, path: Path, command: str) -> None:
 
 
 @contextmanager
-def _sealed(path: Path) -> Iterator[Path]:
-    """Give a name to write a file under, which then gets its SHA-256, and its place: the one that a link leads to."""
+def _sealed(path: Path, command: str, subject: str) -> Iterator[Path]:
+    """Give a name to write a file under, which then gets its SHA-256, and its place."""
     place = Path(os.path.realpath(path))
-    with TemporaryDirectory(prefix=".driftlab-", dir=place.parent) as folder:
+    with (
+        refusals(subject, "make room, or name another place", usage=False),
+        TemporaryDirectory(prefix=".driftlab-", dir=place.parent) as folder,
+    ):
         new = Path(folder) / place.name
         yield new
         seal(new)
         sync(new)
-        os.replace(new, place)
+        put(new, path, command, subject)

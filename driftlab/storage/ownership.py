@@ -14,6 +14,7 @@ import re
 import zlib
 from collections.abc import Collection, Mapping
 from io import BufferedReader
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from fusion_core.budget import COPIED, read_whole
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import json_text
 
-SEAL, ZEROS = re.compile(rb"driftlab ([a-z-]{1,20}) [!-~]{1,80}, sha256:([0-9a-f]{64})"), 64 * b"0"
+OWN = 64 * "0"  # in the place of a SHA-256 of the file itself
+SEAL, ZEROS = re.compile(rb"driftlab ([a-z-]{1,20}) [!-~]{1,80}, sha256:([0-9a-f]{64})"), OWN.encode()
 LONGEST = 200  # bytes of a seal, at least
 LARGE, BLOCK = 1 << 24, 1 << 18  # bytes of a file whose digest is one of sums, and of a block
 SUMS = "sums:"  # how such a digest begins
@@ -31,7 +33,7 @@ LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 
 def seal_of(command: str) -> str:
     """Return the text by which a file is known, with zeros in the place of its SHA-256; `seal` writes that."""
-    return f"driftlab {command} {__version__}, sha256:{ZEROS.decode()}"
+    return f"driftlab {command} {__version__}, sha256:{OWN}"
 
 
 def seal(path: Path) -> None:
@@ -45,17 +47,44 @@ def seal(path: Path) -> None:
 
 def check_own(path: Path, command: str, subject: str, remedy: str) -> None:
     """Raise ConfigError where something else is at a path than what a command wrote there, as it wrote it."""
-    real = Path(os.path.realpath(path))
-    if not os.path.lexists(real):
-        return
-    _, by, said, found = _seal(real) if real.is_file() else (None, "", b"", b"")
+    if why := why_not_own(Path(os.path.realpath(path)), command):
+        raise ConfigError(f"{subject}: {why}; move it away, or {remedy}")
+
+
+def why_not_own(path: Path, command: str) -> str:
+    """Return the reason why a path is not as a command wrote it; empty where it is, or nothing is there."""
+    if not os.path.lexists(path):
+        return ""
+    regular = path.is_file() and not path.is_symlink()
+    _, by, said, found = _seal(path) if regular else (None, "", b"", b"")
     if by != command:
-        has = f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote"
-    elif said != found:
-        has = f"was changed since `driftlab {command}` wrote it"
-    else:
-        return
-    raise ConfigError(f"{subject}: {has}; move it away, or {remedy}")
+        return (
+            f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote, as an earlier version may "
+            "have kept none"
+        )
+    return "" if said == found else f"was changed since `driftlab {command}` wrote it"
+
+
+def put(new: Path, path: Path, command: str, subject: str) -> None:
+    """Give a file its place, the one that a link leads to, for one of the same command that nobody changed meanwhile.
+
+    Otherwise it is called `PATH.partial`, and ConfigError is raised.
+    """
+    place = Path(os.path.realpath(path))
+    try:
+        check_own(place, command, subject, "name another file")
+    except ConfigError as error:
+        kept = place.with_name(f"{place.name}.partial")
+        if new != kept:
+            os.replace(new, kept := free(kept))
+        raise ConfigError(f"{error}; the new one is {path.with_name(kept.name)}") from None
+    os.replace(new, place)
+
+
+def free(path: Path) -> Path:
+    """Return a path, or one like it, under which nothing is."""
+    names = chain([path], (path.with_name(f"{path.name}.before-{k}") for k in count(1)))
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def _seal(path: Path) -> tuple[int | None, str, bytes, bytes]:
@@ -84,18 +113,30 @@ def sign(folder: Path, first: str, names: Collection[str], known: Mapping[str, s
 def signed(content: dict[str, Any], first: str, digests: Mapping[str, str]) -> str:
     """Return the text of the first file of a folder, with the SHA-256 of files and its own, made with zeros there."""
     rest = {key: value for key, value in content.items() if key != "written"}
-    text = json_text({**rest, "written": {**digests, first: ZEROS.decode()}}, 2, allow_nan=False) + "\n"
-    before, _, after = text.rpartition(ZEROS.decode())
+    return with_own(json_text({**rest, "written": {**digests, first: OWN}}, 2, allow_nan=False) + "\n")
+
+
+def with_own(text: str) -> str:
+    """Return a text with its SHA-256 in the place of its last OWN."""
+    before, _, after = text.rpartition(OWN)
     return before + hashlib.sha256(text.encode()).hexdigest() + after
+
+
+def written(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of files by their names, as the first file of a folder has them; nothing where it has none."""
+    known = document(path).get("written")
+    return {name: str(said) for name, said in known.items()} if isinstance(known, dict) else {}
 
 
 def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
     """Return the files of a folder that driftlab did not write as they are."""
-    known = document(folder / first).get("written")
-    known = known if isinstance(known, dict) else {}
-    said = {name: str(known.get(name)) for name in names}
-    found = {n: digest(folder / n, said[n] if n == first else "", said[n].startswith(SUMS)) for n in names}
-    return sorted(name for name in names if not found[name] or found[name] != known.get(name))
+    known = written(folder / first)
+    return sorted(name for name in names if not is_as(folder / name, known.get(name, ""), own=name == first))
+
+
+def is_as(path: Path, said: str, *, own: bool = False) -> bool:
+    """Return True if a file has the SHA-256 that was said of it; `own`: that it says itself."""
+    return bool(said) and digest(path, said if own else "", said.startswith(SUMS)) == said
 
 
 def digest(path: Path, own: str = "", sums: bool | None = None) -> str:

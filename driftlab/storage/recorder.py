@@ -23,7 +23,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.storage.folders import Lock, check_writable, refusals
 from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, sync
-from driftlab.storage.ownership import check_own, seal, seal_of
+from driftlab.storage.ownership import check_own, put, seal, seal_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Source, head
 from fusion_core.data_sets import attribute
@@ -242,16 +242,17 @@ def recording_file(out: Path, settings: str) -> Iterator[Hdf5Writer | CsvWriter]
     if kind is None:
         raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
     check_own(out, "simulate", f"--out {out}", "name another file")
-    with _renamed(Path(os.path.realpath(out)), out) as partial:
+    with _locked_partial(Path(os.path.realpath(out)), out) as partial:
         writer = kind(partial, settings)
         with closing(writer.file):  # also of a program that stops: rows that were written are whole
             yield writer
         seal(partial)
+        put(partial, out, "simulate", f"--out {out}")
 
 
 @contextmanager
-def _renamed(out: Path, named: Path) -> Iterator[Path]:
-    """Give the name `OUT.partial` to write to, and rename the file to `out` when all went well.
+def _locked_partial(out: Path, named: Path) -> Iterator[Path]:
+    """Give the name `OUT.partial` to write to.
 
     `OUT.lock` is held meanwhile. Left behind, it says that what is called `OUT.partial` is ours.
     """
@@ -262,7 +263,6 @@ def _renamed(out: Path, named: Path) -> Iterator[Path]:
         lock = _locked(out, f"--out {named}", unfinished)
         try:
             yield partial
-            os.replace(partial, out)
         finally:
             lock.release(remove=not any(path.exists() for path in unfinished))
 

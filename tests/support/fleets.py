@@ -59,8 +59,9 @@ def contents(fleet):
         if path.suffix == ".html":
             found[name] = b""
             continue
-        content = re.sub(rb'"fitted_at": ?"[^"]*"', b"", path.read_bytes())
+        content = re.sub(rb'"fitted_at": ?"[^"]*"|sha256:[0-9a-f]{64}', b"", path.read_bytes())
         if path.name == "unit.json":
-            content = {name: value for name, value in json.loads(content).items() if name != "seconds"}
+            content = json.loads(content)
+            del content["seconds"], content["written"]
         found[name] = content
     return found

@@ -1,12 +1,26 @@
 """The folder of a fleet, opened again and again."""
 
-import json
+import errno
+import os
 
 import pytest
 
-from driftlab.errors import ConfigError
+from driftlab.errors import ConfigError, Unwritable
 from driftlab.family.record import UnitRecord
+from driftlab.production import store
 from driftlab.production.store import fleet_folder
+
+FAILED = {"key": "k", "state": "failed", "error": "none"}
+
+
+def complete(folder, report):
+    folder.hidden("report.html").write_bytes(report)
+    folder.publish(["report.html"])
+    folder.write_mark({**folder.mark, "complete": True})
+
+
+def texts(folder):
+    return {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("name", ["6", "x", "0001", "a.b"])
@@ -46,8 +60,7 @@ def test_what_others_put_beside_the_files_of_a_unit_stays(tmp_path):
 
 def test_a_table_of_a_fleet_that_was_edited_is_not_replaced(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
-        folder.write("report.html", b"a")
-        folder.write_mark({**json.loads((folder.path / "fleet.json").read_text()), "complete": True})
+        complete(folder, b"a")
     with fleet_folder(tmp_path / "fleet"):
         pass
     (tmp_path / "fleet" / "report.html").write_text("b")
@@ -55,4 +68,119 @@ def test_a_table_of_a_fleet_that_was_edited_is_not_replaced(tmp_path):
         pytest.raises(ConfigError, match=r"holds report.html, which driftlab did not write, or not so; move it away"),
         fleet_folder(tmp_path / "fleet"),
     ):
+        pass
+
+
+def test_a_file_of_a_unit_that_was_edited_goes_along_with_the_one_that_is_made_anew(tmp_path):
+    record = UnitRecord(unit="6", map_file="map.json", **FAILED)
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"map.json": b"1", "unit.npz": b"1"}, "stamp")
+        folder.put_page("6", {"page/report.html": b"1", "page/map.report.html": b"1"})
+    unit = tmp_path / "fleet" / "units" / "6"
+    (unit / "map.json").write_bytes(b"edited")
+    (unit / "page" / "report.html").write_bytes(b"edited")
+    (unit / "unit.json").write_text((unit / "unit.json").read_text().replace('"none"', '"edited"'))
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"map.json": b"2", "unit.npz": b"2"}, "stamp")
+    left = texts(unit)
+    assert left.pop("map.json") == left.pop("unit.npz") == "2"
+    assert '"none"' in left.pop("unit.json")
+    assert '"edited"' in left.pop("unit.json.before-1")
+    assert left == {"map.json.before-1": "edited", "page-report.html": "edited"}
+
+
+def test_a_record_that_was_edited_is_put_aside_when_the_manifest_says_something_else(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+        path = folder.unit("6") / "unit.json"
+        path.write_text(path.read_text().replace('"none"', '"edited"'))
+        for lot in "ab":
+            folder.note(UnitRecord(unit="6", lot=lot, **FAILED))
+    left = texts(path.parent)
+    assert '"lot": "b"' in left.pop("unit.json")
+    assert '"edited"' in left.pop("unit.json.before-1")
+    assert not left
+
+
+def test_what_others_call_as_a_folder_of_pages_stays(tmp_path):
+    record = UnitRecord(unit="6", **FAILED)
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(record, {"explained/loop.json": b"1"}, "stamp")
+        unit = folder.unit("6")
+        (unit / "page").write_text("mine")
+        (unit / "explained" / "page").mkdir()
+        (unit / "explained" / "page" / "mine.txt").write_text("mine")
+        folder.put_page("6", {"page/report.html": b"1"})
+        assert (unit / "page.before-1").read_text() == "mine"
+        folder.put(record, {}, "stamp")
+        left = texts(unit)
+        (unit / "explained").symlink_to(tmp_path)
+        folder.put(record, {}, "stamp")
+        assert (unit / "explained").is_symlink()
+    del left["unit.json"]
+    assert left == {"page.before-1": "mine", "explained-page/mine.txt": "mine"}
+
+
+def test_a_report_that_was_edited_while_its_fleet_was_not_complete_is_put_aside(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        complete(folder, b"a")
+        folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+    path = tmp_path / "fleet" / "report.html"
+    with fleet_folder(tmp_path / "fleet") as folder:
+        complete(folder, b"b")
+        folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+        assert path.read_text() == "b"
+    path.write_text("mine")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        complete(folder, b"c")
+    assert path.read_text() == "c"
+    assert path.with_name("report.html.before-1").read_text() == "mine"
+
+
+def test_a_report_that_was_edited_before_its_fleet_was_marked_as_complete_is_not_replaced(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.hidden("report.html").write_bytes(b"a")
+        folder.publish(["report.html"])
+        (folder.path / "report.html").write_text("mine")
+        folder.write_mark({**folder.mark, "complete": True})
+    with pytest.raises(ConfigError, match=r"holds report\.html"), fleet_folder(tmp_path / "fleet"):
+        pass
+
+
+def test_a_fleet_is_looked_at_once_its_lock_is_held(tmp_path, monkeypatch):
+    """Between the first look and the lock another command ends, and somebody edits its report."""
+    with fleet_folder(tmp_path / "fleet") as folder:
+        complete(folder, b"a")
+        folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+
+    class Late(store.Lock):
+        def __init__(self, path, what):
+            monkeypatch.undo()
+            with fleet_folder(tmp_path / "fleet") as folder:
+                complete(folder, b"b")
+            (tmp_path / "fleet" / "report.html").write_text("mine")
+            super().__init__(path, what)
+
+    monkeypatch.setattr(store, "Lock", Late)
+    with pytest.raises(ConfigError, match=r"holds report\.html"), fleet_folder(tmp_path / "fleet"):
+        pass
+    assert not (tmp_path / "fleet" / "driftlab.lock").exists()
+
+
+def test_a_fleet_whose_disk_was_full_at_its_first_file_is_made_anew(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        with pytest.raises(Unwritable), fleet_folder(tmp_path / "fleet"):
+            pass
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert folder.mark["program"] == "driftlab fleet"
+
+
+def test_a_fleet_of_a_version_without_digests_says_so(tmp_path):
+    (tmp_path / "fleet.json").write_text('{"schema": 1, "complete": true}')
+    message = "is of a version that kept no SHA-256 of its files; move it away, or name another folder"
+    with pytest.raises(ConfigError, match=message), fleet_folder(tmp_path):
         pass

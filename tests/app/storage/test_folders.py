@@ -4,6 +4,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -13,9 +14,9 @@ import pytest
 
 from driftlab.storage.folders import LOCK, Lock, output_folder
 from driftlab.storage.hdf5 import GrowingFile
-from driftlab.storage.map_file import check_place
+from driftlab.storage.map_file import check_file, check_place, write_text
 from driftlab.storage.ownership import sign
-from driftlab.storage.recorder import RECORDED_MARK, Recorder
+from driftlab.storage.recorder import RECORDED_MARK, Recorder, recording_file
 from fusion_core.chunk import Chunk
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -167,6 +168,38 @@ def test_a_folder_that_cannot_be_renamed_is_written_to(tmp_path, monkeypatch):
     (tmp_path / "out" / "notes.txt").write_text("mine")
     with pytest.raises(ConfigError, match=r"holds notes\.txt"):
         write(tmp_path / "out")
+
+
+@pytest.mark.parametrize("before", [False, True], ids=["new", "replaced"])
+def test_a_kill_while_files_are_moved_in_one_by_one_is_made_up_for(tmp_path, monkeypatch, before):
+    """Before each change of a name: what is there then is refused to nobody but who edited it."""
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    if before:
+        write(tmp_path / "out", "one")
+    states = []
+
+    def spied(old, new, function=os.replace):
+        states.append(shutil.copytree(tmp_path / "out", tmp_path / f"state{len(states)}" / "out"))
+        function(old, new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", spied)
+        write(tmp_path / "out", "two")
+    assert len(states) >= 3
+    for state in states:
+        edited = state.parent / "edited" / "out"
+        shutil.copytree(state, edited)
+        if (edited / "report.html").exists():
+            (edited / "report.html").write_text("mine")
+            monkeypatch.chdir(edited)
+            with pytest.raises(ConfigError, match=r"holds report.html, which driftlab did not write"):
+                write(edited)
+            assert (edited / "report.html").read_text() == "mine"
+        monkeypatch.chdir(state)
+        write(state, "three")
+        assert names(state) == ["estimates.h5", "report.html", "summary.json"]
+        assert (state / "report.html").read_text() == page("three")
 
 
 def test_a_run_that_fails_leaves_what_it_wrote_and_nothing_else(tmp_path):
@@ -364,3 +397,29 @@ def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
         check_place(tmp_path / "link.csv", [tmp_path / "soak.csv"], "fit-map")
     with pytest.raises(ConfigError, match=r"soak.csv.m.json: cannot be written \(File exists\); name a folder"):
         check_place(tmp_path / "soak.csv" / "m.json", [], "fit-map")
+
+
+def test_a_file_that_is_edited_while_it_is_made_anew_stays(tmp_path):
+    path = tmp_path / "map.svg"
+    write_text(path, "<svg/>", "fit-map")
+    check_file(path, "fit-map", str(path), "name another")
+    path.write_text("mine")
+    message = r"map.svg: exists, and has no SHA-256 .*; move it away, or name another file; the new one is .*map.svg"
+    for number in ("", ".before-1"):
+        with pytest.raises(ConfigError, match=rf"{message}.partial{number}$"):
+            write_text(path, "<svg></svg>", "fit-map")
+        assert (tmp_path / f"map.svg.partial{number}").read_text().startswith("<svg></svg>")
+    assert path.read_text() == "mine"
+
+
+def test_a_recording_that_is_edited_while_it_is_simulated_anew_stays(tmp_path):
+    path = tmp_path / "twin.csv"
+    with recording_file(path, "{}") as file:
+        file.append(chunk())
+    with pytest.raises(ConfigError, match=r"was changed since .*; the new one is .*twin.csv.partial"):
+        with recording_file(path, "{}") as file:
+            file.append(chunk())
+            edited = path.read_bytes().replace(b"0.0", b"0.1")
+            path.write_bytes(edited)
+    assert path.read_bytes() == edited
+    assert b"0.0" in (tmp_path / "twin.csv.partial").read_bytes()
