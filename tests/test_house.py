@@ -251,7 +251,7 @@ BUDGET = {
     "driftlab/maps": 1772,
     "driftlab/noise": 1147,
     "driftlab/planning": 1164,
-    "driftlab/production": 2262,
+    "driftlab/production": 2249,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
     "driftlab/reports": 2735,

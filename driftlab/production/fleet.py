@@ -17,11 +17,10 @@ from driftlab.config import Config, with_recording
 from driftlab.family.parallel import serial
 from driftlab.production.family import analyse
 from driftlab.production.manifest import read_manifest
-from driftlab.production.progress import fleet_progress
-from driftlab.production.report import is_written, write_fleet
 from driftlab.production.result import FleetResult
-from driftlab.production.store import UNITS, UnitStore, fleet_folder
-from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary
+from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, UnitStore, fleet_folder
+from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, fleet_progress
+from driftlab.production.tables import write_fleet
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
@@ -145,8 +144,9 @@ class _Command:
         self._timed("units", jobs.do)
         status = self.status = self._timed("reading", jobs.status)
         key, before = self._key(), folder.mark
-        fitted = before.get("family", {}).get("fitted", True)
-        as_it_was = before.get("key") == key and before.get("complete") and is_written(folder.path, family=fitted)
+        files = (TABLE, REPORT, *([FAMILY] if before.get("family", {}).get("fitted", True) else ()))
+        as_it_was = before.get("key") == key and before.get("complete")
+        as_it_was = as_it_was and all((folder.path / name).is_file() for name in files)
         if as_it_was and not jobs.pages_missing(before["pages"]):
             return self._mark(**{name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark()

@@ -1,4 +1,4 @@
-"""`units.parquet`: a row a unit and axis; its columns with their types, units and meanings.
+"""The files of a fleet as a whole: `units.parquet`, a row a unit and axis, the family, and the report.
 
 `SI` stands for the SI unit of the bias, which the column `bias_unit` names. The family's part of each unit's rows is
 made with the unit's curve for the report, and its `family_map.json`.
@@ -10,35 +10,138 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from driftlab import __version__
+from driftlab.config import Config
 from driftlab.evaluation.limits import VERDICTS, worst
+from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
 from driftlab.family.record import UnitRecord
+from driftlab.family.shared_effect import SharedEffect, of_effect
 from driftlab.family.shared_effects import SharedEffects
-from driftlab.production.store import COMMAND, FAMILY_MAP, NEW, UNITS, UnitRef
+from driftlab.identification.result import described
+from driftlab.production.family import FamilyAnalysis
+from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder, UnitRef
+from driftlab.production.summary import FleetProgress, Stage
+from driftlab.production.units_pass import FleetStatus
+from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
+from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-
-if TYPE_CHECKING:
-    import polars as pl
 
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
 PIECE = 10_000  # rows that are made a frame at once
+AT_ONCE = 25  # units that a process is given at once, with the family
 Row = dict[str, Any]
 
 
-def rows_of(record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None) -> Iterator[Row]:
-    """Yield the rows of a unit: `odd` are the reasons for which it stands out, None where they are not known."""
+def write_fleet(
+    folder: FleetFolder,
+    status: FleetStatus,
+    config: Config,
+    analysis: FamilyAnalysis,
+    pages: Collection[str],
+    progress: FleetProgress,
+    each: ParallelMap = serial,
+) -> None:
+    """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
+    if analysis.family is not None:
+        kind = next((settings.kind for settings in config.tracked_maps()), "")
+        common = analysis.common.as_json() if analysis.common.effects else None
+        save_family(
+            folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
+            odd_lots=[lot.sentence for lot in analysis.lots],
+        )  # fmt: skip
+    curves: list[Array] = []
+    more = list(dict.fromkeys(name for record in status.records for name in record.more))
+    rows = _rows(folder.path, status, analysis, curves, progress, each)
+    write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
+    progress(Stage("report"))
+    title = f"Fleet {folder.out.name or folder.path.name}"
+    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
+    write_fleet_report(folder.hidden(REPORT), overview)
+    folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
+
+
+def _rows(
+    folder: Path,
+    status: FleetStatus,
+    analysis: FamilyAnalysis,
+    curves: list[Array],
+    progress: FleetProgress,
+    each: ParallelMap,
+) -> Iterator[Row]:
+    """Yield the rows of the table, write the units' maps with the family, and add each unit's curve to `curves`."""
+    stage = Stage("tables and maps", total=len(status.records))
+    progress(stage)
+    family, common, reasons = analysis.family, analysis.common, analysis.reasons
+    units = ((UnitRef(folder, one.unit, one.lot), one, common.of_unit(one.unit)) for one in status.done)
+    parts = iter(()) if family is None else each(partial(_of_the_family, family), units, at_once=AT_ONCE)
+    for record in status.records:
+        part = next(parts, None) if record.state == "done" else None
+        if part is None:
+            yield from rows_of(record)
+        else:
+            yield from rows_of(record, part[0], reasons.get(record.unit, ()))
+            curves.append(part[1])
+        stage.done += 1
+        progress(stage)
+
+
+def temperatures(family: Family) -> Array:
+    """Return temperatures (G,) over the family's domain, degC."""
+    return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
+
+
+def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) -> tuple[list[Row], Array]:
+    """Write the map of a unit with the family; return the family's part of its rows, and that map's curve (d, G).
+
+    `shape_distance` is that of its coefficients from the mean of its lot, in deviations: 1 is usual.
+    """
+    place, record, common = unit
+    soaked, lot = place.read()
+    soaked = common.apart(soaked, lot)
+    if not common.effects:
+        soaked = informed_where_unknown(soaked, family, record)
+    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
+    path = place.folder / UNITS / place.unit / FAMILY_MAP
+    new = path.with_name(f".{FAMILY_MAP}{NEW}")
+    provenance = {"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}
+    family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
+    seal(new)
+    if why_not_own(path, COMMAND):
+        os.rename(path, free(path))
+    os.replace(new, path)
+    T, before = temperatures(family), family.marginal(lot)
+    off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
+    columns = {
+        "coefficients": posterior.c,
+        "coefficients_sigma": np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
+        "family_sigma": np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
+        "shape_distance": np.sqrt(np.array(off) / family.knots.q),
+    }
+    for first in common.of_units.get(place.unit, ())[:1]:
+        columns |= {"common_effect": first.c[:, 0], "common_effect_sigma": first.sigma[:, 0]}
+    knots = family.knots.peaks.tolist()
+    rows = [{"knots": knots, **{name: values[k].tolist() for name, values in columns.items()}} for k in range(len(off))]
+    return rows, (family.knots.values(T) @ posterior.c.T).T.astype(np.float32)
+
+
+def rows_of(record: UnitRecord, family: Sequence[Row] = (), odd: Sequence[str] | None = None) -> Iterator[Row]:
+    """Yield the rows of a unit.
+
+    `family` are the family's parts of them, `odd` the reasons for which it stands out, None where they are not known.
+    """
     row: Row = {name: getattr(record, name) for name in ("unit", "state", "seconds")}
     row |= {named(name): value for name, value in record.more.items()}
     texts = ("lot", "date", "error", "channel", "bias_unit", "driftlab", "key")
@@ -58,7 +161,7 @@ def rows_of(record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] |
         for name in FIGURES:
             if (figure := record.figures.get(name)) is not None:
                 values |= {name: figure.value[k], f"{name}_sigma": figure.sigma[k]}
-        yield row | values | ({} if family is None else family.row(k))
+        yield row | values | (family[k] if family else {})
 
 
 def _plugin(item: Mapping[str, Any]) -> str:
@@ -87,10 +190,14 @@ def write_table(path: Path, rows: Iterable[Row], more: Iterable[str], metadata: 
     from polars import selectors
 
     columns, left = all_columns(more), iter(rows)
-    types = schema(columns)
-    pieces = [pl.DataFrame(schema=types)]
+    types = {
+        "text": pl.String(), "texts": pl.List(pl.String()), "number": pl.Float64(), "numbers": pl.List(pl.Float64()),
+        "count": pl.Int64(), "flag": pl.Boolean(),
+    }  # fmt: skip
+    schema = {name: types[column.type] for name, column in columns.items()}
+    pieces = [pl.DataFrame(schema=schema)]
     while piece := list(islice(left, PIECE)):
-        pieces.append(pl.DataFrame(piece, schema=types))
+        pieces.append(pl.DataFrame(piece, schema=schema))
     described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in columns.items()}
     table = pl.concat(pieces).with_columns(selectors.float().fill_nan(None))
     table.write_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
@@ -174,109 +281,39 @@ def all_columns(more: Iterable[str]) -> dict[str, UnitColumn]:
     return columns
 
 
-def schema(columns: Mapping[str, UnitColumn]) -> dict[str, pl.DataType]:
-    """Return the types of columns, of polars."""
-    import polars as pl
-
-    types: dict[Type, pl.DataType] = {
-        "text": pl.String(),
-        "texts": pl.List(pl.String()),
-        "number": pl.Float64(),
-        "numbers": pl.List(pl.Float64()),
-        "count": pl.Int64(),
-        "flag": pl.Boolean(),
-    }
-    return {name: types[column.type] for name, column in columns.items()}
-
-
-AT_ONCE = 25  # units that a process is given at once, with the family
-
-
-@dataclass(frozen=True, eq=False)
-class OfTheFamily:
-    """The family's part of a unit's rows, and its curve.
-
-    Attributes
-    ----------
-    knots : (q,) array
-        Where the splines peak, degC.
-    c, sigma : (d, q) arrays
-        Coefficients of the unit's map with the family, and their deviations.
-    curve : (d, G) array
-        That map over `temperatures`, in single precision.
-    map_sigma : (d,) array
-        Rms of its deviation over the family's domain.
-    distance : (d,) array
-        Of its coefficients from the mean of its lot, in deviations: 1 is usual.
-    common, common_sigma : (d,) arrays or None
-        First coefficient of the first common effect in this unit.
-    """
-
-    knots: Array
-    c: Array
-    sigma: Array
-    curve: Array
-    map_sigma: Array
-    distance: Array
-    common: Array | None = None
-    common_sigma: Array | None = None
-
-    def row(self, k: int) -> Row:
-        """Return the part of the row of the k-th axis."""
-        numbers = {
-            "family_sigma": self.map_sigma, "shape_distance": self.distance, "common_effect": self.common,
-            "common_effect_sigma": self.common_sigma,
-        }  # fmt: skip
-        return {
-            "knots": self.knots.tolist(),
-            "coefficients": self.c[k].tolist(),
-            "coefficients_sigma": self.sigma[k].tolist(),
-            **{name: None if values is None else float(values[k]) for name, values in numbers.items()},
-        }
+def _overview(
+    title: str,
+    status: FleetStatus,
+    unit: BiasUnit,
+    analysis: FamilyAnalysis,
+    pages: Collection[str],
+    curves: Sequence[Array],
+) -> FleetOverview:
+    family, axes = analysis.family, analysis.line.axes
+    T = np.zeros(0) if family is None else temperatures(family)
+    return FleetOverview(
+        title=title,
+        records=status.records,
+        unit=unit,
+        line=analysis.line,
+        T=T,
+        curves=np.stack(curves) if curves else np.zeros((0, len(axes), len(T)), dtype=np.float32),
+        drawn=[record.unit for record in status.done] if curves else [],
+        mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
+        odd=analysis.odd,
+        effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],
+        links={name: f"{UNITS}/{name}/page/report.html" for name in pages},
+        remarks=analysis.lines,
+    )
 
 
-def temperatures(family: Family) -> Array:
-    """Return temperatures (G,) over the family's domain, degC."""
-    return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
-
-
-def posteriors(
-    folder: Path, records: Iterable[UnitRecord], family: Family, common: SharedEffects, each: ParallelMap = serial
-) -> Iterator[OfTheFamily]:
-    """Yield the family's part of each unit that was done, in their order, and write the units' maps.
-
-    Raises
-    ------
-    DataError
-        If a unit's file is damaged, or belongs to another family.
-    """
-    units = ((UnitRef(folder, one.unit, one.lot), one, common.of_unit(one.unit)) for one in records)
-    return each(partial(_of_unit, family), units, at_once=AT_ONCE)
-
-
-def _of_unit(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) -> OfTheFamily:
-    place, record, common = unit
-    soaked, lot = place.read()
-    soaked = common.apart(soaked, lot)
-    if not common.effects:
-        soaked = informed_where_unknown(soaked, family, record)
-    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
-    T = temperatures(family)
-    path = place.folder / UNITS / place.unit / FAMILY_MAP
-    new = path.with_name(f".{FAMILY_MAP}{NEW}")
-    provenance = {"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}
-    family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
-    seal(new)
-    if why_not_own(path, COMMAND):
-        os.rename(path, free(path))
-    os.replace(new, path)
-    before = family.marginal(lot)
-    off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
-    sizes = common.of_units.get(place.unit, ())
-    return OfTheFamily(
-        family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
-        (family.knots.values(T) @ posterior.c.T).T.astype(np.float32),
-        np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
-        np.sqrt(np.array(off) / family.knots.q),
-        sizes[0].c[:, 0] if sizes else None, sizes[0].sigma[:, 0] if sizes else None,
-    )  # fmt: skip
+def _effect_row(shared: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> SharedEffectRow:
+    """Return an effect as the report shows it, with its mean first coefficient in each lot."""
+    per = shared.unit.removeprefix(unit.si)
+    lots = [
+        (lot.lot, lot.units, axis, float(mean[0]) * unit.factor, float(sigma[0]) * unit.factor)
+        for lot in shared.lots
+        for axis, mean, sigma in zip(axes, lot.mean, lot.sigma, strict=True)
+    ]
+    sentence = " ".join([*of_effect(shared, unit, axes), shared.effect.explanation])
+    return SharedEffectRow(described(shared.effect), sentence, f"{unit.shown}{per}", tuple(lots))

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from driftlab.production import progress as fleet_progress
-from driftlab.production.summary import Stage
+from driftlab.production import summary
+from driftlab.production.summary import Stage, fleet_progress
 
 
 def test_the_end_is_estimated_from_what_was_done():
@@ -22,10 +22,10 @@ def test_the_end_is_estimated_from_what_was_done():
 
 def test_a_log_gets_a_line_now_and_then(monkeypatch):
     told, now = io.StringIO(), [1000.0]
-    monkeypatch.setattr(fleet_progress.sys, "stderr", told)
-    monkeypatch.setattr(fleet_progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(summary.sys, "stderr", told)
+    monkeypatch.setattr(summary.time, "monotonic", lambda: now[0])
     stage = Stage("units", total=1000, begun=1000.0)
-    with fleet_progress.fleet_progress() as show:
+    with fleet_progress() as show:
         for _ in range(1000):
             now[0] += 0.125  # which no sum of rounds
             stage.done += 1

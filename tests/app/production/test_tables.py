@@ -20,7 +20,7 @@ def record(unit, **more):
 def written(tmp_path):
     def write(*records, more=()):
         path = tmp_path / "units.parquet"
-        write_table(path, (row for one in records for row in rows_of(one, None, None)), more, {"SI": "rad/s"})
+        write_table(path, (row for one in records for row in rows_of(one)), more, {"SI": "rad/s"})
         return path
 
     return write
