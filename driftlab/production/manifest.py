@@ -21,7 +21,6 @@ import io
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -47,23 +46,13 @@ LONGEST = 200  # bytes of a unit's name: names of files have 255 at most
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """One unit of a manifest.
-
-    Attributes
-    ----------
-    unit, lot, date : str
-        The date in ISO 8601; lot and date are empty where they are not given.
-    recordings : dict of str to tuple of str
-        By role: `calibration`, `train`, `holdout`.
-    more : dict of str to str
-        The other columns.
-    """
+    """One unit of a manifest."""
 
     unit: str
     lot: str = ""
-    date: str = ""
-    recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    more: Mapping[str, str] = field(default_factory=dict)
+    date: str = ""  # ISO 8601
+    recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by role: calibration, train, holdout
+    more: Mapping[str, str] = field(default_factory=dict)  # the other columns
 
 
 @dataclass(frozen=True)
@@ -144,20 +133,17 @@ def _name_mistake(name: str) -> str:
 
 def _entries(text: str, name: str, folder: str) -> list[ManifestEntry]:
     """Return the units of a manifest; raises ConfigError with a line for each of its first mistakes."""
-    lines, wrong = _rows(text, name), _Mistakes(name)
+    wrong = _Mistakes(name)
     units: dict[str, list[tuple[int, dict[str, str]]]] = {}
     paths: dict[str, tuple[int, str, str]] = {}
-    for number, row in lines:
-        unit, role, path = row["unit"], row.get("role", "").lower(), row["path"]
-        if why := _name_mistake(unit):
-            wrong.add(number, f"unit '{quote(unit)}' {why}; name it otherwise")
-        if role not in ROLES:
-            wrong.add(number, f"role '{quote(role)}' is not known; write calibration (or soak), train or holdout")
+    for number, row in list(_rows(text, name, wrong)):
+        for what in _mistakes_of(row):
+            wrong.add(number, what)
+        if (role := ROLES.get(row["role"].lower())) is None:
             continue
-        if not path:
-            wrong.add(number, f"unit {quote(unit)} has no path; name its recording")
-        before = paths.setdefault(os.path.normpath(path) if not is_url(path) else path, (number, unit, ROLES[role]))
-        if before[0] != number and not (before[1] == unit and {before[2], ROLES[role]} == {"calibration", "train"}):
+        unit, path = row["unit"], row["path"]
+        before = paths.setdefault(path if is_url(path) else os.path.normpath(path), (number, unit, role))
+        if before[0] != number and not (before[1] == unit and {before[2], role} == {"calibration", "train"}):
             wrong.add(number, f"path {quote(path, 200)} is in line {before[0]} already; name each recording once")
         units.setdefault(unit, []).append((number, row))
     entries = [_entry(unit, rows, folder, wrong) for unit, rows in units.items()]
@@ -167,8 +153,8 @@ def _entries(text: str, name: str, folder: str) -> list[ManifestEntry]:
     return entries
 
 
-def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
-    """Return each row with the number of its line; empty ones are left out."""
+def _rows(text: str, name: str, wrong: _Mistakes) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield each row with the number of its line; empty ones, and those of another number of cells, are left out."""
     head = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count))
     header = [column.strip() for column in next(reader, [])]
@@ -180,7 +166,7 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     twice = sorted({column for column in names if names.count(column) > 1})
     if twice:
         raise ConfigError(f"--units {name}: column '{quote(twice[0])}' is there twice; name each once")
-    rows, wrong, held = list[tuple[int, dict[str, str]]](), _Mistakes(name), 0
+    rows = 0
     try:
         for cells in reader:
             if not any(cell.strip() for cell in cells):
@@ -188,16 +174,34 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
             if len(cells) != len(names):
                 wrong.add(reader.line_num, f"has {len(cells)} cells, the header {len(names)}; write as many")
                 continue
-            held += len(cells)
-            if len(rows) == COUNT or held > CELLS:
+            rows += 1
+            if rows > COUNT or rows * len(names) > CELLS:
                 raise ConfigError(
                     f"--units {name}: has more than {COUNT:,} recordings, or {CELLS:,} cells; make several fleets of it"
                 )
-            rows.append((reader.line_num, {n: cell.strip() for n, cell in zip(names, cells, strict=True) if n}))
+            row = {n: cell.strip() for n, cell in zip(names, cells, strict=True) if n}
+            yield reader.line_num, dict.fromkeys(COLUMNS, "") | row
     except csv.Error as error:
         raise ConfigError(f"--units {name}: line {reader.line_num} is no CSV ({error}); write it as UTF-8") from None
-    wrong.raise_any()
-    return rows
+
+
+def _mistakes_of(row: Mapping[str, str]) -> Iterator[str]:
+    """Yield the mistakes of a row that show in it alone."""
+    unit, role, date = row["unit"], row["role"].lower(), row["date"]
+    if why := _name_mistake(unit):
+        yield f"unit '{quote(unit)}' {why}; name it otherwise"
+    if role not in ROLES:
+        yield f"role '{quote(role)}' is not known; write calibration (or soak), train or holdout"
+        return
+    if not row["path"]:
+        yield f"unit {quote(unit)} has no path; name its recording"
+    for column, text in row.items():
+        if not (is_plain(column) and is_plain(text) and len(text) <= TEXT):
+            yield f"column {quote(column)} has '{quote(text)}', which is no text of one line; mend it"
+    try:
+        datetime.fromisoformat(date or "2026-01-31")
+    except ValueError:
+        yield f"date '{quote(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05"
 
 
 def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, wrong: _Mistakes) -> ManifestEntry:
@@ -206,18 +210,12 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, w
     lots: dict[str, int] = {}
     dates: dict[str, str] = {}
     for number, row in rows:
-        role = ROLES[row.get("role", "").lower()]
+        role = ROLES[row["role"].lower()]
         recordings.setdefault(role, []).append(_placed(folder, row["path"]))
-        for column in (name for name in row if not (is_plain(name) and is_plain(row[name]) and len(row[name]) <= TEXT)):
-            wrong.add(
-                number, f"column {quote(column)} has '{quote(row[column])}', which is no text of one line; mend it"
-            )
-        if lot := row.get("lot", ""):
-            lots.setdefault(lot, number)
-        if date := row.get("date", ""):
-            if not _is_date(date):
-                wrong.add(number, f"date '{quote(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05")
-            dates.setdefault(role, date)
+        if row["lot"]:
+            lots.setdefault(row["lot"], number)
+        if row["date"]:
+            dates.setdefault(role, row["date"])
         for column, value in row.items():
             if column not in COLUMNS and value:
                 more.setdefault(column, {})[value] = None
@@ -226,23 +224,14 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, w
         wrong.add(number, f"unit {quote(unit)} is of lot {quote(other)} here and of {quote(one)} before; name one")
     if "calibration" not in recordings:
         wrong.add(rows[0][0], f"unit {quote(unit)} has no recording to fit on; give it one of the role calibration")
-    return ManifestEntry(
-        unit,
-        next(iter(lots), ""),
-        dates.get("calibration", next(iter(dates.values()), "")),
-        {role: tuple(paths) for role, paths in recordings.items()},
-        {column: ", ".join(values) for column, values in more.items()},
-    )
-
-
-def _is_date(text: str) -> bool:
-    with suppress(ValueError):
-        return bool(datetime.fromisoformat(text))
-    return False
+    date = dates.get("calibration", next(iter(dates.values()), ""))
+    others = {column: ", ".join(values) for column, values in more.items()}
+    of_roles = {role: tuple(paths) for role, paths in recordings.items()}
+    return ManifestEntry(unit, next(iter(lots), ""), date, of_roles, others)
 
 
 class _Mistakes:
-    """The mistakes of a manifest, line by line."""
+    """The mistakes of a manifest: how many there are, and the first with their lines."""
 
     def __init__(self, name: str) -> None:
         self.name, self.found, self.count = name, list[tuple[int, str]](), 0
@@ -252,16 +241,12 @@ class _Mistakes:
         if len(self.found) < LISTED:
             self.found.append((line, what))
 
-    def lines(self) -> Iterator[str]:
-        for line, what in sorted(self.found)[:5]:
-            yield f"--units {self.name}: line {line}: {what}"
-        if self.count > 5:
-            yield f"and {self.count - 5} more of the kind"
-
     def raise_any(self) -> None:
         """Raise ConfigError if there was any."""
         if self.found:
-            raise ConfigError("\n".join(self.lines()))
+            lines = [f"--units {self.name}: line {line}: {what}" for line, what in sorted(self.found)[:5]]
+            lines += [f"and {self.count - 5} more of the kind"] if self.count > 5 else []
+            raise ConfigError("\n".join(lines))
 
 
 MANIFEST = PIECE // 2  # bytes of a manifest: more than a million units

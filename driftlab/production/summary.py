@@ -22,24 +22,13 @@ from fusion_core.escaping import line
 
 @dataclass
 class Stage:
-    """One stage of a fleet, as it goes on.
-
-    Attributes
-    ----------
-    name : str
-    total : int
-        Units that it takes; 0 where that is not counted.
-    done, failed : int
-        So far.
-    begun : float
-        `time.monotonic`, s.
-    """
+    """One stage of a fleet, as it goes on."""
 
     name: str
-    total: int = 0
-    done: int = 0
+    total: int = 0  # units that it takes; 0 where that is not counted
+    done: int = 0  # so far
     failed: int = 0
-    begun: float = field(default_factory=time.monotonic)
+    begun: float = field(default_factory=time.monotonic)  # s
 
     def left(self) -> float | None:
         """Return the seconds until the end, if it goes on like that; None as long as that is not known."""

@@ -47,34 +47,19 @@ Recordings = Mapping[str, Sequence[str]]  # by role
 class Task:
     """The work on one unit.
 
-    Attributes
-    ----------
-    unit, lot, date : str
-        As the manifest has them.
-    more : mapping of str to str
-        Its other columns.
-    recordings : mapping of str to tuple of str
-        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`, or a URL in place
-        of the path.
-    config : str
-        The whole config, as YAML.
-    folder : str
-        The folder that relative paths are relative to.
-    explain : bool
-        Whether the loop is closed, where there are recordings for it.
-    page : bool
-        Whether the pages of run and map are written.
+    `recordings` has by role (`calibration`, `train`, `test`, `holdout`) `PATH` or `PATH::START:STOP`, or a URL in place
+    of the path; lot, date and `more`, the other columns, are as the manifest has them.
     """
 
     unit: str
     recordings: Mapping[str, tuple[str, ...]]
-    config: str
+    config: str  # the whole, as YAML
     lot: str = ""
     date: str = ""
     more: Mapping[str, str] = field(default_factory=dict)
-    folder: str = "."
-    explain: bool = False
-    page: bool = False
+    folder: str = "."  # that relative paths are relative to
+    explain: bool = False  # whether the loop is closed, where there are recordings for it
+    page: bool = False  # whether the pages of run and map are written
 
     @property
     def names(self) -> list[str]:

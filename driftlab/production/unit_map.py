@@ -57,22 +57,11 @@ IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map wait
 
 @dataclass(frozen=True, eq=False)
 class UnitMap:
-    """The map of a unit.
+    """The map of a unit."""
 
-    Attributes
-    ----------
-    config : Config
-        With the map in memory, where its filter can use it.
-    settings : ThermalMap
-        Of its fit.
-    soak : GatheredSoak
-        The samples.
-    verdict : MapVerdict
-    """
-
-    config: Config
-    settings: ThermalMap
-    soak: GatheredSoak
+    config: Config  # with the map in memory, where its filter can use it
+    settings: ThermalMap  # of its fit
+    soak: GatheredSoak  # the samples
     verdict: MapVerdict
 
     @property
@@ -141,29 +130,14 @@ def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config
 
 @dataclass(frozen=True, eq=False)
 class CoastResult:
-    """A run, and its coast.
+    """A run, and its coast."""
 
-    Attributes
-    ----------
-    name : str
-        Of the recording.
-    in_sample : bool
-        Whether the map was fitted on it.
-    figures : mapping of str to Figure
-        The coasts.
-    limits : list of dict
-        Those of the config, checked against run and map.
-    notes : list of str
-    result : RunResult or None
-        None where the config has no filter.
-    """
-
-    name: str
-    in_sample: bool
-    figures: dict[str, Figure]
-    limits: list[dict[str, Any]]
+    name: str  # of the recording
+    in_sample: bool  # whether the map was fitted on it
+    figures: dict[str, Figure]  # the coasts
+    limits: list[dict[str, Any]]  # those of the config, checked against run and map
     notes: list[str]
-    result: RunResult | None
+    result: RunResult | None  # None where the config has no filter
 
 
 def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> CoastResult:

@@ -38,26 +38,13 @@ MISSING = 10_000  # units without their recordings, over as many as have theirs
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options of `driftlab fleet`, by their names.
+    """Options of `driftlab fleet`, by their names."""
 
-    Attributes
-    ----------
-    workers : int or None
-        Processes; as many as there are processors.
-    scheduler : str or None
-        Address of a Dask scheduler, in place of processes.
-    explain, force : bool
-    pages : collection of str
-        Patterns of the units whose pages are wanted; `all`.
-    family : Path or None
-        A family that is known already.
-    """
-
-    workers: int | None = None
-    scheduler: str | None = None
+    workers: int | None = None  # processes; None: as many as there are processors
+    scheduler: str | None = None  # address of one of Dask, in place of processes
     explain: bool = False
-    pages: Collection[str] = ()
-    family: Path | None = None
+    pages: Collection[str] = ()  # patterns of the units whose pages are wanted; `all`
+    family: Path | None = None  # one that is known already
     force: bool = False
 
     def crew(self) -> Workers:
@@ -80,27 +67,17 @@ class FleetOptions:
 
 @dataclass
 class UnitJobs:
-    """The work on the units of a manifest, in a fleet's folder.
-
-    Attributes
-    ----------
-    config, versions : str
-        YAML of the whole config; versions of driftlab and its plugins.
-    done : int
-        Units that were done by this command.
-    again, without_recordings : list of str
-        Units of these that were replaced, and units that were left as they are without their recordings.
-    """
+    """The work on the units of a manifest, in a fleet's folder."""
 
     manifest: Manifest
     folder: FleetFolder
-    config: str
-    versions: str
+    config: str  # the whole, as YAML
+    versions: str  # of driftlab and its plugins
     options: FleetOptions
     progress: FleetProgress
-    done: int = 0
-    again: list[str] = field(default_factory=list)
-    without_recordings: list[str] = field(default_factory=list)
+    done: int = 0  # units that were done by this command
+    again: list[str] = field(default_factory=list)  # units of these that were replaced
+    without_recordings: list[str] = field(default_factory=list)  # units that were left as they are
 
     def do(self) -> None:
         """Do every unit that is not done, and put it into the folder."""
@@ -274,18 +251,10 @@ def _looks(folder: str, name: str) -> Iterator[tuple[int | str, ...] | None]:
 
 @dataclass(frozen=True)
 class FleetStatus:
-    """The units of a manifest as they are in the folder.
+    """The units of a manifest as they are in the folder."""
 
-    Attributes
-    ----------
-    records : sequence of UnitRecord
-        In the order of the manifest.
-    key : str
-        Hash of all that the family stands on: the keys of the units, their lots and dates.
-    """
-
-    records: Sequence[UnitRecord] = ()
-    key: str = ""
+    records: Sequence[UnitRecord] = ()  # in the order of the manifest
+    key: str = ""  # hash of all that the family stands on: the keys of the units, their lots and dates
 
     @cached_property
     def done(self) -> list[UnitRecord]:

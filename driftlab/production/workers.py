@@ -7,7 +7,6 @@ process that has begun it, however that ends.
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import multiprocessing
 import os
@@ -176,6 +175,8 @@ def _limit_threads() -> None:
 
 def _end_with_parent() -> None:
     """Have the system end this process when the one ends that has begun it, whatever this one is doing then."""
+    import fcntl
+
     parent = multiprocessing.parent_process()
     assert parent is not None, "this is a worker"
     held = parent.sentinel  # of a pipe whose other end the parent alone has

@@ -29,31 +29,15 @@ SEPARATORS = (",", ";", "\t")
 
 @dataclass(frozen=True)
 class FileColumns:
-    """The columns of a file, by a source.
+    """The columns of a file, by a source."""
 
-    Attributes
-    ----------
-    kind, noun : str
-        Of the source, and its word for a column.
-    settings : mapping
-        Of the source, for this file.
-    names : list of str
-        Every column.
-    values : mapping of str to (N,) or (N, d) array
-        The first rows of those that are numbers.
-    units : mapping of str to str
-        As the file gives them.
-    more : bool
-        Whether the file has more rows than were looked at.
-    """
-
-    kind: str
-    noun: str
-    settings: dict[str, Any]
-    names: list[str]
-    values: dict[str, Array]
-    units: dict[str, str]
-    more: bool
+    kind: str  # of the source
+    noun: str  # its word for a column
+    settings: dict[str, Any]  # of the source, for this file
+    names: list[str]  # every column
+    values: dict[str, Array]  # the first rows, (N,) or (N, d), of those that are numbers
+    units: dict[str, str]  # as the file gives them
+    more: bool  # whether the file has more rows than were looked at
 
 
 @dataclass(frozen=True)

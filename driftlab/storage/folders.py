@@ -19,7 +19,6 @@ leaves no lock, only the file, which the next one takes. On a file system withou
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -403,6 +402,8 @@ class Lock:
             raise ConfigError(f"{what}: {path} is in the way, and not of driftlab; move it, or name another")
 
     def _locked(self) -> int:
+        import fcntl
+
         number = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
