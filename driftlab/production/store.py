@@ -28,6 +28,7 @@ from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
 from driftlab.storage.ownership import (
     OWN,
+    check_folder,
     digest,
     document,
     foreign,
@@ -95,11 +96,7 @@ class FleetFolder:
                 "folder"
             )
         changed = foreign(self.path, MARK, {MARK, *({*OF_ALL} & names)}) if self.mark else []
-        if changed and (self.mark.get("complete") or MARK in changed):
-            raise ConfigError(
-                f"--out {self.out}: holds {', '.join(changed)}, which driftlab did not write, or not so; move it away, "
-                "or name another folder"
-            )
+        check_folder(f"--out {self.out}", changed if self.mark.get("complete") or MARK in changed else [])
 
     def unit(self, name: str) -> Path:
         """Return the folder of a unit."""

@@ -26,13 +26,13 @@ import socket
 import stat
 import sys
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
 
 from driftlab.storage.hdf5 import reading, reason, sync
-from driftlab.storage.ownership import foreign, is_as, sign, written
+from driftlab.storage.ownership import check_folder, foreign, is_as, sign, written
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -40,31 +40,15 @@ FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}  # not 
 
 
 class Folder:
-    """A folder of results and its `.partial`, held for one command.
-
-    Parameters
-    ----------
-    out : Path
-        As it was named; a link leads to the folder that is meant.
-    command : str
-        One of FILES.
-    read : collection of Path
-        Files that are needed and must not be inside.
-    resume : bool
-        Whether what an earlier run left in `.partial` stays there.
-    force : bool
-        Whether results may be replaced that cannot be computed again, or were edited.
-    recording : Path or None
-        The recording that a live run goes on with: results that stand on it may be replaced.
-    """
+    """A folder of results and its `.partial`, held for one command; the arguments are those of `output_folder`."""
 
     def __init__(
         self, out: Path, command: str, read: Collection[Path], *, resume: bool, force: bool, recording: Path | None
     ) -> None:
-        self.out, self.command = out, command
+        self.out, self.subject, self.command = out, f"--out {out}", command
         self.force, self.recording = force, recording if resume else None
         self.folder = Path(os.path.realpath(out))
-        with refusals(f"--out {out}", "name a folder that can be"):
+        with refusals(self.subject, "name a folder that can be"):
             self.inside = self.folder.is_dir() and cannot_be_renamed(self.folder)
             home = self.folder if self.inside else self.folder.parent
             self.partial = home / f"{self.folder.name or 'results'}.partial"
@@ -85,7 +69,7 @@ class Folder:
 
     def unwritable(self, error: OSError) -> Unwritable:
         """Return the error of a step on the way that the system refused."""
-        subject = f"--out {self.out}"
+        subject = self.subject
         if isinstance(error.filename, str | bytes):
             name = Path(os.fsdecode(error.filename))
             if not any(Path(os.path.realpath(name)).is_relative_to(place) for place in (self.folder, self.partial)):
@@ -100,7 +84,7 @@ class Folder:
                 not self.inside or (real.parent == self.folder and matches(real.name, FILES[self.command]))
             )
             if replaced or real.is_relative_to(self.partial):
-                raise ConfigError(f"--out {self.out}: holds {path}, which is used here; name another folder")
+                raise ConfigError(f"{self.subject}: holds {path}, which is used here; name another folder")
 
     def check_target(self) -> None:
         """Raise ConfigError where the folder must not be replaced."""
@@ -110,25 +94,18 @@ class Folder:
         first, second = FILES[self.command][:2]
         if names and not any(fnmatch(name, second) for name in written(self.folder / first)):
             raise ConfigError(
-                f"--out {self.out}: exists and is not the output of an earlier {self.command}, or of a version that "
-                "kept no SHA-256 of its files; move it away, or name another folder"
+                f"{self.subject}: exists and is not the output of an earlier {self.command}, or of a version that kept "
+                "no SHA-256 of its files; move it away, or name another folder"
             )
         names -= {LOCK, BEFORE}
         others = sorted(name for name in names if not matches(name, FILES[self.command]))
         if others:
             raise ConfigError(
-                f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
-                "name another folder"
+                f"{self.subject}: holds {', '.join(others[:5])} of another command, which would be lost; name another "
+                "folder"
             )
-        self._check_own([] if self.force else foreign(self.folder, first, names))
+        check_folder(self.subject, [] if self.force else foreign(self.folder, first, names))
         self._check_can_be_computed_again(self.folder)
-
-    def _check_own(self, others: list[str]) -> None:
-        if others:
-            raise ConfigError(
-                f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
-                "away, or name another folder"
-            )
 
     def _names(self) -> list[str]:
         names = [name for name in os.listdir(self.folder) if name != self.partial.name]
@@ -140,7 +117,7 @@ class Folder:
         if why is not None:
             live = "go on with --resume and the same --record, or " if folder == self.partial else ""
             force = ", or give --force to replace it" if self.command == "run" else ""
-            raise ConfigError(f"--out {self.out}: {folder.name} {why}; {live}name another folder{force}")
+            raise ConfigError(f"{self.subject}: {folder.name} {why}; {live}name another folder{force}")
 
     def _check_rights(self, home: Path) -> None:
         """Raise OSError where the rename at the end would fail."""
@@ -162,7 +139,7 @@ class Folder:
         others = sorted(name for name in names if not matches(name, known))
         if (names and LOCK not in names) or others:
             raise self._foreign(others or names)
-        lock = Lock(self.partial / LOCK, f"--out {self.out}")
+        lock = Lock(self.partial / LOCK, self.subject)
         try:
             if not (resume and "checkpoint.npz" in names):
                 self._check_can_be_computed_again(self.partial)
@@ -177,7 +154,7 @@ class Folder:
 
     def _foreign(self, names: list[str]) -> ConfigError:
         return ConfigError(
-            f"--out {self.out}: {self.shown} exists, and driftlab did not write {', '.join(sorted(names)[:5])} there; "
+            f"{self.subject}: {self.shown} exists, and driftlab did not write {', '.join(sorted(names)[:5])} there; "
             "move it away, or name another folder"
         )
 
@@ -218,9 +195,8 @@ class Folder:
         old, new = written(before), written(self.partial / first)
         there = [name for name in {*old, *new} if os.path.lexists(self.folder / name)]
         there = [name for name in there if not is_as(self.folder / name, new.get(name, ""))]
-        self._check_own(
-            [] if self.force else [n for n in there if n == first or not is_as(self.folder / n, old.get(n, ""))]
-        )
+        others = [name for name in there if name == first or not is_as(self.folder / name, old.get(name, ""))]
+        check_folder(self.subject, [] if self.force else others)
         for name in there:
             remove(self.folder / name)
         for name in sorted(set(os.listdir(self.partial)) - {LOCK, BEFORE}, key=first.__eq__):
@@ -228,7 +204,7 @@ class Folder:
 
     def _finish_moving(self) -> None:
         """Do the rest where a command was killed while it moved its files in."""
-        lock = Lock(self.partial / LOCK, f"--out {self.out}")
+        lock = Lock(self.partial / LOCK, self.subject)
         try:
             if written(self.partial / FILES[self.command][0]):
                 self._move_in()
@@ -280,8 +256,24 @@ def output_folder(
 ) -> Iterator[Path]:
     """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
 
-    The arguments are those of `Folder`; with `durable` the files reach the disk before they get their names. When the
-    run dies, what was written stays in `OUT.partial`.
+    When the run dies, what was written stays in `OUT.partial`.
+
+    Parameters
+    ----------
+    out : Path
+        As it was named; a link leads to the folder that is meant.
+    command : str
+        One of FILES.
+    read : collection of Path
+        Files that are needed and must not be inside.
+    resume : bool
+        Whether what an earlier run left in `.partial` stays there.
+    force : bool
+        Whether results may be replaced that cannot be computed again, or were edited.
+    recording : Path or None
+        The recording that a live run goes on with: results that stand on it may be replaced.
+    durable : bool
+        Whether the files reach the disk before they get their names.
 
     Raises
     ------
@@ -389,37 +381,28 @@ class Lock:
     """
 
     def __init__(self, path: Path, what: str) -> None:
-        self.path, self.what = path, what
+        import fcntl
+
+        self.path = path
         self.left_over = path.exists()  # by a process that was killed, if this one gets the lock
         while True:
-            self._number = self._locked()
-            if self._is_the_file():
-                break
+            self._number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            try:
+                fcntl.flock(self._number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = _holder(os.pread(self._number, 4096, 0))
+                os.close(self._number)
+                raise ConfigError(f"{what}: is being written by {holder}; wait for its end, or name another") from None
+            except OSError:  # of a file system that knows no locks
+                pass
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.stat(path), os.fstat(self._number)):
+                    break
             os.close(self._number)  # the owner before has removed it meanwhile
         mark = os.pread(self._number, 4096, 0)
         if mark and b'"program": "driftlab"' not in mark:
             os.close(self._number)
             raise ConfigError(f"{what}: {path} is in the way, and not of driftlab; move it, or name another")
-
-    def _locked(self) -> int:
-        import fcntl
-
-        number = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = _holder(os.read(number, 4096))
-            os.close(number)
-            raise ConfigError(f"{self.what}: is being written by {holder}; wait for its end, or name another") from None
-        except OSError:  # of a file system that knows no locks
-            pass
-        return number
-
-    def _is_the_file(self) -> bool:
-        try:
-            return os.path.samestat(os.stat(self.path), os.fstat(self._number))
-        except FileNotFoundError:
-            return False
 
     def sign(self) -> None:
         """Write the lock's owner into the file; raises OSError."""

@@ -122,6 +122,15 @@ def with_own(text: str) -> str:
     return before + hashlib.sha256(text.encode()).hexdigest() + after
 
 
+def check_folder(subject: str, others: list[str]) -> None:
+    """Raise ConfigError where a folder that is to be replaced holds files that driftlab did not write as they are."""
+    if others:
+        raise ConfigError(
+            f"{subject}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it away, or name "
+            "another folder"
+        )
+
+
 def written(path: Path) -> dict[str, str]:
     """Return the SHA-256 of files by their names, as the first file of a folder has them; nothing where it has none."""
     known = document(path).get("written")
