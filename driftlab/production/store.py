@@ -23,22 +23,11 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
+from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
-from driftlab.storage.ownership import (
-    OWN,
-    check_folder,
-    digest,
-    document,
-    foreign,
-    free,
-    is_as,
-    signed,
-    why_not_own,
-    with_own,
-    written,
-)
+from driftlab.storage.ownership import OWN, check_folder, foreign, free, is_as
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -56,7 +45,7 @@ class FleetFolder:
     ----------
     path : Path
     mark : dict
-        The content of `fleet.json` as it was found.
+        The content of `fleet.json`.
     stamps : dict of str to (str, str)
         Key and stamp of the units that were done here, by name.
     """
@@ -84,7 +73,7 @@ class FleetFolder:
     def _read_mark(self) -> None:
         """Read the mark; raises ConfigError where the folder is no fleet's, or is complete and was edited since."""
         names = set(os.listdir(self.path)) if self.path.exists() else set()
-        self.mark, self.written = mark_of(self.path), written(self.path / MARK)
+        self.mark, self.written = mark_of(self.path), ownership.written(self.path / MARK)
         if not self.mark and names - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(
                 f"--out {self.out}: exists and is not the output of an earlier fleet; move it away, or name another "
@@ -142,8 +131,6 @@ class FleetFolder:
 
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already; one that was edited is put aside."""
-        if foreign(self.unit(record.unit), RECORD, [RECORD]):
-            os.rename(self.unit(record.unit) / RECORD, free(self.unit(record.unit) / RECORD))
         self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
         self._records[record.unit] = record
 
@@ -154,16 +141,21 @@ class FleetFolder:
         self._journal.flush()
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file that is there whole or not at all; `name` is relative to the fleet's folder."""
+        """Write a file that is there whole or not at all; one that says its own SHA-256, and was edited, is put aside.
+
+        `name` is relative to the fleet's folder.
+        """
         path = self.path / name
         new = path.with_name(f".{path.name}{NEW}")
         new.write_bytes(content)
+        if path.name in (MARK, RECORD) and os.path.lexists(path) and foreign(path.parent, path.name, [path.name]):
+            os.rename(path, free(path))
         os.replace(new, path)
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Write `fleet.json` and return its content: it knows itself and the files of all units."""
-        self.write(MARK, signed(plain(dict(content)), MARK, self.written).encode())
-        self.mark = {**content, "written": document(self.path / MARK)["written"]}
+        self.write(MARK, ownership.signed(plain(dict(content)), MARK, self.written).encode())
+        self.mark = {**content, "written": ownership.document(self.path / MARK)["written"]}
         return self.mark
 
     def hidden(self, name: str) -> Path:
@@ -180,7 +172,7 @@ class FleetFolder:
                 remove(path)
             elif os.path.lexists(path):
                 os.rename(path, free(path))
-        self.written = {name: digest(self.hidden(name)) for name in names}
+        self.written = {name: ownership.digest(self.hidden(name)) for name in names}
         self.write_mark(self.mark)
         for name in names:
             os.replace(self.hidden(name), self.path / name)
@@ -216,7 +208,7 @@ class FleetFolder:
 
 def _content(record: UnitRecord) -> bytes:
     record = record.model_copy(update={"written": {**record.written, RECORD: OWN}})
-    return with_own(record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
+    return ownership.with_own(record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
 
 
 def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
@@ -231,7 +223,9 @@ def _take_along(old: Path, place: Path) -> None:
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
             names = [f"{inside}/{name}" if inside else name for name in os.listdir(folder)]
-            others = [n for n in foreign(old, RECORD, names) if n != FAMILY_MAP or why_not_own(old / n, COMMAND)]
+            others = [
+                n for n in foreign(old, RECORD, names) if n != FAMILY_MAP or ownership.why_not_own(old / n, COMMAND)
+            ]
             for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
                 if name in others:
                     os.rename(old / name, free(place / name.replace("/", "-")))
@@ -279,11 +273,6 @@ def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder
         ) from error
     finally:
         held.close()
-
-
-def as_json(content: Mapping[str, Any]) -> bytes:
-    """Return the content of a JSON file."""
-    return (json.dumps(plain(dict(content)), indent=1, allow_nan=False) + "\n").encode()
 
 
 MARK = "fleet.json"  # mark of a fleet's folder
@@ -362,7 +351,7 @@ def soaked_of(folder: Path) -> UnitInformation:
 
 def mark_of(folder: Path) -> dict[str, Any]:
     """Return the content of `fleet.json`; empty where there is none that can be read."""
-    mark = document(folder / MARK)
+    mark = ownership.document(folder / MARK)
     return mark if "schema" in mark else {}
 
 

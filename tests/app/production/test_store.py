@@ -184,3 +184,12 @@ def test_a_fleet_of_a_version_without_digests_says_so(tmp_path):
     message = "is of a version that kept no SHA-256 of its files; move it away, or name another folder"
     with pytest.raises(ConfigError, match=message), fleet_folder(tmp_path):
         pass
+
+
+def test_a_mark_that_is_edited_while_the_fleet_goes_on_is_put_aside(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        (folder.path / "fleet.json").write_text("mine")
+        complete(folder, b"a")
+    assert (tmp_path / "fleet" / "fleet.json.before-1").read_text() == "mine"
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert folder.mark["complete"]
