@@ -200,5 +200,4 @@ class _Command:
             config=jobs.config,
             **more,
         )
-        content = summary.content()
-        return folder.write_mark(content)
+        return folder.write_mark(summary.content())

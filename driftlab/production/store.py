@@ -73,7 +73,8 @@ class FleetFolder:
     def _read_mark(self) -> None:
         """Read the mark; raises ConfigError where the folder is no fleet's, or is complete and was edited since."""
         names = set(os.listdir(self.path)) if self.path.exists() else set()
-        self.mark, self.written = mark_of(self.path), ownership.written(self.path / MARK)
+        mark = ownership.document(self.path / MARK)
+        self.mark, self.written = mark if "schema" in mark else {}, ownership.written(self.path / MARK)
         if not self.mark and names - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(
                 f"--out {self.out}: exists and is not the output of an earlier fleet; move it away, or name another "
@@ -292,42 +293,34 @@ class UnitRef:
 
     def read(self) -> tuple[UnitInformation, str]:
         """Return the information of its soaks, and its lot; raises UnreadableFile."""
-        return soaked_of(self.folder / UNITS / self.unit), self.lot
+        path = self.folder / UNITS / self.unit / "unit.npz"
+        try:
+            return UnitInformation.from_bytes(read_whole(path, PIECE)), self.lot
+        except Exception:  # of a damaged archive nearly any
+            raise UnreadableFile(
+                f"{path}: is missing or damaged; remove the folder and give the same command again"
+            ) from None
 
 
 class UnitStore:
-    """The units of a fleet's folder that were soaked, in the order of their names; may be gone through again and again.
+    """Units of a fleet's `folder` that were soaked, by names and lots; may be gone through again and again.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the fleet.
-    units : sequence of (str, str), optional
-        Names and lots of those that count, in their order; all that are done and did not leave the manifest where it is
-        left out.
-
-    Raises
-    ------
-    UnreadableFile
-        If the folder is no fleet; while one goes through it, if a file is damaged.
+    Raises UnreadableFile while one goes through it, if a file is damaged.
     """
 
-    def __init__(self, folder: Path, units: Sequence[tuple[str, str]] | None = None) -> None:
-        self.folder = folder
-        self.units = list(_units_of(folder) if units is None else units)
+    def __init__(self, folder: Path, units: Sequence[tuple[str, str]]) -> None:
+        self.folder, self.units = folder, units
 
     def __len__(self) -> int:
         return len(self.units)
 
     def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
         """Yield the information of each unit's soaks, and its lot."""
-        for place in self.places():
-            yield place.read()
+        return (place.read() for place in self.places())
 
     def places(self) -> Iterator[UnitRef]:
         """Yield the place of each unit."""
-        for name, lot in self.units:
-            yield UnitRef(self.folder, name, lot)
+        return (UnitRef(self.folder, name, lot) for name, lot in self.units)
 
 
 def record_of(folder: Path) -> UnitRecord | None:
@@ -336,34 +329,3 @@ def record_of(folder: Path) -> UnitRecord | None:
         return UnitRecord.model_validate_json(read_whole(folder / RECORD))
     except (OSError, ValidationError):
         return None
-
-
-def soaked_of(folder: Path) -> UnitInformation:
-    """Return the information of a unit's soaks, from its folder; raises UnreadableFile."""
-    path = folder / "unit.npz"
-    try:
-        return UnitInformation.from_bytes(read_whole(path, PIECE))
-    except Exception:  # of a damaged archive nearly any
-        raise UnreadableFile(
-            f"{path}: is missing or damaged; remove the folder and give the same command again"
-        ) from None
-
-
-def mark_of(folder: Path) -> dict[str, Any]:
-    """Return the content of `fleet.json`; empty where there is none that can be read."""
-    mark = ownership.document(folder / MARK)
-    return mark if "schema" in mark else {}
-
-
-def _units_of(folder: Path) -> Iterator[tuple[str, str]]:
-    mark = mark_of(folder)
-    if not mark:
-        raise UnreadableFile(
-            f"{folder}: is no fleet, it has no {MARK} that can be read; name the --out of driftlab fleet"
-        )
-    gone = set(mark.get("left", ()))
-    for path in sorted((folder / UNITS).iterdir()):
-        if path.name[0] != "." and path.name not in gone:
-            record = record_of(path)
-            if record is not None and record.state == "done":
-                yield record.unit, record.lot

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from driftlab.family.unit_information import UnitInformation
     from driftlab.production.unit_map import CoastResult, UnitMap
 
-CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
+CALIBRATION, TRAIN, HOLDOUT = "calibration", "train", "holdout"  # roles
 MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
 Recordings = Mapping[str, Sequence[str]]  # by role
 
@@ -47,8 +47,8 @@ Recordings = Mapping[str, Sequence[str]]  # by role
 class Task:
     """The work on one unit.
 
-    `recordings` has by role (`calibration`, `train`, `test`, `holdout`) `PATH` or `PATH::START:STOP`, or a URL in place
-    of the path; lot, date and `more`, the other columns, are as the manifest has them.
+    `recordings` has by role (`calibration`, `train`, `holdout`) `PATH` or `PATH::START:STOP`, or a URL in place of the
+    path; lot, date and `more`, the other columns, are as the manifest has them.
     """
 
     unit: str
@@ -165,13 +165,12 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     """Return the rest of the record of a unit that was done, and its files."""
     config, faults = config_of(task.config, task.folder), Faults()
     soaks = recordings.get(CALIBRATION, ())
-    tests = [name for role in TESTS for name in recordings.get(role, ())]
     if not soaks:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
     unit = fit_unit_map(config, soaks, faults)
     fitted, rows = unit.fitted, unit.soak.rows(unit.fitted.record.channel)
     soaked, densities = soaked_of(task.unit, unit.axes, rows)
-    run = coasted(unit, tests, soaks, soaked.walk)
+    run = coasted(unit, recordings.get(HOLDOUT, ()), soaks, soaked.walk)
     files = {"unit.npz": soaked.to_bytes(), unit.file: unit.content()}
     good = unit.verdict.good
     record: dict[str, Any] = {
@@ -197,7 +196,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if task.page:
         files |= pages_of(unit, run, soaks, faults.lines(), files[unit.file])
     if task.explain:
-        record["loop"] = loop_of(config, {**recordings, "holdout": tests}, files)
+        record["loop"] = loop_of(config, recordings, files)
     return record, files
 
 
@@ -234,11 +233,10 @@ def loop_of(config: Config, recordings: Recordings, files: dict[str, bytes]) -> 
 
     Return its verdict and effects as `loop.json` has them, or why there are none.
     """
-    roles = {role: recordings.get(role, ()) for role in (CALIBRATION, TRAIN, "holdout")}
-    if not roles[TRAIN] or not roles["holdout"]:
+    if not recordings.get(TRAIN) or not recordings.get(HOLDOUT):
         return {"why_not": MISSING}
     try:
-        result = explain(config, roles[CALIBRATION], roles[TRAIN], roles["holdout"])
+        result = explain(config, recordings[CALIBRATION], recordings[TRAIN], recordings[HOLDOUT])
     except FusionError as error:
         return {"why_not": _message(error, recordings)}
     files.update({f"explained/{name}": content for name, content in result.files.items()})

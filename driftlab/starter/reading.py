@@ -70,12 +70,8 @@ def _file_sources() -> dict[str, type[FileSource]]:
 
 def columns_of(path: Path, cls: type[FileSource]) -> FileColumns:
     """Read the first rows of every column; raises DataError where the source cannot."""
-    settings: list[dict[str, Any]] = [{}]
-    if "separator" in cls.model_fields:
-        settings = [{"separator": separator} for separator in SEPARATORS]
-    found: list[FileColumns] = []
-    errors: list[FusionError] = []
-    for given in settings:
+    found, errors = list[FileColumns](), list[FusionError]()
+    for given in [{"separator": text} for text in SEPARATORS] if "separator" in cls.model_fields else [{}]:
         try:
             found.append(_read(path, cls, given))
         except DataError as error:

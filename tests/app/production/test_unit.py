@@ -89,7 +89,7 @@ def test_the_map_is_that_of_fit_map_to_the_byte(folder, tmp_path) -> None:
     assert json.dumps(own) == json.dumps(other)
 
 
-@pytest.mark.parametrize("role", ["calibration", "test", "holdout"])
+@pytest.mark.parametrize("role", ["calibration", "holdout"])
 def test_the_coast_is_that_of_a_run_with_the_map(folder, tmp_path, role) -> None:
     roles = {"calibration": "soak.h5"} | ({} if role == "calibration" else {role: "again.h5"})
     name = "soak.h5" if role == "calibration" else "again.h5"
