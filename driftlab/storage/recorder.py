@@ -73,9 +73,9 @@ class Recorder:
         self.started: float | None = None  # time zero in s since 1970
         self._shift: float | None = None
         self.kept: Path | None = None  # an unreadable file, under its new name
-        there = self.path.exists()
+        self._replaced = there = self.path.exists()
         if there and not resume and not force:
-            raise ConfigError(f"--record {path}: is there already; name another file, or go on with it with --resume")
+            raise self._in_the_way()
         if there and not self.path.is_file():
             raise ConfigError(f"--record {path}: is no file; name another")
         if not self.path.parent.is_dir():
@@ -91,6 +91,11 @@ class Recorder:
         except BaseException:
             self.lock.release()
             raise
+
+    def _in_the_way(self) -> ConfigError:
+        return ConfigError(
+            f"--record {self.named}: is there already; name another file, or go on with it with --resume"
+        )
 
     def _attributes(self) -> dict[str, Any]:
         with reading(self.path) as old:
@@ -142,6 +147,8 @@ class Recorder:
         if self._shift:
             chunk = Chunk(chunk.t + self._shift, chunk.channels)
         if self.file is None:
+            if self.path.exists() and not self._replaced:  # it has come since
+                raise self._in_the_way()
             attributes = {"program": f"{RECORDED_MARK} {__version__}", "config": self.config, "started": self.started}
             self.file = GrowingFile(self.path, attributes, COLUMNS)
         self.file.append({"time": chunk.t, **chunk.channels})

@@ -305,6 +305,6 @@ def test_soaks_of_one_resistor_differ_as_their_information_says(recordings, name
     ramps = [soaked(f"{path}::{part}", OVEN) for part in ("0:9300", "9300:18300", "18300:")]
     ratios = [compared(a, b, level=True)[0] for k, a in enumerate(ramps) for b in ramps[:k]]
     assert np.mean(ratios) < 1.3
-    record = done(path.parent, OVEN, calibration=f"{name}.csv::0:9300", test=f"{name}.csv::18300:").record
+    record = done(path.parent, OVEN, calibration=f"{name}.csv::0:9300", holdout=f"{name}.csv::18300:").record
     assert record.bias_unit == "ratio" or record.bias_unit == "1"
     assert values(record, "coast")[0] < 2e-6

@@ -300,6 +300,16 @@ def test_a_recording_is_locked_and_is_never_replaced_unasked(tmp_path):
         assert len(file["time"]) == 5
 
 
+def test_a_file_that_comes_before_the_first_sample_stays(tmp_path):
+    recorder = Recorder(tmp_path / "raw.h5", "", resume=False, force=True)
+    (tmp_path / "raw.h5").write_text("mine")
+    with pytest.raises(ConfigError, match="is there already; name another file"):
+        recorder.add(chunk())
+    recorder.close()
+    assert (tmp_path / "raw.h5").read_text() == "mine"
+    assert names(tmp_path) == ["raw.h5"]
+
+
 @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n\x03\x08\x08" + bytes(90)])
 def test_a_recording_that_was_killed_before_its_first_row_is_taken_up(tmp_path, content):
     path = tmp_path / "raw.h5"
