@@ -53,62 +53,39 @@ EVERY = 30.0  # s between lines of a log
 
 @contextmanager
 def fleet_progress() -> Iterator[FleetProgress]:
-    """Show the stages of a fleet on standard error, with units done and failed, and an estimate of the end."""
-    console = terminal(stderr=True)
-    reporter = _Bar() if console.is_terminal and not session().quiet else _Log(quiet=session().quiet)
-    try:
-        yield reporter
-    finally:
-        reporter.close()
+    """Show the stages of a fleet on standard error, with units done and failed, and an estimate of the end.
 
+    With -v it is noted how long each took.
+    """
+    from rich.progress import BarColumn, Progress, TextColumn
 
-class _Log:
-    """A line each EVERY s."""
+    quiet, console = session().quiet, terminal(stderr=True)
+    columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False))
+    bars = Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)
+    bar = bars.add_task("", total=None)
+    current, written = Stage(""), time.monotonic()
 
-    def __init__(self, *, quiet: bool) -> None:
-        self.quiet, self.stage = quiet, Stage("")
-        self.written = time.monotonic()
+    def note() -> None:
+        if current.name:
+            session().stages.append((current.name, time.monotonic() - current.begun))
 
-    def __call__(self, stage: Stage) -> None:
-        if stage is not self.stage:
-            self._note()
-            self.stage = stage
-        if not self.quiet and time.monotonic() - self.written >= EVERY:
-            self.written = time.monotonic()
+    def report(stage: Stage) -> None:
+        nonlocal current, written
+        if stage is not current:
+            note()
+        current = stage
+        if not bars.disable:
+            bars.update(bar, description=stage.text(), completed=stage.done, total=stage.total or None)
+        elif not quiet and time.monotonic() - written >= EVERY:
+            written = time.monotonic()
             sys.stderr.write(f"{line(stage.text())}\n")
             sys.stderr.flush()
 
-    def _note(self) -> None:
-        """Note how long the stage took, for -v."""
-        if self.stage.name:
-            session().stages.append((self.stage.name, time.monotonic() - self.stage.begun))
-
-    def close(self) -> None:
-        """End it."""
-        self._note()
-
-
-class _Bar(_Log):
-    """One line that is written anew, with a bar."""
-
-    def __init__(self) -> None:
-        from rich.progress import BarColumn, TextColumn
-        from rich.progress import Progress as Bars
-
-        super().__init__(quiet=True)
-        columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False))
-        self.bars = Bars(*columns, console=terminal(stderr=True), transient=True)
-        self.bar = self.bars.add_task("", total=None)
-        self.bars.start()
-
-    def __call__(self, stage: Stage) -> None:
-        super().__call__(stage)
-        self.bars.update(self.bar, description=stage.text(), completed=stage.done, total=stage.total or None)
-
-    def close(self) -> None:
-        """Take the bar away."""
-        super().close()
-        self.bars.stop()
+    try:
+        with bars:
+            yield report
+    finally:
+        note()
 
 
 NAMED = 10  # units that a line names

@@ -30,6 +30,7 @@ def test_a_log_gets_a_line_now_and_then(monkeypatch):
             now[0] += 0.125  # which no sum of rounds
             stage.done += 1
             show(stage)
+        now[0] += 100
     lines = told.getvalue().splitlines()
     assert lines == [
         "units: 240 of 1,000 units, 95 s left",
