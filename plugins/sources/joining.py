@@ -1,4 +1,6 @@
-"""Streams of one log on one time base: a log keeps each sensor under its own time stamps, a filter wants rows.
+"""Records of a log as arrays, and its streams on one time base.
+
+A log keeps each sensor under its own time stamps, a filter wants rows.
 
 ::
 
@@ -10,7 +12,10 @@ Where no sample is near enough a row has NaN, so that it is left out and counted
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 
@@ -61,3 +66,11 @@ def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -
 def interval(t: Array) -> float:
     """Return the usual time between samples, s; 0 where there is one."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def records(data: NDArray[np.uint8] | bytes, at: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes."""
+    size = dtype.itemsize
+    # every place in the data where one could begin, without a copy
+    windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
+    return windows[at].view(dtype.base).reshape(len(at), *dtype.shape)

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import TimeBudget, size_of
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile, quote
+from fusion_plugins.sources.joining import records
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
 
 MAX_LAYOUTS = 8  # layouts at a time
@@ -107,12 +108,10 @@ class Decoder:
         fits = batch.sizes[at] >= layout.need
         if not np.any(fits):
             return fits
-        # every place in the data where such a message could begin, without a copy
-        windows = np.ndarray((len(batch.data) - layout.need + 1,), f"V{layout.need}", batch.data, strides=(1,))
-        records = windows[batch.starts[at[fits]]].view(layout.record)
-        same = np.ones(len(records), dtype=np.bool_)
+        values = records(batch.data, batch.starts[at[fits]], layout.record)
+        same = np.ones(len(values), dtype=np.bool_)
         for name, value in layout.lengths.items():
-            same &= records[name] == value
+            same &= values[name] == value
         fits[fits] = same
         rows = at[fits]
         for leaf, widths in self.widths.items():
@@ -121,7 +120,7 @@ class Decoder:
                 widths.add(shape[0])
         for name in layout.record.names or ():
             if not name.startswith("#"):
-                _put(columns, name, len(batch.starts), rows, records[name][same])
+                _put(columns, name, len(batch.starts), rows, values[name][same])
         return fits
 
     def _layout(self, data: bytes, start: int, size: int) -> MessageLayout:
