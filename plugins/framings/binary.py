@@ -27,10 +27,11 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Memory
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings, nearest
-from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+from fusion_plugins.framings.field import DeviceCounter, channel, check_channel
 
 Bytes = NDArray[np.uint8]
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
@@ -149,8 +150,7 @@ class BinaryField(Settings):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.name is not None:
-            check_unit(self.name, self.unit)
-            check_axes(self.name, self.count)
+            check_channel(self.name, self.unit, self.count)
         return self
 
 
@@ -207,10 +207,6 @@ class Binary(Framing):
     def _size(self) -> int:
         return int(self._layout.itemsize)
 
-    @cached_property
-    def _factors(self) -> dict[str, tuple[float, float]]:
-        return {field.name: factors(field.name, field.unit) for field in self.fields if field.name is not None}
-
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
         """Return the frames that end in `data`; the memory is what may be the beginning of the next one."""
         stream = memory + data if memory else data
@@ -264,7 +260,7 @@ class Binary(Framing):
             numbers = values[f"f{k}"].astype(np.float64)
             if field.scale != 1 or field.offset != 0:
                 numbers = numbers * field.scale + field.offset
-            channels[field.name] = shaped(field.name, in_si(numbers, self._factors[field.name]))
+            channels[field.name] = channel(field.name, numbers, field.unit)
         rejections = {GARBAGE: garbage, DAMAGED: rejected}
         return Frames(len(values), channels, count, {what: n for what, n in rejections.items() if n})
 
