@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -46,7 +46,7 @@ ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
 """Messages about the log itself."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MessageStream:
     """The rows of one message, of one instance where it has several.
 
@@ -59,12 +59,15 @@ class MessageStream:
         The file.
     unit : int or None
         The inertial unit that they are of, from 0; None for other messages.
+    samples : dict of str to array
+        The axes of their sensor, as soon as they were worked out.
     """
 
     message: records.Message
     at: records.Places
     data: records.Bytes
     unit: int | None = None
+    samples: dict[str, Array] = field(default_factory=dict, init=False)
 
     def values(self, label: str, rows: slice = slice(None)) -> Array:
         """Return a field of the rows."""

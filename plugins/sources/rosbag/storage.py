@@ -6,7 +6,7 @@ import mmap
 import struct
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -185,8 +185,13 @@ def plain(batch: Batch, path: Path) -> Batch:
         what = f"a batch of {len(batch.starts)} messages"
         messages.append(unpacked(batch.data[start:end], "zstd", path, what, left)[0])
         left -= len(messages[-1])
+    return packed(batch.connection, batch.times, messages)
+
+
+def packed(connection: int, times: Integers, messages: Sequence[bytes]) -> Batch:
+    """Return messages of a connection as one batch."""
     sizes = np.array([len(data) for data in messages], dtype=np.int64)
-    return batch._replace(data=b"".join(messages), starts=np.cumsum(sizes) - sizes, sizes=sizes)
+    return Batch(connection, times, b"".join(messages), np.cumsum(sizes) - sizes, sizes)
 
 
 def ros2_name(name: str) -> str:
