@@ -12,7 +12,8 @@ Where no sample is near enough a row has NaN, so that it is left out and counted
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,23 @@ from fusion_core.chunk import Array
 SLOWER = 2.0  # times the rows' interval: from there on a stream is drawn through, not picked from
 NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of that row
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
+
+
+PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
+
+
+class FieldPath(NamedTuple):
+    """A path `NAME.FIELD`, or `NAME[2].FIELD` of one of several sensors, taken apart."""
+
+    name: str
+    number: int | None
+    field: str
+
+
+def taken_apart(path: str) -> FieldPath | None:
+    """Return the parts of a path, None where it is none."""
+    match = PATH.fullmatch(path)
+    return None if match is None else FieldPath(match[1], None if match[2] is None else int(match[2]), match[3])
 
 
 def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:

@@ -22,7 +22,6 @@ comes after to tell, a few rows that are farther from all others than these last
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -40,7 +39,6 @@ from fusion_core.settings import nearest
 from fusion_plugins.sources.dataflash import scan as records
 from fusion_plugins.sources.dataflash.imu import Parameters
 
-PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
 DESCRIBED, CHANGES = 100_000, 10_000
 ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
 """Messages about the log itself."""
@@ -241,13 +239,6 @@ class DataFlashMessages:
             k = int(digit) - 1 if digit else 0
             streams[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
         return {k: stream for k, stream in streams.items() if len(stream.at)}
-
-    def split(self, path: str) -> tuple[str, int | None, str] | None:
-        """Return message, instance and field of a path `IMU[1].GyrX`; None where it is none."""
-        match = PATH.fullmatch(path)
-        if match is None:
-            return None
-        return match["name"], None if match["instance"] is None else int(match["instance"]), match["label"]
 
     def missing(self, path: str) -> MissingChannel:
         """Return the error for a message that the log does not have."""

@@ -19,7 +19,7 @@ from fusion_core.faults import Faults
 from fusion_plugins.sources.dataflash.imu import ImuCorrections, Sensor
 from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
 from fusion_plugins.sources.dataflash.scan import CLOCKS, DESCRIPTIONS, INERTIAL
-from fusion_plugins.sources.joining import joined
+from fusion_plugins.sources.joining import joined, taken_apart
 
 AXES: dict[Sensor, list[str]] = {"Gyr": ["GyrX", "GyrY", "GyrZ"], "Acc": ["AccX", "AccY", "AccZ"]}
 SENSORS: dict[str, Sensor] = {axis: sensor for sensor, axes in AXES.items() for axis in axes}
@@ -111,7 +111,7 @@ class Messages(Table):
 
     def _find(self, path: str) -> Field | None:
         """Return the rows and the field that a path names; None where the message has no such field."""
-        parts = self.log.split(path)
+        parts = taken_apart(path)
         if parts is None:
             return None
         name, instance, label = parts

@@ -177,7 +177,7 @@ class LogFile:
                     self._lost, self._first_lost = self._lost + lost, self._first_lost if self._lost else first
                     clock.check(n + stopped)
                     if stopped:
-                        size, kind = struct.unpack_from("<HB", self.data[at : at + 3])
+                        size, kind = struct.unpack("<HB", self.data[at : at + 3].tobytes())
                         with suppress(ValueError, KeyError, IndexError):  # of what is damaged
                             self._define(chr(kind), at, self.data[at + 3 : at + 3 + size].tobytes())
                         at, count, text = at + 3 + size, count + 1, text + size
@@ -290,8 +290,8 @@ NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
 def sampled(rows: int) -> Places:
     """Return the numbers of an instance's rows that tell about it: the first, second, fourth and so on, and more."""
-    n = np.arange(rows)
-    return n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)]
+    n: Places = np.arange(rows)
+    return np.asarray(n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)])
 
 
 @njit(cache=True, nogil=True)
