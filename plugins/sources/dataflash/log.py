@@ -330,22 +330,14 @@ def _near(t: Array) -> NDArray[np.bool_]:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _rising(t: Array) -> NDArray[np.bool_]:
     """Return the samples of t (N,) on the longest subsequence that does not fall, as flags (patience sorting)."""
-    n = len(t)
-    tops, before = np.empty(n, np.int64), np.empty(n, np.int64)
-    piles = 0
+    n, piles = len(t), 0
+    tops, before, last = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)  # last: t at the top of each pile
     for k in range(n):
-        low, high = 0, piles
-        if piles and t[tops[piles - 1]] <= t[k]:  # as almost always
-            low = piles
-        while low < high:
-            middle = (low + high) // 2
-            if t[tops[middle]] <= t[k]:
-                low = middle + 1
-            else:
-                high = middle
-        tops[low] = k
-        before[k] = tops[low - 1] if low else -1
-        piles = max(piles, low + 1)
+        rises = piles > 0 and last[piles - 1] <= t[k]  # as almost always
+        pile = piles if rises else np.searchsorted(last[:piles], t[k], side="right")
+        tops[pile], last[pile] = k, t[k]
+        before[k] = tops[pile - 1] if pile else -1
+        piles = max(piles, pile + 1)
     good = np.zeros(n, np.bool_)
     k = tops[piles - 1] if n else -1
     while k >= 0:

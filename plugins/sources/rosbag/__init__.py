@@ -106,15 +106,12 @@ class Topics(Table):
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of at least ROWS rows in the order of their time; what is joined to them is read before."""
-        wanted: dict[str, dict[str, Field | None]] = {}
-        for path in [self.leading, *paths]:
-            topic, field = self._field(path)
-            wanted.setdefault(topic, {})[path] = field
-        streams = {
-            topic: TopicStream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
-            for topic, fields in wanted.items()
-        }
-        rows = streams.pop(self._field(self.leading)[0])
+        wanted = {path: self._field(path) for path in [self.leading, *paths]}
+        streams: dict[str, TopicStream] = {}
+        for topic, _ in wanted.values():
+            fields = {path: field for path, (of, field) in wanted.items() if of == topic}
+            streams[topic] = TopicStream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
+        rows = streams.pop(wanted[self.leading][0])
         for _ in self._read(streams):
             pass
         for stream in streams.values():
@@ -124,7 +121,10 @@ class Topics(Table):
             rows.take(final=final)
             if len(rows.t):
                 step = interval(rows.t) if step is None else step
-                columns = {path: self._column(path, streams, rows, step) for path in paths}
+                zero, columns = float(rows.t[0]), {path: rows.values(path) for path in paths if path in rows.fields}
+                for stream in streams.values():
+                    for path in stream.fields:
+                        columns[path] = joined(rows.t - zero, stream.t - zero, stream.values(path), step)
                 overlap = {topic: overlap[topic] or stream.meets(rows.t) for topic, stream in streams.items()}
                 yield Block(len(rows.t), columns.__getitem__)
         for topic, meets in overlap.items():
@@ -141,14 +141,6 @@ class Topics(Table):
                 if stream.pending >= ROWS:
                     yield False
         yield True
-
-    def _column(self, path: str, streams: dict[str, TopicStream], rows: TopicStream, step: float) -> Array:
-        """Return the values of a path at each row."""
-        stream = streams.get(self._field(path)[0])
-        if stream is None:
-            return rows.values(path)
-        zero = float(rows.t[0])
-        return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
 
     def _apart(self, rows: TopicStream, stream: TopicStream) -> BadValue:
         if not len(stream.t):
@@ -273,12 +265,9 @@ class TopicStream:
         if not np.any(good):
             return
         time = self._timed(batch.times, columns, good)
-        n = len(good)
-        self._parts.append({
-            path: self._same(path, field, column(field, columns, n))[good]
-            for path, field in self.fields.items()
-            if field is not None
-        })  # fmt: skip
+        fields = {path: field for path, field in self.fields.items() if field is not None}
+        self._check_widths(fields)
+        self._parts.append({path: column(field, columns, len(good))[good] for path, field in fields.items()})
         self._times.append(time[good])
         self.pending += int(np.sum(good))
 
@@ -343,16 +332,15 @@ class TopicStream:
             where = f"logged at {_moment(times[other[0]])}"
             self._note(f"whose frame_id is not '{shown}', as that of the first", len(other), where)
 
-    def _same(self, path: str, field: Field, values: Array) -> Array:
-        """Return a column; raises BadValue where it is of arrays that differ in length."""
-        if field.sort == "array":
+    def _check_widths(self, fields: Mapping[str, Field]) -> None:
+        """Raise BadValue where a field is of arrays that differ in length."""
+        for path, field in fields.items():
             widths = {width for decoder in self._decoders.values() for width in decoder.widths[field.leaves[0]]}
-            if len(widths) > 1:
+            if field.sort == "array" and len(widths) > 1:
                 raise BadValue(
                     f"{self.path}: '{path}' has arrays of {min(widths)} to {max(widths)} values, arrays of one length "
                     f"were expected; name one value of them, as {path}[0]"
                 )
-        return values
 
     def _note(self, what: str, count: int, where: str) -> None:
         self.faults.add(f"messages on {self.topic} {what}", count, where)
