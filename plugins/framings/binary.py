@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -63,12 +63,6 @@ class Checksum(Settings):
         """Number of bytes."""
         return SIMPLE.get(self.kind) or int(self.kind.split("/")[0].removeprefix("CRC-")) // 8
 
-    @cached_property
-    def _crc(self) -> Callable[[bytes], int]:
-        algorithm = _crc(self.kind)
-        assert algorithm is not None, "the kind was checked"
-        return algorithm
-
     def good(self, frames: Bytes, order: Literal["big", "little"]) -> NDArray[np.bool_]:
         """Return the frames (N, L) that end with the checksum of the bytes before it, as flags (N,)."""
         body, sent = frames[:, self.start : -self.size], frames[:, -self.size :]
@@ -84,11 +78,13 @@ class Checksum(Settings):
         if self.kind in SIMPLE:
             total = np.sum(body, axis=1, dtype=np.int64)
             return np.asarray((-total if self.complement else total) % (1 << 8 * self.size), dtype=np.int64)
-        crc = self._crc
+        crc = _crc(self.kind)
+        assert crc is not None, "the kind was checked"
         n, text = body.shape[1], body.tobytes()
         return np.array([crc(text[k : k + n]) for k in range(0, len(text), n)], dtype=np.int64)
 
 
+@cache
 def _crc(name: str) -> Callable[[bytes], int] | None:
     import fastcrc
 

@@ -38,7 +38,7 @@ from fusion_core.contracts import Block, FileSource, Source, Table, foreign, hea
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import damaged
+from fusion_plugins.sources.unpacked import damaged, translated
 
 if TYPE_CHECKING:
     import polars as pl
@@ -59,10 +59,13 @@ class Parquet(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""
+        import polars as pl
+
         first = head(path)
         if not (first.startswith(SIGNATURE) or SIGNATURE.startswith(first)):
             raise foreign(path, first, self.kind)
-        yield ParquetColumns(path)
+        with translated(path, pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+            yield ParquetColumns(path)
 
 
 class Column(NamedTuple):
@@ -87,9 +90,8 @@ class ParquetColumns(Table):
 
         self.path = path
         self.layout = RowGroups(path)
-        with _translated(path):
-            self.frame = pl.scan_parquet(path, glob=False)
-            schema = self.frame.collect_schema()
+        self.frame = pl.scan_parquet(path, glob=False)
+        schema = self.frame.collect_schema()
         self.columns: dict[str, Column] = {}
         for name, kind in schema.items():
             for column in _with_fields(name, name, pl.col(name), kind):
@@ -118,7 +120,7 @@ class ParquetColumns(Table):
     def _frames(self, columns: Sequence[pl.Expr], paths: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield expressions of columns as data frames of some rows; the next one is read while one is used."""
         waiting: Future[pl.DataFrame] | None = None
-        with _translated(self.path), ThreadPoolExecutor(1) as reader:
+        with ThreadPoolExecutor(1) as reader:
             for begin, rows in self.layout.spans({self.columns[path].top for path in paths}):
                 query = self.frame.slice(begin, rows).select(columns)
                 done, waiting = waiting, reader.submit(query.collect)
@@ -203,17 +205,6 @@ def _instance(kind: Any) -> pl.DataType:
     import polars as pl
 
     return pl.Series(dtype=kind).dtype
-
-
-@contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    """Turn the errors of polars into UnreadableFile."""
-    import polars as pl
-
-    try:
-        yield
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise damaged(path, " ".join(str(error).split())[:160]) from None
 
 
 SPAN = 128_000_000  # bytes of rows that are read at a time

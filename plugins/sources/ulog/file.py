@@ -24,6 +24,7 @@ import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,15 +65,25 @@ class Instance:
         Where the messages of its rows begin.
     row : dtype
         The fields of a row.
-    samples : dict of str to array
-        Some of its rows, by field.
+    data : (B,) array of uint8
+        The file.
     """
 
     topic: str
     number: int
     at: Places
     row: np.dtype[np.void]
-    samples: Mapping[str, Array]
+    data: NDArray[np.uint8]
+
+    def columns(self, rows: Places | slice = slice(None)) -> dict[str, Array]:
+        """Return rows of it by field."""
+        values: Any = records(self.data, self.at[rows] + 5, self.row)
+        return {name: values[name] for name in self.row.names or ()}
+
+    @cached_property
+    def samples(self) -> Mapping[str, Array]:
+        """Some of its rows, by field."""
+        return self.columns(sampled(self.rows))
 
     @property
     def rows(self) -> int:
@@ -149,7 +160,7 @@ class LogFile:
 
     def read(self, wanted: Collection[Instance], faults: Faults) -> dict[Instance, dict[str, Array]]:
         """Return the rows of instances, by field; what is wrong with the file goes to `faults`."""
-        data = {instance: self._columns(instance.at, instance.row) for instance in wanted}
+        data = {instance: instance.columns() for instance in wanted}
         faults.add(
             "bytes of the log that belong to no message that is known (cut, damaged or of a later format)",
             self._lost,
@@ -210,8 +221,7 @@ class LogFile:
         for number, (topic, instance, row) in reversed(self._added.items()):
             at = rows[slice(*np.searchsorted(numbers, [number, number + 1]))]
             if len(at) and "timestamp" in (row.names or ()):
-                samples = self._columns(at[sampled(len(at))], row)
-                yield (topic, instance), Instance(topic, instance, at, row, samples)
+                yield (topic, instance), Instance(topic, instance, at, row, self.data)
 
     def _row(self, topic: str) -> tuple[np.dtype[np.void], int]:
         """Return the fields of a topic's rows, and the bytes of padding behind them."""
@@ -233,10 +243,6 @@ class LogFile:
                     yield path, NUMBERS[kind]
                 else:
                     yield from self._flat(topic, kind, f"{path}.", depth + 1)
-
-    def _columns(self, at: Places, row: np.dtype[np.void]) -> dict[str, Array]:
-        values: Any = records(self.data, at + 5, row)
-        return {name: values[name] for name in row.names or ()}
 
 
 def _declared(field: str) -> tuple[str, int | None, str]:
