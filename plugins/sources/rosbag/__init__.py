@@ -37,9 +37,10 @@ from fusion_core.settings import nearest
 from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
-from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers, Storage, plain, zstd
+from fusion_plugins.sources.rosbag.storage import Batch, ChunkedFile, Connection, Integers, plain, zstd
 from fusion_plugins.sources.unpacked import damaged
 
+Storage = ChunkedFile | sqlite.Sqlite
 ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
 
@@ -254,14 +255,12 @@ class TopicStream:
     def add(self, batch: Batch, connection: Connection) -> None:
         """Take the messages of a batch in; raises BadValue where arrays in them differ in length."""
         if connection.type != self.type:
-            self._note("of another type, left out", len(batch.times), f"logged at {_moment(batch.times[0])}")
+            self._note("of another type, left out", np.ones(len(batch.times), np.bool_), batch.times)
             return
         if connection.encoding not in self._decoders:
             self._decoders[connection.encoding] = Decoder(self.types, self.type, connection.encoding, self.leaves)
         columns, good = self._decoders[connection.encoding].decode(batch)
-        if not np.all(good):
-            first = _moment(batch.times[np.argmin(good)])
-            self._note("that cannot be decoded, left out", int(np.sum(~good)), f"logged at {first}")
+        self._note("that cannot be decoded, left out", ~good, batch.times)
         if not np.any(good):
             return
         time = self._timed(batch.times, columns, good)
@@ -285,11 +284,8 @@ class TopicStream:
                 "were expected; set stamp: log"
             )
         time = np.concatenate([np.empty(0, np.int64), *self._times])
-        late = time < np.maximum.accumulate(time)
-        order = np.arange(len(time))
-        if np.any(late):
-            self._note("that stand after a later one, put in order", int(np.sum(late)), f"at {_moment(time[late][0])}")
-            order = np.argsort(time, kind="stable")
+        self._note("that stand after a later one, put in order", time < np.maximum.accumulate(time), time, "at")
+        order = np.argsort(time, kind="stable")
         cut = len(order) if final else max(len(order) - HELD, 0)
         now, later = order[:cut], order[cut:]
         whole = {path: np.concatenate([part[path] for part in self._parts]) for path in (self._parts or [{}])[0]}
@@ -308,29 +304,19 @@ class TopicStream:
         n = int(np.sum(good))
         self._seen += n
         if self.bare:
-            self._note("that have no header, taken by the log's time", n, "message 1")
+            self.faults.add(f"messages on {self.topic} that have no header, taken by the log's time", n, "message 1")
         if not self.stamped:
             return log
-        self._framed(columns[FRAME][good], log[good])
+        self._frame = bytes(columns[FRAME][good][0]) if self._frame is None else self._frame
+        shown, other = self._frame.decode("utf-8", "replace"), good & (columns[FRAME] != self._frame)
+        self._note(f"whose frame_id is not '{shown}', as that of the first", other, log)
         sec, nanosec = (columns[name].astype(np.int64) for name in STAMP)
         time: Integers = sec * SECOND + nanosec
         zero = good & (time == 0)
-        if np.any(zero):
-            self._note(
-                "with a stamp of zero, left out", int(np.sum(zero)), f"logged at {_moment(log[np.argmax(zero)])}"
-            )
-            self._zero += int(np.sum(zero))
-            good &= ~zero
+        self._note("with a stamp of zero, left out", zero, log)
+        self._zero += int(np.sum(zero))
+        good &= ~zero
         return time
-
-    def _framed(self, frames: NDArray[Any], times: Integers) -> None:
-        """Note where a message is of another frame than the first."""
-        self._frame = bytes(frames[0]) if self._frame is None else self._frame
-        other = np.flatnonzero(frames != self._frame)
-        if len(other):
-            shown = self._frame.decode("utf-8", "replace")
-            where = f"logged at {_moment(times[other[0]])}"
-            self._note(f"whose frame_id is not '{shown}', as that of the first", len(other), where)
 
     def _check_widths(self, fields: Mapping[str, Field]) -> None:
         """Raise BadValue where a field is of arrays that differ in length."""
@@ -342,12 +328,12 @@ class TopicStream:
                     f"were expected; name one value of them, as {path}[0]"
                 )
 
-    def _note(self, what: str, count: int, where: str) -> None:
-        self.faults.add(f"messages on {self.topic} {what}", count, where)
-
-
-def _moment(nanoseconds: np.int64) -> str:
-    return f"{nanoseconds // SECOND}.{nanoseconds % SECOND:09d} s"
+    def _note(self, what: str, which: NDArray[np.bool_], times: Integers, at: str = "logged at") -> None:
+        """Count messages, by flags and the times (n,) of all in ns."""
+        if np.any(which):
+            first = times[np.argmax(which)]
+            where = f"{at} {first // SECOND}.{first % SECOND:09d} s"
+            self.faults.add(f"messages on {self.topic} {what}", int(np.sum(which)), where)
 
 
 @hookimpl

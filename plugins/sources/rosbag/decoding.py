@@ -52,15 +52,12 @@ class MessageLayout(NamedTuple):
 
     Attributes
     ----------
-    need : int
-        Bytes from the beginning that hold them.
     record : dtype
-        The wanted numbers by their paths, and the lengths that tell the layout by `#k`.
+        The wanted numbers by their paths, and the lengths that tell the layout by `#k`; as long as holds them all.
     lengths : dict of str to int
         The values of the fields `#k` in messages of this layout.
     """
 
-    need: int
     record: np.dtype[np.void]
     lengths: Mapping[str, int]
 
@@ -105,7 +102,7 @@ class Decoder:
         self, layout: MessageLayout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]
     ) -> NDArray[np.bool_]:
         """Copy what messages of a layout hold into the columns; return which they were."""
-        fits = batch.sizes[at] >= layout.need
+        fits = batch.sizes[at] >= layout.record.itemsize
         if not np.any(fits):
             return fits
         values = records(batch.data, batch.starts[at[fits]], layout.record)
@@ -126,16 +123,13 @@ class Decoder:
     def _layout(self, data: bytes, start: int, size: int) -> MessageLayout:
         walk = _Walk(self.types, memoryview(data)[start : start + size], self.encoding == "cdr", self.leaves)
         walk.through(self.kind)
-        names, formats, offsets = [], [], []
-        for name, (form, offset) in {**walk.lengths_at, **walk.places}.items():
-            names.append(name)
-            formats.append(form)
-            offsets.append(offset)
+        places = {**walk.lengths_at, **walk.places}
+        formats, offsets = [form for form, _ in places.values()], [offset for _, offset in places.values()]
         need = max((o + np.dtype(f).itemsize for f, o in zip(formats, offsets, strict=True)), default=0)
         if not 0 < need <= size:
             raise ValueError("the message is cut")
-        record = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": need})
-        return MessageLayout(need, record, walk.lengths)
+        record = np.dtype({"names": list(places), "formats": formats, "offsets": offsets, "itemsize": need})
+        return MessageLayout(record, walk.lengths)
 
 
 def _put(columns: dict[str, NDArray[Any]], name: str, n: int, rows: Integers, values: NDArray[Any]) -> None:

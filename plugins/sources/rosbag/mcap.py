@@ -44,7 +44,7 @@ class Mcap(storage.ChunkedFile):
         self._counts: dict[int, int] = {}
         super().__init__(path, faults)
 
-    def count(self, connection: int) -> int | None:
+    def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
         return self._counts.get(connection, 0)
 

@@ -46,7 +46,7 @@ class Ros1(storage.ChunkedFile):
         self._form = _HeaderLayout(b"")
         super().__init__(path, faults)
 
-    def count(self, connection: int) -> int | None:
+    def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
         return sum((piece.counts or {}).get(connection, 0) for piece in self.pieces)
 

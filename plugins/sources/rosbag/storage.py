@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,18 +68,6 @@ class Batch(NamedTuple):
     sizes: Integers
 
 
-class Storage(Protocol):
-    """An open bag file."""
-
-    connections: list[Connection]
-
-    def count(self, connection: int) -> int | None:
-        """Return the number of messages of a connection, None where a damaged file does not tell."""
-
-    def batches(self, wanted: Set[int]) -> Iterator[Batch]:
-        """Yield the messages of the wanted connections as they stand in the file."""
-
-
 ChunkMessages = dict[int, list[int]]
 """Messages of one chunk by connection: time, start and size of each, one after the other."""
 
@@ -112,6 +100,10 @@ class ChunkedFile(ABC):
                 self.pieces = []
                 self._scan()
         self.connections = list(self._connected())
+
+    @abstractmethod
+    def count(self, connection: int) -> int:
+        """Return the number of messages of a connection."""
 
     @abstractmethod
     def _indexed(self) -> bool:
