@@ -214,7 +214,7 @@ class LogFile:
             (self.parameters[name],) = np.frombuffer(content[1 + content[0] :], NUMBERS[form]).tolist()
 
     def _found(self, rows: Places) -> Iterator[tuple[tuple[str, int], Instance]]:
-        """Yield what has rows with a time; of several subscriptions of one instance the first comes last."""
+        """Yield the instances that have rows with a time; of several subscriptions of one, the first comes last."""
         numbers = records(self.data, rows + 3, U16)
         order = np.argsort(numbers, kind="stable")
         rows, numbers = rows[order], numbers[order]
@@ -256,7 +256,7 @@ def _declared(field: str) -> tuple[str, int | None, str]:
 
 
 def _sections(path: Path, first: bytes, size: int) -> tuple[int, list[int]]:
-    """Return where messages begin, and where the parts of the file end.
+    """Return the place at which messages begin, and the ends of the parts of the file.
 
     After a crash PX4 appends what it kept to the end of the log, which may end within a message; the flags say where.
     """
