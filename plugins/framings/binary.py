@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -27,10 +27,11 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Memory
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings, nearest
-from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+from fusion_plugins.framings.field import DeviceCounter, channel, check_channel
 
 Bytes = NDArray[np.uint8]
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
@@ -62,12 +63,6 @@ class Checksum(Settings):
         """Number of bytes."""
         return SIMPLE.get(self.kind) or int(self.kind.split("/")[0].removeprefix("CRC-")) // 8
 
-    @cached_property
-    def _crc(self) -> Callable[[bytes], int]:
-        algorithm = _crc(self.kind)
-        assert algorithm is not None, "the kind was checked"
-        return algorithm
-
     def good(self, frames: Bytes, order: Literal["big", "little"]) -> NDArray[np.bool_]:
         """Return the frames (N, L) that end with the checksum of the bytes before it, as flags (N,)."""
         body, sent = frames[:, self.start : -self.size], frames[:, -self.size :]
@@ -83,11 +78,13 @@ class Checksum(Settings):
         if self.kind in SIMPLE:
             total = np.sum(body, axis=1, dtype=np.int64)
             return np.asarray((-total if self.complement else total) % (1 << 8 * self.size), dtype=np.int64)
-        crc = self._crc
+        crc = _crc(self.kind)
+        assert crc is not None, "the kind was checked"
         n, text = body.shape[1], body.tobytes()
         return np.array([crc(text[k : k + n]) for k in range(0, len(text), n)], dtype=np.int64)
 
 
+@cache
 def _crc(name: str) -> Callable[[bytes], int] | None:
     import fastcrc
 
@@ -149,8 +146,7 @@ class BinaryField(Settings):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.name is not None:
-            check_unit(self.name, self.unit)
-            check_axes(self.name, self.count)
+            check_channel(self.name, self.unit, self.count)
         return self
 
 
@@ -207,10 +203,6 @@ class Binary(Framing):
     def _size(self) -> int:
         return int(self._layout.itemsize)
 
-    @cached_property
-    def _factors(self) -> dict[str, tuple[float, float]]:
-        return {field.name: factors(field.name, field.unit) for field in self.fields if field.name is not None}
-
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
         """Return the frames that end in `data`; the memory is what may be the beginning of the next one."""
         stream = memory + data if memory else data
@@ -264,7 +256,7 @@ class Binary(Framing):
             numbers = values[f"f{k}"].astype(np.float64)
             if field.scale != 1 or field.offset != 0:
                 numbers = numbers * field.scale + field.offset
-            channels[field.name] = shaped(field.name, in_si(numbers, self._factors[field.name]))
+            channels[field.name] = channel(field.name, numbers, field.unit)
         rejections = {GARBAGE: garbage, DAMAGED: rejected}
         return Frames(len(values), channels, count, {what: n for what, n in rejections.items() if n})
 

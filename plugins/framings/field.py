@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import USUAL
+from fusion_core.contracts import USUAL, Channel
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import Counter
-from fusion_core.errors import UnitError, quote
+from fusion_core.errors import UnitError
 from fusion_core.settings import Settings
-from fusion_core.units import Unit, convert, si_unit_of
+from fusion_core.units import Unit, convert
 
 VALID = "valid"  # zero where the device says that a sample must not be used
 
@@ -33,55 +34,31 @@ class DeviceCounter(Settings):
         return Counter(min(self.modulo, (1 << 63) - 1), self.tick)  # no device counts as far as 64 bits
 
 
-def check_unit(name: str, unit: str | None) -> None:
-    """Raise the validation error of a channel whose unit is missing, unknown, or of another dimension."""
+def check_channel(name: str, unit: str | None, d: int) -> None:
+    """Raise the validation error of a channel of `d` axes whose unit is missing or wrong, or that has too many axes."""
     usual = USUAL.get(name)
-    si, example = (usual.si if usual else None), (usual and usual.example) or "0.1 V"
-    if unit is None:
-        if usual and usual.example:
-            raise problem(f"channel {name} has no unit; write unit: {example}")
-        return
+    if unit is None and usual and usual.example:
+        raise problem(f"channel {name} has no unit; write unit: {usual.example}")
     try:
-        convert(0.0, unit, si)
-    except UnitError:
-        what = f"cannot be converted to {si}" if si and _is_unit(unit) else "is not known"
-        raise problem(f"channel {name}: unit '{quote(unit)}' {what}; write it like '{example}'") from None
+        Channel(path="field", unit=unit).check(name)
+    except UnitError as error:
+        raise problem(str(error)) from None
+    if usual and usual.axes and d > usual.axes:
+        raise problem(f"channel {name} has {d} axes, at most {usual.axes} were expected; leave the others out")
 
 
-def _is_unit(unit: str) -> bool:
-    try:
-        return bool(si_unit_of(unit))
-    except UnitError:
-        return False
+def channel(name: str, columns: Array, unit: str | None = None) -> Array:
+    """Return (N, d) columns in SI as the channel has them: a triad keeps its axis, a scalar is (N,)."""
+    zero, slope = _factors(name, unit)
+    values = columns if slope == 1 and zero == 0 else columns * slope + zero
+    triad = name in USUAL and USUAL[name].axes == 3
+    return values if triad or values.shape[1] > 1 else np.ascontiguousarray(values[:, 0])
 
 
-def factors(name: str, unit: str | None) -> tuple[float, float]:
+@cache
+def _factors(name: str, unit: str | None) -> tuple[float, float]:
     """Return the value of 0 `unit` in SI, and of 1 `unit` more."""
     if unit is None:
         return 0.0, 1.0
     zero, one = convert(np.array([0.0, 1.0]), unit, USUAL[name].si if name in USUAL else None)
     return float(zero), float(one - zero)
-
-
-def in_si(values: Array, factor: tuple[float, float]) -> Array:
-    """Return values in SI by their `factors`."""
-    zero, slope = factor
-    return values if slope == 1 and zero == 0 else values * slope + zero
-
-
-def check_axes(name: str, d: int) -> None:
-    """Raise the validation error of a channel with more axes than there are."""
-    usual = USUAL.get(name)
-    if usual and usual.axes and d > usual.axes:
-        raise problem(f"channel {name} has {d} axes, at most {usual.axes} were expected; leave the others out")
-
-
-def shaped(name: str, columns: Array) -> Array:
-    """Return (N, d) columns as the channel has them: a triad keeps its axis, a scalar is (N,)."""
-    triad = name in USUAL and USUAL[name].axes == 3
-    return columns if triad or columns.shape[1] > 1 else np.ascontiguousarray(columns[:, 0])
-
-
-def problem(text: str) -> PydanticCustomError:
-    """Return a validation error."""
-    return PydanticCustomError("framing", "{text}", {"text": text})

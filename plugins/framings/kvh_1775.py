@@ -24,11 +24,12 @@ import numpy as np
 from pydantic import model_validator
 
 from fusion_core.contracts import Memory
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit
 from fusion_plugins.framings.binary import Binary
-from fusion_plugins.framings.field import VALID, problem
+from fusion_plugins.framings.field import VALID
 
 ALL_VALID = 0x77
 HEADERS = {"A": "FE 81 FF 55", "B": "FE 81 FF 56"}

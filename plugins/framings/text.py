@@ -21,23 +21,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.contracts import Channel, Memory
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
-from fusion_core.contracts.table import Name
 from fusion_core.errors import MissingChannel
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+from fusion_plugins.framings.field import DeviceCounter, channel, check_channel
 
 LONGEST = 4096  # bytes of a line
 UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before the stream, within it, too far back
-
-
-class TextColumn(Channel):
-    """The place of one channel in a line."""
-
-    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
-    """Name of the column; a list of names, one an axis."""
-    unit: str | None = None
-    """Unit of the column."""
 
 
 class Text(Framing):
@@ -52,7 +43,7 @@ class Text(Framing):
     """Beginning of every line of samples, as in "$IMU,"."""
     checksum: Literal["nmea"] | None = None
     """Checksum at the end of a line."""
-    channels: Annotated[Mapping[str, TextColumn], Field(min_length=1)]
+    channels: Annotated[Mapping[str, Channel], Field(min_length=1)]
     """Channels of the columns."""
     counter: DeviceCounter | None = None
     """The column by which the device counts."""
@@ -60,8 +51,7 @@ class Text(Framing):
     @model_validator(mode="after")
     def _check(self) -> Self:
         for name, column in self.channels.items():
-            check_unit(name, column.unit)
-            check_axes(name, len(column.paths))
+            check_channel(name, column.unit, len(column.paths))
         if self.columns is not None:
             missing = next((path for path in self._needed if path not in self.columns), None)
             if missing is not None:
@@ -159,15 +149,11 @@ class Text(Framing):
         values = np.array(rows, dtype=np.float64).reshape(len(rows), len(self._needed))
         place = {path: k for k, path in enumerate(self._needed)}
         channels = {
-            name: shaped(name, in_si(values[:, [place[p] for p in column.paths]], self._factors[name]))
+            name: channel(name, values[:, [place[p] for p in column.paths]], column.unit)
             for name, column in self.channels.items()
         }
         count = None if self.counter is None else np.rint(values[:, place[self.counter.field]]).astype(np.int64)
         return Frames(len(rows), channels, count, rejected)
-
-    @cached_property
-    def _factors(self) -> dict[str, tuple[float, float]]:
-        return {name: factors(name, column.unit) for name, column in self.channels.items()}
 
 
 def _numbers(cells: Sequence[str]) -> list[float] | None:

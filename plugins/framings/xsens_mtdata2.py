@@ -28,7 +28,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.framings.field import shaped
+from fusion_plugins.framings.field import channel
 
 SYNC = b"\xfa\xff\x36"
 LONGEST = 4096  # bytes of a message; the length of what looks like a longer one is damaged
@@ -113,7 +113,7 @@ class XsensMtdata2(Framing):
             values["temperature"] = _hold(values["temperature"], held.get("temperature"))
             if len(whole):
                 held = {"temperature": values["temperature"][-1]}
-        channels: dict[str, Array] = {name: shaped(name, columns[good]) for name, columns in values.items()}
+        channels: dict[str, Array] = {name: channel(name, columns[good]) for name, columns in values.items()}
         left = {what: n for what, n in rejected.items() if n}
         return Frames(int(np.sum(good)), channels, count[good], left), dict(held)
 

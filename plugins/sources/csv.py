@@ -68,6 +68,7 @@ class CsvLines(Table):
     def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:
         self.path, self.file, self.separator, self.faults = path, file, separator, faults
         self.skipped, self.most = 0, TEXTS  # bytes of comments and blank lines, and how many there may be
+        self.line = 1  # number of the first line of the block that is read
         self.columns = [name.strip() for name in self._fields(self._header())]
         self._check_header()
 
@@ -82,47 +83,43 @@ class CsvLines(Table):
             if (count := self.columns.count(path)) > 1:
                 raise BadValue(f"{self.path}: has {count} columns '{path}', one was expected; rename the others")
         at = {path: self.columns.index(path) for path in paths}
-        for offset, block, final in self._pieces():
+        for _, block, final in self._pieces():
             unfinished = final and not block.endswith(b"\n")
             values = None if unfinished else self._fast(block, at)
             if values is None:
                 cells = self._without(block)
                 values = self._fast(cells, at) if cells and cells != block and not unfinished else None
-                values = self._careful(block, cells, at, offset, final) if values is None else values
+                values = self._careful(block, cells, at, final) if values is None else values
             rows = len(next(iter(values.values()), ()))
             if rows:
                 self.most = SKIPPED
                 yield Block(rows, values.__getitem__)
             else:
                 self._skip(len(block))
+            self.line += block.count(b"\n")
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
-        while line := self._line_after_comments():
-            if len(line) == LONGEST and not line.endswith(b"\n"):
+        for offset, block, _ in self._pieces():
+            first = FIRST.search(block)
+            begin = first.start() if first else len(block)
+            end = block.find(b"\n", begin) + 1 or len(block)
+            self._skip(begin)
+            self.line += block.count(b"\n", 0, end)
+            if first is None:
+                continue
+            if end - begin > LONGEST:
                 raise self._too_long()
+            self.file.seek(offset + end)
             try:
-                text = line.decode("utf-8-sig" if self.file.tell() == len(line) else "utf-8")
+                text = block[begin:end].decode("utf-8" if offset + begin else "utf-8-sig")
             except UnicodeDecodeError:
-                text = line.decode("latin-1")
+                text = block[begin:end].decode("latin-1")
             if text.strip() and not text.startswith("#"):
                 return text
             self._skip(BLOCK)  # such a line is looked for in a block of its own
+            return self._header()
         raise EmptyRecording(f"{self.path}: has no header line; write the columns' names in the first line")
-
-    def _line_after_comments(self) -> bytes:
-        """Return the next line that may be the header; comments before it are passed over by blocks."""
-        place, rest = self.file.tell(), b""
-        while data := self.file.read(BLOCK):
-            block = rest + data
-            first = FIRST.search(block)
-            end = first.start() if first else block.rfind(b"\n") + 1
-            place, rest = place + end, block[end:]
-            self._skip(end)
-            if first or len(rest) > LONGEST:
-                break
-        self.file.seek(place)
-        return self.file.readline(LONGEST)
 
     def _skip(self, count: int) -> None:
         self.skipped += count
@@ -210,26 +207,26 @@ class CsvLines(Table):
         grid = ends.reshape(-1, n)
         return len(grid) if np.all(grid[:, -1]) and not np.any(grid[:, :-1]) else None
 
-    def _careful(self, block: bytes, cells: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
+    def _careful(self, block: bytes, cells: bytes, at: dict[str, int], final: bool) -> dict[str, Array]:
         """Parse the lines of a block, whose comments `cells` lacks, one by one; raises BadValue."""
         text = cells.decode("utf-8", "replace").removesuffix("\n")
         lines = [line.rstrip("\r") for line in text.split("\n")] if cells else []
         one = len(self.columns) == 1  # then a blank line is an empty cell
         rows = [k for k, line in enumerate(lines) if not line.startswith("#") and (one or line.strip())]
         self._skip(SLOW * (len(lines) - len(rows)))
-        where = partial(self._number_of, block, offset)
+        where = partial(self._number_of, block)
         if final and rows and self._torn(lines[rows[-1]], at, closed=block.endswith(b"\n")):
             self.faults.add("torn last line, left out", 1, f"line {where(rows.pop())}")
         numbers = [self._row(lines[k], at, where, k) for k in rows]
         columns = np.array(numbers, dtype=np.float64).reshape(len(numbers), len(at)).T
         return dict(zip(at, np.ascontiguousarray(columns), strict=True))
 
-    def _number_of(self, block: bytes, offset: int, k: int) -> int:
-        """Return the number of the k-th line that is kept of a block that begins at `offset`."""
+    def _number_of(self, block: bytes, k: int) -> int:
+        """Return the number of the k-th line that is kept of the block."""
         left_out = COMMENTS if len(self.columns) == 1 else BLANK
         lines = block.removesuffix(b"\n").split(b"\n")
         numbers = (number for number, line in enumerate(lines) if not left_out.fullmatch(line + b"\n"))
-        return self._line(offset) + next(islice(numbers, k, None), len(lines))
+        return self.line + next(islice(numbers, k, None), len(lines))
 
     def _row(self, line: str, at: dict[str, int], where: Callable[[int], int], k: int) -> list[float]:
         """Return the numbers of a line, whose number is `where(k)`."""
@@ -262,16 +259,6 @@ class CsvLines(Table):
             with suppress(csv.Error):
                 return next(csv.reader([line], delimiter=self.separator))
         return line.split(self.separator)
-
-    def _line(self, offset: int) -> int:
-        """Return the number of the line that begins at `offset`."""
-        here = self.file.tell()
-        self.file.seek(0)
-        count, left = 1, offset
-        while left and (data := self.file.read(min(left, BLOCK))):
-            count, left = count + data.count(b"\n"), left - len(data)
-        self.file.seek(here)
-        return count
 
 
 def _number(cell: str) -> float | None:

@@ -23,7 +23,7 @@ from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
-from fusion_core.errors import BadValue, UnreadableFile
+from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.unpacked import damaged
@@ -49,11 +49,8 @@ class Hdf5(FileSource):
             cut = first.startswith(SIGNATURE) or SIGNATURE.startswith(first)
             if not cut and not h5py.is_hdf5(path):
                 raise foreign(path, first, self.kind)
-            file = _open(path)
-        try:
-            yield DataSets(path, file)
-        finally:
-            file.close()
+            with _open(path) as file:
+                yield DataSets(path, file)
 
 
 class DataSets(Table):
@@ -68,13 +65,11 @@ class DataSets(Table):
     @cached_property
     def names(self) -> Sequence[str]:
         """Every data set, in groups too; of a name that is not UTF-8, the bytes are shown."""
-        with _translated(self.path):
-            return [name.decode("utf-8", "backslashreplace") for name in names_of(self.path, self.file)]
+        return [name.decode("utf-8", "backslashreplace") for name in names_of(self.path, self.file)]
 
     def has(self, path: str) -> bool:
         """Return True if `path` is a data set; it may begin with a slash."""
-        with _translated(self.path):
-            return path.strip("/") in self.names and path in self.file
+        return path.strip("/") in self.names and path in self.file
 
     def unit(self, path: str) -> str | None:
         """Return the attribute `unit` or `units`, where it is text."""
@@ -89,8 +84,7 @@ class DataSets(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows; nothing is read before a column is asked for."""
         rows = self._rows(paths)
-        with _translated(self.path):
-            self._data = {path: DataSetRows(self.path, self.file[path]) for path in paths}  # once, not for every block
+        self._data = {path: DataSetRows(self.path, self.file[path]) for path in paths}  # once, not for every block
         data = list(self._data.values())
         check_rows(self.path, data)
         row = sum(8.0 * np.prod(column.node.shape[1:]) for column in data)
@@ -102,8 +96,7 @@ class DataSets(Table):
 
     def _rows(self, paths: Sequence[str]) -> int:
         """Return the number of rows of all data sets together."""
-        with _translated(self.path):
-            kinds = {path: (self.file[path].shape, self.file[path].dtype) for path in paths}
+        kinds = {path: (self.file[path].shape, self.file[path].dtype) for path in paths}
         if self.file.swmr_mode:
             # a writer that was killed has left some data sets longer than others by what it wrote last
             whole = min(shape[0] for shape, _ in kinds.values() if shape)
@@ -125,9 +118,8 @@ class DataSets(Table):
     def _packing(self, path: str) -> tuple[list[Any], float, float]:
         """Return the raw values that stand for a missing one, the factor and the offset."""
         missing = [self._attribute(path, name) for name in ("_FillValue", "missing_value")]
-        with _translated(self.path):
-            if missing[0] is None and "_NCProperties" in self.file.attrs:
-                missing.append(self.file[path].fillvalue or None)  # NetCDF's default for its type; 0 where it has none
+        if missing[0] is None and "_NCProperties" in self.file.attrs:
+            missing.append(self.file[path].fillvalue or None)  # NetCDF's default for its type; 0 where it has none
         values = [value for part in missing if part is not None for value in np.ravel(part)]
         return values, self._factor(path, "scale_factor", 1.0), self._factor(path, "add_offset", 0.0)
 
@@ -145,16 +137,14 @@ class DataSets(Table):
 
     def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
         missing, factor, offset = packing[path]
-        with _translated(self.path):
-            raw = self._data[path][start:stop]
+        raw = self._data[path][start:stop]
         values = np.asarray(raw, dtype=np.float64)
         for value in missing:
             values = np.where(raw == value, np.nan, values)
         return values if factor == 1 and offset == 0 else values * factor + offset
 
     def _attribute(self, path: str, name: str) -> Any:
-        with _translated(self.path):
-            return attribute(self.path, self.file[path], name)
+        return attribute(self.path, self.file[path], name)
 
 
 def _open(path: Path) -> Any:
@@ -174,9 +164,11 @@ def _open(path: Path) -> Any:
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """Turn what h5py raises into UnreadableFile."""
+    """Turn what h5py raises, while the file is open, into UnreadableFile."""
     try:
         yield
+    except FusionError:
+        raise
     except BlockingIOError:
         raise UnreadableFile(
             f"{path}: is being written by another program; wait until it is closed, or read a copy"

@@ -1,4 +1,6 @@
-"""Streams of one log on one time base: a log keeps each sensor under its own time stamps, a filter wants rows.
+"""Records of a log as arrays, and its streams on one time base.
+
+A log keeps each sensor under its own time stamps, a filter wants rows.
 
 ::
 
@@ -10,13 +12,34 @@ Where no sample is near enough a row has NaN, so that it is left out and counted
 
 from __future__ import annotations
 
+import re
+from typing import Any, NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 
 SLOWER = 2.0  # times the rows' interval: from there on a stream is drawn through, not picked from
 NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of that row
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
+
+
+PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
+
+
+class FieldPath(NamedTuple):
+    """A path `NAME.FIELD`, or `NAME[2].FIELD` of one of several sensors, taken apart."""
+
+    name: str
+    number: int | None
+    field: str
+
+
+def taken_apart(path: str) -> FieldPath | None:
+    """Return the parts of a path, None where it is none."""
+    match = PATH.fullmatch(path)
+    return None if match is None else FieldPath(match[1], None if match[2] is None else int(match[2]), match[3])
 
 
 def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:
@@ -61,3 +84,11 @@ def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -
 def interval(t: Array) -> float:
     """Return the usual time between samples, s; 0 where there is one."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def records(data: NDArray[np.uint8] | bytes, at: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes."""
+    size = dtype.itemsize
+    # every place in the data where one could begin, without a copy
+    windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
+    return windows[at].view(dtype.base).reshape(len(at), *dtype.shape)

@@ -24,10 +24,11 @@ from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
-from fusion_core.errors import BadValue, FusionError, UnreadableFile
+from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.mat_elements import Elements, Old, Variable
+from fusion_plugins.sources.unpacked import translated
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -55,12 +56,10 @@ class Mat(FileSource):
         if first.startswith(HDF5) or first[512 : 512 + len(HDF5)] == HDF5:
             import h5py
 
-            with _translated(path):
-                file = h5py.File(path, "r")
-            with file:
+            with translated(path, Exception), h5py.File(path, "r") as file:
                 yield Variables(path, Hdf5Groups(path, file), time)
         elif first.startswith(b"MATLAB 5.0") or first[124:128] in (b"\0\1IM", b"\1\0MI") or _version_4(first):
-            with path.open("rb") as plain:
+            with translated(path, Exception), path.open("rb") as plain:
                 yield Variables(path, Loaded(path, plain, path.stat().st_size, old=_version_4(first)), time)
         else:
             raise foreign(path, first, self.kind)
@@ -79,19 +78,17 @@ class Loaded:
     @cached_property
     def tops(self) -> Mapping[str, Variable]:
         """Every variable, its numbers left out."""
-        with _translated(self.path):
-            for variable, at in self._coming:
-                self._note(variable, at)
+        for variable, at in self._coming:
+            self._note(variable, at)
         return {name: variable for name, (variable, _) in self._seen.items()}
 
     def top(self, name: str) -> Variable | None:
         """Return a variable, None where there is none; of several of one name, the first."""
         if name not in self._kept:
-            with _translated(self.path):
-                while name not in self._seen and (further := next(self._coming, None)) is not None:
-                    self._note(*further)
-                known = self._seen.get(name)
-                self._kept[name] = None if known is None else self._elements.load(known[1])
+            while name not in self._seen and (further := next(self._coming, None)) is not None:
+                self._note(*further)
+            known = self._seen.get(name)
+            self._kept[name] = None if known is None else self._elements.load(known[1])
         return self._kept[name]
 
     def _note(self, variable: Variable, at: int) -> None:
@@ -117,8 +114,7 @@ class Hdf5Groups:
     @cached_property
     def tops(self) -> Mapping[str, Any]:
         """Every variable."""
-        with _translated(self.path):
-            return {name: node for name, node in self._inside(self.file).items() if not name.startswith("#")}
+        return {name: node for name, node in self._inside(self.file).items() if not name.startswith("#")}
 
     def top(self, name: str) -> Any:
         """Return a variable, None where there is none."""
@@ -128,8 +124,7 @@ class Hdf5Groups:
         """Return the fields of a struct, None where it is none."""
         if not hasattr(node, "keys") or "MATLAB_object_decode" in node.attrs or "MATLAB_sparse" in node.attrs:
             return None
-        with _translated(self.path):
-            return self._inside(node)
+        return self._inside(node)
 
     def _inside(self, group: Any) -> Mapping[str, Any]:
         """Return the nodes of a group: Octave keeps a value beside the name of its type."""
@@ -146,21 +141,20 @@ class Hdf5Groups:
 
     def plain(self, node: Any) -> tuple[Array | Turned | None, tuple[int, ...], str]:
         """Return a view of the numbers as MATLAB has them, or None, with its shape and what it is."""
-        with _translated(self.path):
-            kind = attribute(self.path, node, "MATLAB_class")
-            kind = b"double" if kind is None else kind
-            name = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
-            if "MATLAB_object_decode" in node.attrs:
-                return None, (), f"an object of class {name}"
-            if hasattr(node, "keys"):
-                return None, (), "a sparse matrix"
-            if node.dtype.kind == "O":
-                return None, node.shape[::-1], "a cell array" if name == "cell" else "an array of structs"
-            if name not in PLAIN or node.dtype.kind not in "iuf":
-                return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
-            if "MATLAB_empty" in node.attrs:
-                return np.zeros((0, 1)), (0, 1), ""
-            return Turned(self.path, node), node.shape[::-1], ""
+        kind = attribute(self.path, node, "MATLAB_class")
+        kind = b"double" if kind is None else kind
+        name = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
+        if "MATLAB_object_decode" in node.attrs:
+            return None, (), f"an object of class {name}"
+        if hasattr(node, "keys"):
+            return None, (), "a sparse matrix"
+        if node.dtype.kind == "O":
+            return None, node.shape[::-1], "a cell array" if name == "cell" else "an array of structs"
+        if name not in PLAIN or node.dtype.kind not in "iuf":
+            return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
+        if "MATLAB_empty" in node.attrs:
+            return np.zeros((0, 1)), (0, 1), ""
+        return Turned(self.path, node), node.shape[::-1], ""
 
 
 class Turned:
@@ -200,8 +194,7 @@ class Variables(Table):
         arrays = {path: self._plain(path) for path in paths}
         rows = self._rows({path: shape for path, (_, shape) in arrays.items()})
         along = {path: self._axis(path, shape, rows) for path, (_, shape) in arrays.items()}
-        with _translated(self.path):
-            columns = [a.along(along[path]) for path, (a, _) in arrays.items() if isinstance(a, Turned)]
+        columns = [a.along(along[path]) for path, (a, _) in arrays.items() if isinstance(a, Turned)]
         if columns:
             check_rows(self.path, columns)
         row = sum(8.0 * shape[1 - along[path]] for path, (_, shape) in arrays.items())
@@ -280,12 +273,9 @@ class Variables(Table):
         )
 
     def _read(self, rows: slice, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], path: str) -> Array:
-        with _translated(self.path):
-            array, axis = arrays[path][0], along[path]
-            part = (
-                array.along(axis)[rows].T if isinstance(array, Turned) else array[rows] if axis == 0 else array[:, rows]
-            )
-            values = np.asarray(part, dtype=np.float64)
+        array, axis = arrays[path][0], along[path]
+        part = array.along(axis)[rows].T if isinstance(array, Turned) else array[rows] if axis == 0 else array[:, rows]
+        values = np.asarray(part, dtype=np.float64)
         return values if axis == 0 else values.T
 
 
@@ -298,18 +288,6 @@ def _version_4(first: bytes) -> bool:
             if good and imaginary in (0, 1) and 1 < name <= 64 and first[19 + name : 20 + name] == b"\0":
                 return True
     return False
-
-
-@contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    """Turn what a damaged file raises into UnreadableFile."""
-    try:
-        yield
-    except FusionError:
-        raise
-    except Exception as error:  # of h5py and zlib, or what the parser stumbles over
-        reason = " ".join(str(error).split()).strip("'\"")[:160]
-        raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); save or copy it again") from None
 
 
 @hookimpl

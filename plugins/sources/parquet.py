@@ -38,7 +38,7 @@ from fusion_core.contracts import Block, FileSource, Source, Table, foreign, hea
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import damaged
+from fusion_plugins.sources.unpacked import damaged, translated
 
 if TYPE_CHECKING:
     import polars as pl
@@ -59,10 +59,27 @@ class Parquet(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""
+        import polars as pl
+
         first = head(path)
         if not (first.startswith(SIGNATURE) or SIGNATURE.startswith(first)):
             raise foreign(path, first, self.kind)
-        yield ParquetColumns(path)
+        with translated(path, pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+            yield ParquetColumns(path)
+
+
+class Column(NamedTuple):
+    """A column of a file, or a field of one that is a struct: the column's name, its path, expression and type."""
+
+    top: str
+    path: str
+    expression: pl.Expr
+    kind: pl.DataType
+
+    @property
+    def struct(self) -> bool:
+        """True if it has fields instead of values."""
+        return hasattr(self.kind, "fields")
 
 
 class ParquetColumns(Table):
@@ -73,23 +90,25 @@ class ParquetColumns(Table):
 
         self.path = path
         self.layout = RowGroups(path)
-        with _translated(path):
-            self.frame = pl.scan_parquet(path, glob=False)
-            self.schema = self.frame.collect_schema()
+        self.frame = pl.scan_parquet(path, glob=False)
+        schema = self.frame.collect_schema()
+        self.columns: dict[str, Column] = {}
+        for name, kind in schema.items():
+            for column in _with_fields(name, name, pl.col(name), kind):
+                self.columns.setdefault(column.path, column)
 
     @cached_property
     def names(self) -> Sequence[str]:
         """Every column, and in place of a struct its fields."""
-        return [path for name, kind in self.schema.items() for path in _field_paths(name, kind)]
+        return [column.path for column in self.columns.values() if not column.struct]
 
     def has(self, path: str) -> bool:
         """Return True if `path` is a column, or a field of a struct."""
-        return self._column(path) is not None
+        return path in self.columns
 
     def unit(self, path: str) -> str | None:
         """Return `s` for a time or a duration."""
-        column = self._column(path)
-        return "s" if column and column[1].is_temporal() else None
+        return "s" if self.has(path) and self.columns[path].kind.is_temporal() else None
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of about `size` rows."""
@@ -100,10 +119,9 @@ class ParquetColumns(Table):
 
     def _frames(self, columns: Sequence[pl.Expr], paths: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield expressions of columns as data frames of some rows; the next one is read while one is used."""
-        tops = {top for path in paths for top in self.schema.names() if path == top or path.startswith(f"{top}.")}
         waiting: Future[pl.DataFrame] | None = None
-        with _translated(self.path), ThreadPoolExecutor(1) as reader:
-            for begin, rows in self.layout.spans(tops):
+        with ThreadPoolExecutor(1) as reader:
+            for begin, rows in self.layout.spans({self.columns[path].top for path in paths}):
                 query = self.frame.slice(begin, rows).select(columns)
                 done, waiting = waiting, reader.submit(query.collect)
                 if done is not None:
@@ -112,28 +130,13 @@ class ParquetColumns(Table):
             if waiting is not None:
                 yield waiting.result()
 
-    def _column(self, path: str) -> tuple[pl.Expr, pl.DataType] | None:
-        """Return the expression and the type of a column or of a field, None where there is no such one."""
-        import polars as pl
-
-        for name, kind in self.schema.items():
-            if path == name:
-                return pl.col(name), kind
-            if isinstance(kind, pl.Struct) and path.startswith(f"{name}."):
-                field = _field(pl.col(name), kind, path[len(name) + 1 :])
-                if field:
-                    return field
-        return None
-
     def _numbers(self, path: str) -> pl.Expr:
         """Return the column as numbers in seconds where it is a time; raises BadValue where it is none."""
         import polars as pl
 
-        named = self._column(path)
-        assert named is not None, "the source asked for it before"
-        column, kind = named
+        _, _, column, kind = self.columns[path]
         if isinstance(kind, pl.List | pl.Array):
-            inner = pl.Series(dtype=kind.inner).dtype
+            inner = _instance(kind.inner)
             if inner.is_numeric() or inner == pl.Boolean:
                 return self._axes(path, column, kind)
         elif kind == pl.Date:
@@ -144,13 +147,10 @@ class ParquetColumns(Table):
             return column.cast(pl.Int64) / 1e9
         elif kind.is_numeric() or kind == pl.Boolean:
             return column.cast(pl.Float64)
-        fields = (
-            f"name a field of it, e.g. '{next(_field_paths(path, kind), path)}'" if isinstance(kind, pl.Struct) else ""
-        )
-        raise BadValue(
-            f"{self.path}: column '{path}' is {kind}, numbers were expected; "
-            + (fields or "name another column, or write it as numbers")
-        )
+        field = next((name for name in self.names if name.startswith(f"{path}.")), path)
+        fields = isinstance(kind, pl.Struct)
+        advice = f"name a field of it, e.g. '{field}'" if fields else "name another column, or write it as numbers"
+        raise BadValue(f"{self.path}: column '{path}' is {kind}, numbers were expected; {advice}")
 
     def _axes(self, path: str, column: pl.Expr, kind: pl.DataType) -> pl.Expr:
         """Return lists as arrays of one length: that of the first row which has one."""
@@ -190,41 +190,21 @@ class ParquetColumns(Table):
         return values
 
 
-def _field(column: pl.Expr, kind: pl.Struct, path: str) -> tuple[pl.Expr, pl.DataType] | None:
-    """Return the expression and the type of a field, or of a field of a field."""
+def _with_fields(top: str, path: str, column: pl.Expr, kind: pl.DataType) -> Iterator[Column]:
+    """Yield a column, and of a struct its fields, with all that is in them."""
     import polars as pl
 
-    for field in kind.fields:
-        inner = pl.Series(dtype=field.dtype).dtype  # an instance, where the field names a class
-        if path == field.name:
-            return column.struct.field(field.name), inner
-        if isinstance(inner, pl.Struct) and path.startswith(f"{field.name}."):
-            deeper = _field(column.struct.field(field.name), inner, path[len(field.name) + 1 :])
-            if deeper:
-                return deeper
-    return None
+    yield Column(top, path, column, kind)
+    for field in kind.fields if isinstance(kind, pl.Struct) else ():
+        inner = _instance(field.dtype)
+        yield from _with_fields(top, f"{path}.{field.name}", column.struct.field(field.name), inner)
 
 
-def _field_paths(path: str, kind: object) -> Iterator[str]:
-    """Yield a column's path, or those of its fields."""
+def _instance(kind: Any) -> pl.DataType:
+    """Return a type as an instance, where a field or a list names a class."""
     import polars as pl
 
-    if isinstance(kind, pl.Struct):
-        for field in kind.fields:
-            yield from _field_paths(f"{path}.{field.name}", field.dtype)
-    else:
-        yield path
-
-
-@contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    """Turn the errors of polars into UnreadableFile."""
-    import polars as pl
-
-    try:
-        yield
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise damaged(path, " ".join(str(error).split())[:160]) from None
+    return pl.Series(dtype=kind).dtype
 
 
 SPAN = 128_000_000  # bytes of rows that are read at a time
@@ -247,18 +227,11 @@ class Leaf(NamedTuple):
     lists: bool
 
 
-class Pages(NamedTuple):
-    """The place of the pages of a column in a row group."""
-
-    begin: int
-    length: int
-
-
 class Group(NamedTuple):
-    """A row group: its rows, and the pages of each leaf."""
+    """A row group: its rows, and of each leaf where its pages begin and how many bytes they have."""
 
     rows: int
-    pages: tuple[Pages, ...]
+    pages: list[tuple[int, int]]
 
 
 class RowGroups:
@@ -306,11 +279,11 @@ class RowGroups:
         """Raise UnreadableFile where the wanted columns of a row group take more than the budget."""
         what = f"row group {number} of {group.rows:,} rows"
         check_size(self.path, what, group.rows * width, GROUP)
-        check_size(self.path, f"{what} in the file", sum(group.pages[k].length for k in mine), STORED)
+        check_size(self.path, f"{what} in the file", sum(group.pages[k][1] for k in mine), STORED)
         largest = 0
         for k in mine:
             leaf, values, unpacked, most = self.leaves[k], 0, 0, 0
-            for size, count in self._pages(group.pages[k], data):
+            for size, count in self._pages(*group.pages[k], data):
                 values, unpacked, most = values + count, unpacked + size, max(most, size)
             of = f"column '{leaf.top}' of {what}"
             largest += most
@@ -322,9 +295,9 @@ class RowGroups:
                 check_size(self.path, of, unpacked, PIECE)
         check_size(self.path, f"a page of each column of {what}", largest, PIECE)
 
-    def _pages(self, pages: Pages, data: mmap.mmap) -> Iterator[tuple[int, int]]:
+    def _pages(self, at: int, length: int, data: mmap.mmap) -> Iterator[tuple[int, int]]:
         """Yield bytes when unpacked, and number of values, of the pages of a column."""
-        at, end = pages.begin, pages.begin + pages.length
+        end = at + length
         while at < end:
             self.clock.tick()
             head = _Struct(data[at : min(at + HEADER, end)])
@@ -376,16 +349,11 @@ def _leaves(schema: list[dict[int, Any]]) -> Iterator[Leaf]:
 
 def _group(group: dict[int, Any], leaves: int) -> Group:
     """Return a row group, by its struct in the footer."""
-    pages = []
-    for column in group[1]:
-        about = column[3]
-        begin = about.get(11, about[9])
-        pages.append(Pages(begin, about[7]))
-        if begin < 0 or about[7] < 0:
-            raise ValueError("pages before the file")
-    if len(pages) != leaves or group[3] < 0:
-        raise ValueError("a row group of other columns")
-    return Group(group[3], tuple(pages))
+    about = [column[3] for column in group[1]]
+    pages = [(column.get(11, column[9]), column[7]) for column in about]
+    if len(pages) != leaves or min([group[3], *map(min, pages)]) < 0:
+        raise ValueError("a row group of other columns, or pages before the file")
+    return Group(group[3], pages)
 
 
 class _Struct:

@@ -21,7 +21,7 @@ from typing import IO, BinaryIO
 
 from fusion_core.budget import TEXTS, check_all, keep, no_room, size_of
 from fusion_core.contracts import head
-from fusion_core.errors import UnreadableFile
+from fusion_core.errors import FusionError, UnreadableFile
 
 STANDARD_INPUT = Path("-")
 GZIP = b"\x1f\x8b"
@@ -58,6 +58,17 @@ def opened(path: Path) -> Iterator[Stream]:
 def damaged(path: Path, reason: str) -> UnreadableFile:
     """Return the error of a file that is not as its format asks."""
     return UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again")
+
+
+@contextmanager
+def translated(path: Path, *errors: type[BaseException]) -> Iterator[None]:
+    """Turn the errors of a library, while it has a file open, into the error of a damaged one."""
+    try:
+        yield
+    except FusionError:
+        raise
+    except errors as error:
+        raise damaged(path, " ".join(str(error).split()).strip("'\"")[:160]) from None
 
 
 def beginning(file: Stream, path: Path) -> bytes:

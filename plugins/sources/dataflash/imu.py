@@ -36,6 +36,7 @@ Sensor = Literal["Gyr", "Acc"]
 REFERENCE = 35.0  # degC, of the polynomial
 UNITS = ("INS", "AHRS", "CUST")  # what parameters of inertial units are called
 NEVER = -300.0  # degC, a calibration temperature that was never set
+LIMITS = {"TMIN": 0.0, "TMAX": 70.0}  # degC, of the polynomial, where the log has none
 
 EULER = (
     "0 0 0,0 0 45,0 0 90,0 0 135,0 0 180,0 0 225,0 0 270,0 0 315,180 0 0,180 0 45,180 0 90,180 0 135,0 180 0,"
@@ -97,49 +98,6 @@ class Parameters:
 
 
 @dataclass(frozen=True)
-class Correction:
-    """The correction of the samples of a sensor, for as long as no parameter changed.
-
-    Attributes
-    ----------
-    offset, scale : (3,) array
-    coefficients : (3, 3) array or None
-        Of the powers of T - 35 degC, one a row; None where the polynomial was not applied.
-    T_min, T_max, T_cal : float
-        degC
-    R : (3, 3) array or None
-        From the board's frame to the vehicle's; None where the orientation is none that is known.
-    older : bool
-        Whether the order is that of logs with TimeMS.
-    """
-
-    offset: Array
-    scale: Array
-    coefficients: Array | None
-    T_min: float
-    T_max: float
-    T_cal: float
-    R: Array | None
-    older: bool
-
-    def undo(self, v: Array, T: Array) -> Array:
-        """Return the samples v (N, 3), logged at T (N,) in degC, as the sensor gave them."""
-        assert self.R is not None, "the orientation was checked"
-        if self.older:
-            result: Array = ((v + self.offset) / self.scale) @ self.R
-            return result
-        raw = (v @ self.R) / self.scale + self.offset
-        if self.coefficients is None:
-            return raw
-        return np.asarray(raw + self._polynomial(T) - self._polynomial(np.array([self.T_cal])))
-
-    def _polynomial(self, T: Array) -> Array:
-        assert self.coefficients is not None
-        c, t = self.coefficients, np.clip(T, self.T_min, self.T_max)[:, None] - REFERENCE
-        return np.asarray((c[0] + (c[1] + c[2] * t) * t) * t * 1e-6)
-
-
-@dataclass(frozen=True)
 class ImuCorrections:
     """The corrections of one sensor over a log.
 
@@ -166,67 +124,75 @@ class ImuCorrections:
     def undo(self, v: Array, T: Array, at: Places) -> Array:
         """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them."""
         raw = np.empty_like(v)
-        for rows, correction in self._spans(at):
-            raw[rows] = correction.undo(v[rows], T[rows])
+        for rows, place in self._spans(at):
+            raw[rows] = self._undone(v[rows], T[rows], place)
         return raw
 
     def polynomial(self, at: Places) -> bool:
         """Return True if a learned polynomial was applied to one of the rows."""
-        return any(correction.coefficients is not None for _, correction in self._spans(at))
+        return any(self._compensated(place) for _, place in self._spans(at))
 
     def unknown(self, at: Places) -> int | None:
         """Return an AHRS_ORIENTATION of the rows that is none that is known; None where there is none such."""
-        places = [int(at[rows.start]) for rows, correction in self._spans(at) if correction.R is None]
+        places = [place for _, place in self._spans(at) if self._rotation(place) is None]
         return int(self._value("AHRS_ORIENTATION", places[0])) if places else None
 
     def applied(self, at: Places) -> list[str]:
         """Return the names of what was applied to one of the rows."""
         n, others, offsets = self.names, dict[str, None](), list[Array]()
-        for rows, correction in self._spans(at):
-            orientation = self._value("AHRS_ORIENTATION", int(at[rows.start]))
-            others |= {f"{n.group} (polynomial)": None} if correction.coefficients is not None else {}
-            others |= {n.scale: None} if np.any(correction.scale != 1) else {}
+        for _, place in self._spans(at):
+            orientation, offset = self._value("AHRS_ORIENTATION", place), self._offset(place)
+            others |= {f"{n.group} (polynomial)": None} if self._compensated(place) else {}
+            others |= {n.scale: None} if np.any(self._scale(place) != 1) else {}
             others |= {f"AHRS_ORIENTATION {orientation:g}": None} if orientation else {}
-            if not offsets or np.any(offsets[-1] != correction.offset):
-                offsets.append(correction.offset)
+            if not offsets or np.any(offsets[-1] != offset):
+                offsets.append(offset)
         changed = f" (changed {len(offsets) - 1} times)" if len(offsets) > 1 else ""
         return [*([n.offset + changed] if np.any(offsets) else []), *others]
 
-    def _spans(self, at: Places) -> Iterator[tuple[slice, Correction]]:
-        """Yield stretches of rows over which no parameter changed, and what was done to them."""
+    def _spans(self, at: Places) -> Iterator[tuple[slice, int]]:
+        """Yield stretches of rows over which no parameter changed, and the place of their first one."""
         edges = np.searchsorted(at, self.parameters.changes(self._relevant())).tolist()
-        bounds = sorted({0, *edges, len(at)})
-        for begin, end in pairwise(bounds):
-            yield slice(begin, end), self._correction(int(at[begin]))
+        for begin, end in pairwise(sorted({0, *edges, len(at)})):
+            yield slice(begin, end), int(at[begin])
 
     def _relevant(self) -> list[str]:
         n = self.names
         turned = ["AHRS_ORIENTATION", *(name for angles in CUSTOM.values() for name in angles)]
         single = [n.caltemp, *(f"{n.group}_{end}" for end in ("ENABLE", "TMIN", "TMAX"))]
-        return [
-            *turned,
-            *single,
-            *(name for vector in (n.offset, n.scale, *n.coefficients) for name in of_axes(vector)),
-        ]
+        vectors = (n.offset, n.scale, *n.coefficients)
+        return [*turned, *single, *(name for vector in vectors for name in of_axes(vector))]
+
+    def _undone(self, v: Array, T: Array, place: int) -> Array:
+        """Return samples over which no parameter changed as the sensor gave them."""
+        offset, scale, R = self._offset(place), self._scale(place), self._rotation(place)
+        assert R is not None, "the orientation was checked"
+        if self.older:
+            return np.asarray(((v + offset) / scale) @ R)
+        raw: Array = (v @ R) / scale + offset
+        if not self._compensated(place):
+            return raw
+        c = [self.parameters.vector(vector, place, 0.0) for vector in self.names.coefficients]
+        T_min, T_max = (self._value(f"{self.names.group}_{end}", place, usual) for end, usual in LIMITS.items())
+
+        def p(T: Array) -> Array:
+            t = np.clip(T, T_min, T_max)[:, None] - REFERENCE
+            return np.asarray((c[0] + (c[1] + c[2] * t) * t) * t * 1e-6)
+
+        return raw + p(T) - p(np.array([self._value(self.names.caltemp, place, NEVER)]))
 
     def _value(self, name: str, place: int, default: float = 0.0) -> float:
         return self.parameters.value(name, place, default)
 
-    def _correction(self, place: int) -> Correction:
-        n, parameters = self.names, self.parameters
-        applied = self._value(f"{n.group}_ENABLE", place) == 1
-        coefficients = [parameters.vector(vector, place, 0.0) for vector in n.coefficients]
-        scale = parameters.vector(n.scale, place, 1.0) if self.sensor == "Acc" else np.ones(3)
-        return Correction(
-            parameters.vector(n.offset, place, 0.0),
-            np.where(scale == 0, 1.0, scale),  # multiplied by nothing, a value cannot be brought back
-            np.array(coefficients) if applied else None,
-            self._value(f"{n.group}_TMIN", place, 0.0),
-            self._value(f"{n.group}_TMAX", place, 70.0),
-            self._value(n.caltemp, place, NEVER),
-            self._rotation(place),
-            self.older,
-        )
+    def _compensated(self, place: int) -> bool:
+        return self._value(f"{self.names.group}_ENABLE", place) == 1
+
+    def _offset(self, place: int) -> Array:
+        return self.parameters.vector(self.names.offset, place, 0.0)
+
+    def _scale(self, place: int) -> Array:
+        scale = self.parameters.vector(self.names.scale, place, 1.0) if self.sensor == "Acc" else np.ones(3)
+        return np.where(scale == 0, 1.0, scale)  # multiplied by nothing, a value cannot be brought back
 
     def _rotation(self, place: int) -> Array | None:
         number = int(self._value("AHRS_ORIENTATION", place))

@@ -22,9 +22,8 @@ comes after to tell, a few rows that are farther from all others than these last
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -40,13 +39,12 @@ from fusion_core.settings import nearest
 from fusion_plugins.sources.dataflash import scan as records
 from fusion_plugins.sources.dataflash.imu import Parameters
 
-PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
 DESCRIBED, CHANGES = 100_000, 10_000
 ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
 """Messages about the log itself."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MessageStream:
     """The rows of one message, of one instance where it has several.
 
@@ -59,12 +57,15 @@ class MessageStream:
         The file.
     unit : int or None
         The inertial unit that they are of, from 0; None for other messages.
+    samples : dict of str to array
+        The axes of their sensor, as soon as they were worked out.
     """
 
     message: records.Message
     at: records.Places
     data: records.Bytes
     unit: int | None = None
+    samples: dict[str, Array] = field(default_factory=dict, init=False)
 
     def values(self, label: str, rows: slice = slice(None)) -> Array:
         """Return a field of the rows."""
@@ -239,13 +240,6 @@ class DataFlashMessages:
             streams[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
         return {k: stream for k, stream in streams.items() if len(stream.at)}
 
-    def split(self, path: str) -> tuple[str, int | None, str] | None:
-        """Return message, instance and field of a path `IMU[1].GyrX`; None where it is none."""
-        match = PATH.fullmatch(path)
-        if match is None:
-            return None
-        return match["name"], None if match["instance"] is None else int(match["instance"]), match["label"]
-
     def missing(self, path: str) -> MissingChannel:
         """Return the error for a message that the log does not have."""
         have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
@@ -336,22 +330,14 @@ def _near(t: Array) -> NDArray[np.bool_]:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _rising(t: Array) -> NDArray[np.bool_]:
     """Return the samples of t (N,) on the longest subsequence that does not fall, as flags (patience sorting)."""
-    n = len(t)
-    tops, before = np.empty(n, np.int64), np.empty(n, np.int64)
-    piles = 0
+    n, piles = len(t), 0
+    tops, before, last = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)  # last: t at the top of each pile
     for k in range(n):
-        low, high = 0, piles
-        if piles and t[tops[piles - 1]] <= t[k]:  # as almost always
-            low = piles
-        while low < high:
-            middle = (low + high) // 2
-            if t[tops[middle]] <= t[k]:
-                low = middle + 1
-            else:
-                high = middle
-        tops[low] = k
-        before[k] = tops[low - 1] if low else -1
-        piles = max(piles, low + 1)
+        rises = piles > 0 and last[piles - 1] <= t[k]  # as almost always
+        pile = piles if rises else np.searchsorted(last[:piles], t[k], side="right")
+        tops[pile], last[pile] = k, t[k]
+        before[k] = tops[pile - 1] if pile else -1
+        piles = max(piles, pile + 1)
     good = np.zeros(n, np.bool_)
     k = tops[piles - 1] if n else -1
     while k >= 0:

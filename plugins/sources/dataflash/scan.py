@@ -29,6 +29,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TimeBudget
+from fusion_plugins.sources.joining import records
 
 PIECE = 1 << 26  # bytes between two looks at the clock
 Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
@@ -167,14 +168,6 @@ def _format_size(data: Bytes, pos: int, letters: Places) -> int:
     return size
 
 
-def column(data: Bytes, at: Places, offset: int, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
-    """Return a field (N,) or (N, k) of the records that begin at `at` (N,), `offset` bytes after their beginning."""
-    size = dtype.itemsize
-    # every place in the data where such a field could begin, without a copy
-    windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
-    return windows[at + offset].view(dtype.base).reshape(len(at), *dtype.shape)
-
-
 CODES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "c": "<i2", "H": "<u2", "C": "<u2", "i": "<i4", "e": "<i4",
          "L": "<i4", "I": "<u4", "E": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8", "g": "<f2",
          "a": "(32,)<i2"}  # fmt: skip
@@ -252,7 +245,7 @@ class Message:
         k = self.labels.index(label)
         offset = 3 + sum(SIZES[letter] for letter in self.letters[:k])
         code = CODES.get(self.letters[k], f"S{SIZES[self.letters[k]]}")
-        return column(data, at, offset, np.dtype(code))
+        return records(data, at + offset, np.dtype(code))
 
     def values(self, data: Bytes, at: Places, label: str) -> np.ndarray:
         """Return a field of the records at `at` (N,) as float64 (N,), or (N, 32) where it is an array."""

@@ -19,7 +19,7 @@ from fusion_core.faults import Faults
 from fusion_plugins.sources.dataflash.imu import ImuCorrections, Sensor
 from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
 from fusion_plugins.sources.dataflash.scan import CLOCKS, DESCRIPTIONS, INERTIAL
-from fusion_plugins.sources.joining import joined
+from fusion_plugins.sources.joining import joined, taken_apart
 
 AXES: dict[Sensor, list[str]] = {"Gyr": ["GyrX", "GyrY", "GyrZ"], "Acc": ["AccX", "AccY", "AccZ"]}
 SENSORS: dict[str, Sensor] = {axis: sensor for sensor, axes in AXES.items() for axis in axes}
@@ -73,41 +73,36 @@ class Messages(Table):
         fields = {path: self._field(path) for path in paths}
         self.raw.check(fields.values(), self.faults)
         self._note_units(leading[0])
-        t = None
         columns: dict[str, Array] = {}
-        samples: dict[int, dict[str, Array]] = {}  # of all axes of a sensor, by the rows they are joined from
-        for path, (stream, label) in fields.items():
-            if stream is leading[0]:
-                continue
-            if (stream.message.values(self.log.data, stream.at[:1], label)).ndim > 1:
-                raise BadValue(f"{self.log.path}: '{path}' has 32 values a row, and cannot be joined; name a number")
-            t = rows.time(clock) if t is None else t
-            columns[path] = self._joined(stream, label, t, clock, samples.setdefault(id(stream), {}))
+        others = {id(stream): stream for stream, _ in fields.values() if stream is not leading[0]}
+        t = rows.time(clock) if others else np.empty(0)
+        for stream in others.values():
+            columns |= self._joined(
+                stream, {path: label for path, (s, label) in fields.items() if s is stream}, t, clock
+            )
         for start in range(0, len(rows.at), size):
             part = replace(rows, at=rows.at[start : start + size])
-            yield Block(len(part.at), partial(self._read, part, start, fields, columns, {}))
+            yield Block(len(part.at), partial(self._read, part, start, fields, columns))
 
     def _read(
-        self,
-        part: MessageStream,
-        start: int,
-        fields: Mapping[str, Field],
-        columns: Mapping[str, Array],
-        samples: dict[str, Array],
-        path: str,
+        self, part: MessageStream, start: int, fields: Mapping[str, Field], columns: Mapping[str, Array], path: str
     ) -> Array:
         if path in columns:
             return columns[path][start : start + len(part.at)]
-        return self.raw.values(part, fields[path][1], samples)
+        return self.raw.values(part, fields[path][1])
 
     def _joined(
-        self, stream: MessageStream, label: str, t: Array, clock: str | None, samples: dict[str, Array]
-    ) -> Array:
+        self, stream: MessageStream, labels: Mapping[str, str], t: Array, clock: str | None
+    ) -> dict[str, Array]:
+        """Return fields of another message at the times of the rows."""
         stream = self.log.sound(stream, None, clock)
         times = stream.time(clock)
         falls = np.flatnonzero(np.diff(times) < 0)
         rises = slice(0, int(falls[0]) + 1 if len(falls) else len(times))  # what comes behind a restart is refused
-        return joined(t, times[rises], self.raw.values(stream, label, samples)[rises])
+        values = {path: self.raw.values(stream, label)[rises] for path, label in labels.items()}
+        if wide := next((path for path, column in values.items() if column.ndim > 1), None):
+            raise BadValue(f"{self.log.path}: '{wide}' has 32 values a row, and cannot be joined; name a number")
+        return {path: joined(t, times[rises], column) for path, column in values.items()}
 
     def _field(self, path: str) -> Field:
         field = self._find(path)
@@ -116,7 +111,7 @@ class Messages(Table):
 
     def _find(self, path: str) -> Field | None:
         """Return the rows and the field that a path names; None where the message has no such field."""
-        parts = self.log.split(path)
+        parts = taken_apart(path)
         if parts is None:
             return None
         name, instance, label = parts
@@ -176,16 +171,16 @@ class RawSamples:
         self.log, self.compensated = log, compensated
         self._temperatures: dict[int, tuple[Array, Array]] = {}
 
-    def values(self, stream: MessageStream, label: str, samples: dict[str, Array]) -> Array:
-        """Return a field of rows (N,); `samples` keeps those of all axes of these rows."""
+    def values(self, stream: MessageStream, label: str) -> Array:
+        """Return a field of rows (N,)."""
         sensor = SENSORS.get(label)
         if stream.unit is None or sensor is None or self.compensated == "keep":
             return stream.values(label)
-        if label not in samples:
+        if label not in stream.samples:
             v = np.column_stack([stream.values(axis) for axis in AXES[sensor]])
             raw = self._corrections(stream, sensor).undo(v, self._temperature(stream), stream.at)
-            samples.update(zip(AXES[sensor], np.ascontiguousarray(raw.T), strict=True))
-        return samples[label]
+            stream.samples.update(zip(AXES[sensor], np.ascontiguousarray(raw.T), strict=True))
+        return stream.samples[label]
 
     def check(self, fields: Iterable[Field], faults: Faults) -> None:
         """Report the corrections, and refuse those that cannot or shall not be undone.

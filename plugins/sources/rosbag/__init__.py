@@ -37,9 +37,10 @@ from fusion_core.settings import nearest
 from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
-from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers, Storage, plain, zstd
+from fusion_plugins.sources.rosbag.storage import Batch, ChunkedFile, Connection, Integers, plain, zstd
 from fusion_plugins.sources.unpacked import damaged
 
+Storage = ChunkedFile | sqlite.Sqlite
 ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
 
@@ -106,15 +107,12 @@ class Topics(Table):
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of at least ROWS rows in the order of their time; what is joined to them is read before."""
-        wanted: dict[str, dict[str, Field | None]] = {}
-        for path in [self.leading, *paths]:
-            topic, field = self._field(path)
-            wanted.setdefault(topic, {})[path] = field
-        streams = {
-            topic: TopicStream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
-            for topic, fields in wanted.items()
-        }
-        rows = streams.pop(self._field(self.leading)[0])
+        wanted = {path: self._field(path) for path in [self.leading, *paths]}
+        streams: dict[str, TopicStream] = {}
+        for topic, _ in wanted.values():
+            fields = {path: field for path, (of, field) in wanted.items() if of == topic}
+            streams[topic] = TopicStream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
+        rows = streams.pop(wanted[self.leading][0])
         for _ in self._read(streams):
             pass
         for stream in streams.values():
@@ -124,7 +122,10 @@ class Topics(Table):
             rows.take(final=final)
             if len(rows.t):
                 step = interval(rows.t) if step is None else step
-                columns = {path: self._column(path, streams, rows, step) for path in paths}
+                zero, columns = float(rows.t[0]), {path: rows.values(path) for path in paths if path in rows.fields}
+                for stream in streams.values():
+                    for path in stream.fields:
+                        columns[path] = joined(rows.t - zero, stream.t - zero, stream.values(path), step)
                 overlap = {topic: overlap[topic] or stream.meets(rows.t) for topic, stream in streams.items()}
                 yield Block(len(rows.t), columns.__getitem__)
         for topic, meets in overlap.items():
@@ -141,14 +142,6 @@ class Topics(Table):
                 if stream.pending >= ROWS:
                     yield False
         yield True
-
-    def _column(self, path: str, streams: dict[str, TopicStream], rows: TopicStream, step: float) -> Array:
-        """Return the values of a path at each row."""
-        stream = streams.get(self._field(path)[0])
-        if stream is None:
-            return rows.values(path)
-        zero = float(rows.t[0])
-        return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
 
     def _apart(self, rows: TopicStream, stream: TopicStream) -> BadValue:
         if not len(stream.t):
@@ -262,23 +255,18 @@ class TopicStream:
     def add(self, batch: Batch, connection: Connection) -> None:
         """Take the messages of a batch in; raises BadValue where arrays in them differ in length."""
         if connection.type != self.type:
-            self._note("of another type, left out", len(batch.times), f"logged at {_moment(batch.times[0])}")
+            self._note("of another type, left out", np.ones(len(batch.times), np.bool_), batch.times)
             return
         if connection.encoding not in self._decoders:
             self._decoders[connection.encoding] = Decoder(self.types, self.type, connection.encoding, self.leaves)
         columns, good = self._decoders[connection.encoding].decode(batch)
-        if not np.all(good):
-            first = _moment(batch.times[np.argmin(good)])
-            self._note("that cannot be decoded, left out", int(np.sum(~good)), f"logged at {first}")
+        self._note("that cannot be decoded, left out", ~good, batch.times)
         if not np.any(good):
             return
         time = self._timed(batch.times, columns, good)
-        n = len(good)
-        self._parts.append({
-            path: self._same(path, field, column(field, columns, n))[good]
-            for path, field in self.fields.items()
-            if field is not None
-        })  # fmt: skip
+        fields = {path: field for path, field in self.fields.items() if field is not None}
+        self._check_widths(fields)
+        self._parts.append({path: column(field, columns, len(good))[good] for path, field in fields.items()})
         self._times.append(time[good])
         self.pending += int(np.sum(good))
 
@@ -296,11 +284,8 @@ class TopicStream:
                 "were expected; set stamp: log"
             )
         time = np.concatenate([np.empty(0, np.int64), *self._times])
-        late = time < np.maximum.accumulate(time)
-        order = np.arange(len(time))
-        if np.any(late):
-            self._note("that stand after a later one, put in order", int(np.sum(late)), f"at {_moment(time[late][0])}")
-            order = np.argsort(time, kind="stable")
+        self._note("that stand after a later one, put in order", time < np.maximum.accumulate(time), time, "at")
+        order = np.argsort(time, kind="stable")
         cut = len(order) if final else max(len(order) - HELD, 0)
         now, later = order[:cut], order[cut:]
         whole = {path: np.concatenate([part[path] for part in self._parts]) for path in (self._parts or [{}])[0]}
@@ -319,47 +304,36 @@ class TopicStream:
         n = int(np.sum(good))
         self._seen += n
         if self.bare:
-            self._note("that have no header, taken by the log's time", n, "message 1")
+            self.faults.add(f"messages on {self.topic} that have no header, taken by the log's time", n, "message 1")
         if not self.stamped:
             return log
-        self._framed(columns[FRAME][good], log[good])
+        self._frame = bytes(columns[FRAME][good][0]) if self._frame is None else self._frame
+        shown, other = self._frame.decode("utf-8", "replace"), good & (columns[FRAME] != self._frame)
+        self._note(f"whose frame_id is not '{shown}', as that of the first", other, log)
         sec, nanosec = (columns[name].astype(np.int64) for name in STAMP)
         time: Integers = sec * SECOND + nanosec
         zero = good & (time == 0)
-        if np.any(zero):
-            self._note(
-                "with a stamp of zero, left out", int(np.sum(zero)), f"logged at {_moment(log[np.argmax(zero)])}"
-            )
-            self._zero += int(np.sum(zero))
-            good &= ~zero
+        self._note("with a stamp of zero, left out", zero, log)
+        self._zero += int(np.sum(zero))
+        good &= ~zero
         return time
 
-    def _framed(self, frames: NDArray[Any], times: Integers) -> None:
-        """Note where a message is of another frame than the first."""
-        self._frame = bytes(frames[0]) if self._frame is None else self._frame
-        other = np.flatnonzero(frames != self._frame)
-        if len(other):
-            shown = self._frame.decode("utf-8", "replace")
-            where = f"logged at {_moment(times[other[0]])}"
-            self._note(f"whose frame_id is not '{shown}', as that of the first", len(other), where)
-
-    def _same(self, path: str, field: Field, values: Array) -> Array:
-        """Return a column; raises BadValue where it is of arrays that differ in length."""
-        if field.sort == "array":
+    def _check_widths(self, fields: Mapping[str, Field]) -> None:
+        """Raise BadValue where a field is of arrays that differ in length."""
+        for path, field in fields.items():
             widths = {width for decoder in self._decoders.values() for width in decoder.widths[field.leaves[0]]}
-            if len(widths) > 1:
+            if field.sort == "array" and len(widths) > 1:
                 raise BadValue(
                     f"{self.path}: '{path}' has arrays of {min(widths)} to {max(widths)} values, arrays of one length "
                     f"were expected; name one value of them, as {path}[0]"
                 )
-        return values
 
-    def _note(self, what: str, count: int, where: str) -> None:
-        self.faults.add(f"messages on {self.topic} {what}", count, where)
-
-
-def _moment(nanoseconds: np.int64) -> str:
-    return f"{nanoseconds // SECOND}.{nanoseconds % SECOND:09d} s"
+    def _note(self, what: str, which: NDArray[np.bool_], times: Integers, at: str = "logged at") -> None:
+        """Count messages, by flags and the times (n,) of all in ns."""
+        if np.any(which):
+            first = times[np.argmax(which)]
+            where = f"{at} {first // SECOND}.{first % SECOND:09d} s"
+            self.faults.add(f"messages on {self.topic} {what}", int(np.sum(which)), where)
 
 
 @hookimpl
@@ -404,9 +378,9 @@ def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
     if first.startswith(sqlite.SIGNATURE):
         return sqlite.Sqlite(path, faults)
     if first.startswith(ros1.SIGNATURE):
-        return ros1.Ros1(path, stack.enter_context(path.open("rb")), faults)
+        return ros1.Ros1(path, faults)
     if first.startswith(mcap.SIGNATURE):
-        return mcap.Mcap(path, stack.enter_context(path.open("rb")), faults)
+        return mcap.Mcap(path, faults)
     if first.startswith(b"#ROSBAG V"):
         version = first.partition(b"\n")[0].decode("latin-1")
         raise UnreadableFile(

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import TimeBudget, size_of
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile, quote
+from fusion_plugins.sources.joining import records
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
 
 MAX_LAYOUTS = 8  # layouts at a time
@@ -51,15 +52,12 @@ class MessageLayout(NamedTuple):
 
     Attributes
     ----------
-    need : int
-        Bytes from the beginning that hold them.
     record : dtype
-        The wanted numbers by their paths, and the lengths that tell the layout by `#k`.
+        The wanted numbers by their paths, and the lengths that tell the layout by `#k`; as long as holds them all.
     lengths : dict of str to int
         The values of the fields `#k` in messages of this layout.
     """
 
-    need: int
     record: np.dtype[np.void]
     lengths: Mapping[str, int]
 
@@ -104,15 +102,13 @@ class Decoder:
         self, layout: MessageLayout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]
     ) -> NDArray[np.bool_]:
         """Copy what messages of a layout hold into the columns; return which they were."""
-        fits = batch.sizes[at] >= layout.need
+        fits = batch.sizes[at] >= layout.record.itemsize
         if not np.any(fits):
             return fits
-        # every place in the data where such a message could begin, without a copy
-        windows = np.ndarray((len(batch.data) - layout.need + 1,), f"V{layout.need}", batch.data, strides=(1,))
-        records = windows[batch.starts[at[fits]]].view(layout.record)
-        same = np.ones(len(records), dtype=np.bool_)
+        values = records(batch.data, batch.starts[at[fits]], layout.record)
+        same = np.ones(len(values), dtype=np.bool_)
         for name, value in layout.lengths.items():
-            same &= records[name] == value
+            same &= values[name] == value
         fits[fits] = same
         rows = at[fits]
         for leaf, widths in self.widths.items():
@@ -121,22 +117,19 @@ class Decoder:
                 widths.add(shape[0])
         for name in layout.record.names or ():
             if not name.startswith("#"):
-                _put(columns, name, len(batch.starts), rows, records[name][same])
+                _put(columns, name, len(batch.starts), rows, values[name][same])
         return fits
 
     def _layout(self, data: bytes, start: int, size: int) -> MessageLayout:
         walk = _Walk(self.types, memoryview(data)[start : start + size], self.encoding == "cdr", self.leaves)
         walk.through(self.kind)
-        names, formats, offsets = [], [], []
-        for name, (form, offset) in {**walk.lengths_at, **walk.places}.items():
-            names.append(name)
-            formats.append(form)
-            offsets.append(offset)
+        places = {**walk.lengths_at, **walk.places}
+        formats, offsets = [form for form, _ in places.values()], [offset for _, offset in places.values()]
         need = max((o + np.dtype(f).itemsize for f, o in zip(formats, offsets, strict=True)), default=0)
         if not 0 < need <= size:
             raise ValueError("the message is cut")
-        record = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": need})
-        return MessageLayout(need, record, walk.lengths)
+        record = np.dtype({"names": list(places), "formats": formats, "offsets": offsets, "itemsize": need})
+        return MessageLayout(record, walk.lengths)
 
 
 def _put(columns: dict[str, NDArray[Any]], name: str, n: int, rows: Integers, values: NDArray[Any]) -> None:

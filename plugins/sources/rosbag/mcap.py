@@ -16,7 +16,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Set
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import ClassVar
 from zlib import crc32
 
 from fusion_core.budget import LISTED, PIECE, TEXTS, check_count, check_size, size_of
@@ -30,7 +30,7 @@ STAMPED = struct.Struct("<BQHIQQ")  # a message: op, length, channel, sequence, 
 CHUNK_HEAD = struct.Struct("<QQQI")  # first and last time, size when unpacked, checksum
 LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}
 REPAIR = "`mcap recover IN -o OUT` repairs it"
-READ = 4 << 20  # bytes of messages outside chunks that are read at a time
+READ = 4 << 20  # bytes of messages outside chunks that are read at a time, where there is more than one
 
 
 class Mcap(storage.ChunkedFile):
@@ -38,13 +38,13 @@ class Mcap(storage.ChunkedFile):
 
     repair: ClassVar[str] = REPAIR
 
-    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
+    def __init__(self, path: Path, faults: Faults) -> None:
         self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
         self._counts: dict[int, int] = {}
-        super().__init__(path, file, faults)
+        super().__init__(path, faults)
 
-    def count(self, connection: int) -> int | None:
+    def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
         return self._counts.get(connection, 0)
 
@@ -54,21 +54,19 @@ class Mcap(storage.ChunkedFile):
             yield storage.Connection(number, topic, storage.ros2_name(name), text, LANGUAGES.get(form, ""), encoding)
 
     def _indexed(self) -> bool:
-        tail = HEAD.size + 20 + len(SIGNATURE)
-        if self.size < tail + len(SIGNATURE):
+        end = self.size - HEAD.size - 20 - len(SIGNATURE)
+        if end < len(SIGNATURE) or HEAD.unpack_from(self.data, end) != (FOOTER, 20):
             return False
-        self.file.seek(-tail, 2)
-        footer = self.file.read(tail)
-        start = struct.unpack_from("<Q", footer, HEAD.size)[0]
-        if HEAD.unpack_from(footer) != (FOOTER, 20) or not footer.endswith(SIGNATURE) or not 0 < start < self.size:
+        at = struct.unpack_from("<Q", self.data, end + HEAD.size)[0]
+        if self.data[-len(SIGNATURE) :] != SIGNATURE or not 0 < at < self.size:
             return False
-        self.file.seek(start)
-        check_size(self.path, "the summary", self.size - tail - start, PIECE)
-        summary, at, declared = self.file.read(self.size - tail - start), 0, None
+        check_size(self.path, "the summary", end - at, PIECE)
+        declared = None
         try:
-            while at < len(summary):
-                op, length = HEAD.unpack_from(summary, at)
-                content, at = summary[at + HEAD.size : at + HEAD.size + length], at + HEAD.size + length
+            while at < end:
+                op, length = HEAD.unpack_from(self.data, at)
+                begin, at = at + HEAD.size, at + HEAD.size + length
+                content = self.data[begin : min(at, end)]
                 self.clock.tick()
                 self._describe(op, content)
                 if op == INDEX:
@@ -118,9 +116,7 @@ class Mcap(storage.ChunkedFile):
         at, op = len(SIGNATURE), 0
         while at + HEAD.size <= self.size and op not in (END, FOOTER):
             self.clock.tick()
-            self.file.seek(at)
-            head = self.file.read(HEAD.size)
-            op, length = HEAD.unpack(head)
+            op, length = HEAD.unpack_from(self.data, at)
             end = at + HEAD.size + length
             if op == MESSAGE:
                 end = self._loose(at)
@@ -131,7 +127,7 @@ class Mcap(storage.ChunkedFile):
                 break
             elif op in (SCHEMA, CHANNEL):
                 check_size(self.path, f"the record at byte {at}", length, TEXTS)
-                self._learn(op, self.file.read(length), at)
+                self._learn(op, self.data[at + HEAD.size : end], at)
             if end == at:
                 break
             at = end
@@ -141,41 +137,29 @@ class Mcap(storage.ChunkedFile):
 
     def _loose(self, at: int) -> int:
         """Keep messages that stand outside chunks, from an offset on; return where they end."""
-        self.file.seek(at)
-        data = self.file.read(READ)
-        length = HEAD.unpack_from(data)[1]
-        if at + HEAD.size + length > self.size:
-            return at
-        check_size(self.path, f"the message at byte {at}", length, LISTED)
-        if HEAD.size + length > len(data):
-            data += self.file.read(HEAD.size + length - len(data))
-        end = 0
-        while end + STAMPED.size <= len(data) and data[end] == MESSAGE:
-            step = end + HEAD.size + HEAD.unpack_from(data, end)[1]
-            if step > len(data):
+        end = at
+        while end + STAMPED.size <= self.size and self.data[end] == MESSAGE:
+            length = HEAD.unpack_from(self.data, end)[1]
+            step = end + HEAD.size + length
+            if step > self.size or (end > at and step > at + READ):
                 break
+            check_size(self.path, f"the message at byte {end}", length, LISTED)
             end = step
-        if end:
-            self._look(storage.Piece(at, None, end, chunk=False))
-        return at + end
+        if end > at:
+            self._look(storage.Piece(at, None, end - at, chunk=False))
+        return end
 
     def _look(self, piece: storage.Piece) -> None:
         """Keep a piece with the number of its messages."""
-        counts = self._messages(piece, self._read(piece, quiet=False), None, quiet=False).counts()
+        counts = storage.counted(self._messages(piece, self._content(piece), None))
         for number, n in counts.items():
             self._counts[number] = self._counts.get(number, 0) + n
         if counts:
             self._add(piece._replace(counts=counts))
 
     def _content(self, piece: storage.Piece) -> bytes:
-        return self._read(piece, quiet=self.scanned)
-
-    def _read(self, piece: storage.Piece, *, quiet: bool) -> bytes:
-        """Return the records of a piece as far as they are whole, unpacked; missing ones are reported."""
-        what, there = f"the chunk at byte {piece.offset}", max(min(piece.length, self.size - piece.offset), 0)
-        check_size(self.path, what, there, LISTED)
-        self.file.seek(min(piece.offset, self.size))
-        data = self.file.read(there)
+        what = f"the chunk at byte {piece.offset}"
+        data = self._stored(what, piece.offset, piece.offset + piece.length)
         if not piece.chunk:
             return data
         try:
@@ -192,13 +176,13 @@ class Mcap(storage.ChunkedFile):
             records, whole = storage.unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path, what)
         if whole and len(records) == size and checksum and crc32(records) != checksum:
             records = b""
-        if not records and (size or not good) and not quiet:
+        if not records and (size or not good):
             self._lose(len(data), f"in the chunk at byte {piece.offset}")
         return records
 
     def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[storage.ChunkMessages, int]:
-        messages, at, total = storage.ChunkMessages(), 0, len(data)
-        lists, unpack = messages.messages, STAMPED.unpack_from
+        messages: storage.ChunkMessages = {}
+        at, total, unpack = 0, len(data), STAMPED.unpack_from
         while at + HEAD.size <= total:
             if data[at] == MESSAGE and at + STAMPED.size <= total:
                 _, length, channel, _, time, _ = unpack(data, at)
@@ -206,7 +190,7 @@ class Mcap(storage.ChunkedFile):
                 if end > total or length < STAMPED.size - HEAD.size:
                     break
                 if wanted is None or channel in wanted:
-                    lists.setdefault(channel, []).extend((time, at + STAMPED.size, end - at - STAMPED.size))
+                    messages.setdefault(channel, []).extend((time, at + STAMPED.size, end - at - STAMPED.size))
             else:
                 op, length = HEAD.unpack_from(data, at)
                 end = at + HEAD.size + length

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Set
+from mmap import mmap
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,6 +33,7 @@ LONGEST = 1 << 20  # bytes of a header
 COUNTS = 4_000_000  # of messages by chunk and connection
 VALUES = {b"conn": "I", b"op": "B", b"time": "Q"}
 REPAIR = "`rosbag reindex` repairs a copy"
+DAMAGED = (ValueError, KeyError, IndexError, struct.error)  # what a record raises that is none
 
 
 class Ros1(storage.ChunkedFile):
@@ -39,35 +41,36 @@ class Ros1(storage.ChunkedFile):
 
     repair: ClassVar[str] = REPAIR
 
-    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
+    def __init__(self, path: Path, faults: Faults) -> None:
         self._raw: dict[int, tuple[bytes, bytes]] = {}  # of each connection: topic, and the fields of its data
         self._form = _HeaderLayout(b"")
-        super().__init__(path, file, faults)
+        super().__init__(path, faults)
 
-    def count(self, connection: int) -> int | None:
+    def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
         return sum((piece.counts or {}).get(connection, 0) for piece in self.pieces)
 
     def _indexed(self) -> bool:
         try:
-            first = self._record(len(SIGNATURE))[0]
-            start = int.from_bytes(first[b"index_pos"], "little")
+            first = _record(self.data, len(SIGNATURE))[0]
+            start = at = int.from_bytes(first[b"index_pos"], "little")
             if not len(SIGNATURE) < start <= self.size or self.size - start > LISTED:
                 return False
-            self.file.seek(start)
-            data, at, pairs = self.file.read(), 0, 0
-            while at < len(data):
+            pairs = 0
+            while at < self.size:
                 self.clock.tick()
-                header, begin, at = _record(data, at)
+                header, begin, at = _record(self.data, at)
+                if at > self.size:
+                    return False
                 if header[b"op"][0] == CONNECTION:
-                    self._keep(header, data[begin:at])
+                    self._keep(header, self.data[begin:at])
                 elif header[b"op"][0] == INFO:
                     pairs += (at - begin) // 8
                     check_count(self.path, "counts of messages in its index", pairs, COUNTS)
-                    counts = dict(np.frombuffer(data[begin:at], "<u4").reshape(-1, 2).tolist())
+                    counts = dict(np.frombuffer(self.data[begin:at], "<u4").reshape(-1, 2).tolist())
                     self.pieces.append(storage.Piece(int.from_bytes(header[b"chunk_pos"], "little"), counts))
             declared = tuple(int.from_bytes(first[name], "little") for name in (b"conn_count", b"chunk_count"))
-        except (ValueError, KeyError, IndexError, struct.error):
+        except DAMAGED:
             return False
         inside = all(piece.offset < start for piece in self.pieces)
         return inside and declared == (len(self._raw), len(self.pieces))
@@ -79,24 +82,21 @@ class Ros1(storage.ChunkedFile):
         while at < self.size:
             self.clock.tick()
             try:
-                header, begin, end = self._record(at)
+                header, begin, end = _record(self.data, at)
                 kind = header[b"op"][0]
                 if kind == CHUNK:
                     data, whole = self._chunk(at, None)
-                    messages, walked = self._walk(data, None)
-                    self.clock.check(len(messages))
-                    self.pieces.append(storage.Piece(at, messages.counts()))
-                    pairs += len(messages.messages) + 1
-                    check_count(self.path, "connections in its chunks", pairs, COUNTS)
                     end = min(end, self.size)
-                    if not whole and not walked:
+                    if not whole and not self._walk(data, None)[1]:
                         self._lose(end - at, f"at byte {at}")
-                    self._lose(len(data) - walked, f"in the chunk at byte {at}")
+                    counts = storage.counted(self._messages(storage.Piece(at, None), data, None))
+                    self.pieces.append(storage.Piece(at, counts))
+                    pairs += len(counts) + 1
+                    check_count(self.path, "connections in its chunks", pairs, COUNTS)
                 elif kind == CONNECTION:
                     check_size(self.path, f"the connection at byte {at}", end - begin, TEXTS)
-                    self.file.seek(begin)
-                    self._keep(header, self.file.read(end - begin))
-            except (ValueError, KeyError, IndexError, struct.error):
+                    self._keep(header, self.data[begin:end])
+            except DAMAGED:
                 self._lose(self.size - at, f"at byte {at}")
                 return
             at = end
@@ -117,42 +117,30 @@ class Ros1(storage.ChunkedFile):
             self._raw[number] = header[b"topic"], data
             self._add_text(len(data) + len(header[b"topic"]) + 100, "connections")  # of a small one the objects
 
-    def _record(self, at: int) -> tuple[dict[bytes, bytes], int, int]:
-        """Return the header of the record at an offset of the file, and where its data begins and ends."""
-        self.file.seek(at)
-        length = storage.U32.unpack(self.file.read(4))[0]
-        if length > LONGEST:
-            raise ValueError("no record")
-        header = self.file.read(length + 4)
-        begin = at + 8 + length
-        return _fields(header[:-4]), begin, begin + storage.U32.unpack(header[length:])[0]
-
     def _content(self, piece: storage.Piece) -> bytes:
         return self._chunk(piece.offset, piece.counts)[0]
 
     def _chunk(self, offset: int, counts: Mapping[int, int] | None) -> tuple[bytes, bool]:
         """Return the records of a chunk and whether it is whole; missing messages of its `counts` are reported."""
         try:
-            header, begin, end = self._record(offset)
+            header, begin, end = _record(self.data, offset)
             compression = header[b"compression"].decode()
-        except (ValueError, KeyError, struct.error):
+        except DAMAGED:
             self.faults.add("messages in damaged chunks, lost", sum((counts or {}).values()), f"at byte {offset}")
             return b"", False
         what = f"the chunk at byte {offset}"
-        check_size(self.path, what, min(end, self.size) - begin, LISTED)
-        self.file.seek(begin)
-        stored = self.file.read(max(min(end, self.size) - begin, 0))
+        stored = self._stored(what, begin, end)
         what += f", which declares {int.from_bytes(header.get(b'size', b''), 'little')} bytes,"
         data, whole = storage.unpacked(stored, compression, self.path, what)
-        whole = whole and len(stored) == end - begin
+        whole = whole and end <= self.size
         if not whole and counts is not None:
-            lost = sum(counts.values()) - len(self._walk(data, None)[0])
+            lost = sum(counts.values()) - sum(storage.counted(self._walk(data, None)[0]).values())
             self.faults.add("messages in damaged chunks, lost", max(lost, 0), f"at byte {offset}")
         return data, whole
 
     def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[storage.ChunkMessages, int]:
-        messages, at, form = storage.ChunkMessages(), 0, self._form
-        lists = messages.messages
+        messages: storage.ChunkMessages = {}
+        at, form = 0, self._form
         while at + form.size <= len(data):
             values = form.unpack_from(data, at)
             if form.fixed(values) != form.expected:
@@ -166,7 +154,7 @@ class Ros1(storage.ChunkedFile):
                 break
             if wanted is None or values[form.connection] in wanted:
                 time = values[form.time]
-                lists.setdefault(values[form.connection], []).extend(
+                messages.setdefault(values[form.connection], []).extend(
                     ((time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), begin, values[-1])
                 )
             at = end
@@ -178,12 +166,14 @@ class Ros1(storage.ChunkedFile):
         try:
             header, begin, end = _record(data, at)
             kind = header[b"op"][0]
+            if end > len(data):
+                return None
             if kind == CONNECTION:
                 self._keep(header, data[begin:end])
             if kind != MESSAGE:
                 return end
             self._form = _HeaderLayout(data[at : begin - 4])
-        except (ValueError, KeyError, IndexError, struct.error):
+        except DAMAGED:
             return None
         return at if self._form.size == begin - at else None
 
@@ -221,13 +211,10 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def _record(data: bytes, at: int) -> tuple[dict[bytes, bytes], int, int]:
-    """Return the header of a record, and where its data begins and ends; raises ValueError where it is not whole."""
+def _record(data: bytes | mmap, at: int) -> tuple[dict[bytes, bytes], int, int]:
+    """Return the header of a record, and where its data begins and ends, which may be behind the end of all."""
     length = storage.U32.unpack_from(data, at)[0]
     if length > LONGEST:
         raise ValueError("no record")
     begin = at + 8 + length
-    end = begin + storage.U32.unpack_from(data, begin - 4)[0]
-    if end > len(data):
-        raise ValueError("a record is cut")
-    return _fields(data[at + 4 : begin - 4]), begin, end
+    return _fields(data[at + 4 : begin - 4]), begin, begin + storage.U32.unpack_from(data, begin - 4)[0]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator, Set
 from contextlib import closing
-from itertools import compress
 from pathlib import Path
 from urllib import parse
 
@@ -18,7 +17,7 @@ import numpy as np
 from fusion_core.budget import LISTED, PIECE, TEXTS, TimeBudget, check_size, size_of
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
-from fusion_plugins.sources.rosbag.storage import Batch, Connection, ros2_name
+from fusion_plugins.sources.rosbag.storage import Batch, Connection, packed, ros2_name
 
 SIGNATURE = b"SQLite format 3\0"
 ROWS = 4096  # messages that are read at a time,
@@ -104,15 +103,9 @@ class Sqlite:
 
     def _grouped(self, rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:
         """Yield messages by their topic."""
-        if rows:
-            topics, times, messages = zip(*rows, strict=True)
-            for number in sorted(set(topics)):
-                mine = [topic == number for topic in topics]
-                yield self._batch(number, list(compress(times, mine)), list(compress(messages, mine)))
-
-    def _batch(self, number: int, times: list[int], messages: list[bytes]) -> Batch:
-        sizes = np.array([len(data) for data in messages], dtype=np.int64)
-        return Batch(number, np.array(times, dtype=np.int64), b"".join(messages), np.cumsum(sizes) - sizes, sizes)
+        for number in sorted({topic for topic, *_ in rows}):
+            _, times, messages = zip(*(row for row in rows if row[0] == number), strict=True)
+            yield packed(number, np.array(times, dtype=np.int64), messages)
 
     def _connect(self) -> sqlite3.Connection:
         """Open for reading; without a log beside it, nothing is written next to the file."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,39 +68,8 @@ class Batch(NamedTuple):
     sizes: Integers
 
 
-class Storage(Protocol):
-    """An open bag file."""
-
-    connections: list[Connection]
-
-    def count(self, connection: int) -> int | None:
-        """Return the number of messages of a connection, None where a damaged file does not tell."""
-
-    def batches(self, wanted: Set[int]) -> Iterator[Batch]:
-        """Yield the messages of the wanted connections as they stand in the file."""
-
-
-class ChunkMessages:
-    """Messages of one chunk, by connection: time, start and size of each."""
-
-    def __init__(self) -> None:
-        self.messages: dict[int, list[int]] = {}
-
-    def __len__(self) -> int:
-        """Return the number of messages."""
-        return sum(len(flat) for flat in self.messages.values()) // 3
-
-    def counts(self) -> dict[int, int]:
-        """Return the number of messages of each connection."""
-        return {connection: len(flat) // 3 for connection, flat in self.messages.items()}
-
-    def batches(self, data: bytes) -> Iterator[Batch]:
-        """Yield them as arrays."""
-        for connection, flat in self.messages.items():
-            times, starts, sizes = (
-                np.array(flat, dtype=np.uint64).view(np.int64).reshape(-1, 3).T
-            )  # a damaged time may be any
-            yield Batch(connection, times, data, starts, sizes)
+ChunkMessages = dict[int, list[int]]
+"""Messages of one chunk by connection: time, start and size of each, one after the other."""
 
 
 class Piece(NamedTuple):
@@ -116,18 +86,24 @@ class ChunkedFile(ABC):
 
     repair: ClassVar[str]
 
-    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
-        self.path, self.file, self.faults = path, file, faults
-        self.size = file.seek(0, 2)
+    def __init__(self, path: Path, faults: Faults) -> None:
+        self.path, self.faults = path, faults
+        with path.open("rb") as file:
+            self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self.size = len(self.data)
         self.pieces: list[Piece] = []
         self._texts = 0  # bytes of definitions and topics
+        self._told: set[str] = set()  # places whose losses were reported
         self.clock = TimeBudget(path, "what is no message")
         with self.clock:
-            self.scanned = not self._indexed()
-            if self.scanned:
+            if not self._indexed():
                 self.pieces = []
                 self._scan()
         self.connections = list(self._connected())
+
+    @abstractmethod
+    def count(self, connection: int) -> int:
+        """Return the number of messages of a connection."""
 
     @abstractmethod
     def _indexed(self) -> bool:
@@ -156,23 +132,40 @@ class ChunkedFile(ABC):
                 continue
             with self.clock:
                 data = self._content(piece)
-                messages = self._messages(piece, data, wanted, quiet=self.scanned)
-            yield from messages.batches(data)
+                messages = self._messages(piece, data, wanted)
+            for connection, flat in messages.items():
+                # a damaged time may be any
+                times, starts, sizes = np.array(flat, dtype=np.uint64).view(np.int64).reshape(-1, 3).T
+                yield Batch(connection, times, data, starts, sizes)
 
-    def _messages(self, piece: Piece, data: bytes, wanted: Set[int] | None, *, quiet: bool) -> ChunkMessages:
-        """Return the messages in a piece; bytes behind its last whole record are reported, once."""
+    def _messages(self, piece: Piece, data: bytes, wanted: Set[int] | None) -> ChunkMessages:
+        """Return the messages in a piece; bytes behind its last whole record are reported."""
         messages, end = self._walk(data, wanted)
-        self.clock.check(len(messages))
-        if not quiet:
-            self._lose(len(data) - end, f"in the chunk at byte {piece.offset}")
+        self.clock.check(sum(counted(messages).values()))
+        self._lose(len(data) - end, f"in the chunk at byte {piece.offset}")
         return messages
+
+    def _stored(self, what: str, begin: int, end: int) -> bytes:
+        """Return bytes of the file as far as they are there; raises UnreadableFile beyond the budget."""
+        check_size(self.path, what, min(end, self.size) - begin, LISTED)
+        data = self.data[begin:end]
+        self.data.madvise(mmap.MADV_DONTNEED)  # what was copied needs no memory twice
+        return data
 
     def _add_text(self, count: int, what: str) -> None:
         self._texts += count
         check_size(self.path, f"the text of its {what}", self._texts, TEXTS)
 
     def _lose(self, count: int, where: str) -> None:
-        self.faults.add(f"bytes that are no whole record, lost; {self.repair}", count, where)
+        """Report bytes that are lost, once, however often they are met."""
+        if count and where not in self._told:
+            self._told.add(where)
+            self.faults.add(f"bytes that are no whole record, lost; {self.repair}", count, where)
+
+
+def counted(messages: ChunkMessages) -> dict[int, int]:
+    """Return the number of messages of each connection."""
+    return {connection: len(flat) // 3 for connection, flat in messages.items()}
 
 
 def plain(batch: Batch, path: Path) -> Batch:
@@ -184,8 +177,13 @@ def plain(batch: Batch, path: Path) -> Batch:
         what = f"a batch of {len(batch.starts)} messages"
         messages.append(unpacked(batch.data[start:end], "zstd", path, what, left)[0])
         left -= len(messages[-1])
+    return packed(batch.connection, batch.times, messages)
+
+
+def packed(connection: int, times: Integers, messages: Sequence[bytes]) -> Batch:
+    """Return messages of a connection as one batch."""
     sizes = np.array([len(data) for data in messages], dtype=np.int64)
-    return batch._replace(data=b"".join(messages), starts=np.cumsum(sizes) - sizes, sizes=sizes)
+    return Batch(connection, times, b"".join(messages), np.cumsum(sizes) - sizes, sizes)
 
 
 def ros2_name(name: str) -> str:

@@ -35,7 +35,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import SimulatedSource, Site, Source, Twin
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_core.recursions import LaggedLines
+from fusion_core.recursions import LaggedLines, play
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.earth import earth_rate, gravity
@@ -121,11 +121,8 @@ class TrueBias:
     def _play(self) -> Array:
         """The play operator (S,) in degC at the beginning of each monotone piece, from the middle of its play."""
         assert self.hysteresis is not None
-        T, half = self.body.lagged(self.body.t), self.hysteresis.width / 2
-        play = T.copy()
-        for i in range(1, len(T)):
-            play[i] = np.clip(play[i - 1], T[i] - half, T[i] + half)
-        return play
+        T = self.body.lagged(self.body.t)
+        return np.asarray(play(T, self.hysteresis.width, T[0]))
 
 
 BLOCK = 65_536  # samples drawn at a time; another number gives other samples

@@ -49,7 +49,7 @@ def _number(value: object) -> object:
 
 
 class Ulog(FileSource):
-    """A log of PX4; needs pyulog (`pip install 'driftlab[px4]'`)."""
+    """A log of PX4."""
 
     signatures: ClassVar[tuple[bytes, ...]] = (b"ULog\x01\x125",)
     suffixes: ClassVar[tuple[str, ...]] = (".ulg",)
@@ -82,11 +82,10 @@ class Ulog(FileSource):
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
-        """Open the log; raises ConfigError without pyulog, MissingChannel where it lacks a sensor that is asked for."""
-        from fusion_plugins.sources.ulog.file import LogFile, require_pyulog
+        """Open the log; raises MissingChannel where it lacks a sensor that is asked for."""
+        from fusion_plugins.sources.ulog.file import LogFile
         from fusion_plugins.sources.ulog.table import ULogTopics
 
-        require_pyulog(self.kind)
         log = LogFile(path, self.kind)
         table = ULogTopics(log, self._gyro(log), faults)
         self._check_sensors(table)

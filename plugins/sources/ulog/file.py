@@ -1,16 +1,12 @@
 """A ULog file: its sensors, its parameters, and the rows of those that are wanted.
 
-The file is read twice, block after block: once for its definitions and some rows of each sensor, once for the wanted
-rows. The whole messages make a ULog, which pyulog decodes.
-
-Whole messages of a ULog file: what is cut or damaged is stepped over and counted.
-
 ::
 
     size (2 bytes, little endian), type (1 byte), size bytes        D: the first two of them are the subscription
 
 A message counts where the one behind it can be one too; else the next place is looked for from which three
-messages follow one another. ULog has no checksum: a flipped bit inside the numbers of a row is not seen.
+messages follow one another: what is cut or damaged is stepped over and counted. ULog has no checksum: a flipped bit
+inside the numbers of a row is not seen.
 
 Source: the ULog file format (docs.px4.io, Log File Format).
 
@@ -24,13 +20,13 @@ src/lib/drivers/device/Device.hpp and src/drivers/drv_sensor.h.
 
 from __future__ import annotations
 
-import io
 import struct
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -39,13 +35,22 @@ from numpy.typing import NDArray
 from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
 from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
-from fusion_core.errors import ConfigError, UnreadableFile, quote
+from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
+from fusion_plugins.sources.joining import records
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
+FLAGS = 40  # bytes of the message of flags, at least
 FIELDS, DEEP = 300_000, 16  # numbers in a row of each topic, in all, and formats in one another
 APPENDED = 1  # the bit of the incompatible flags that says that data stands behind the log's end
+PADDING = "_padding"  # what fields are called that fill a row up, and that a logger leaves out at its end
+NUMBERS = {
+    **{f"{sign}int{8 * size}_t": f"<{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
+    "float": "<f4", "double": "<f8", "bool": "i1", "char": "i1",
+}  # fmt: skip
+U16 = np.dtype("<u2")
+Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +61,34 @@ class Instance:
     ----------
     topic, number : str, int
         As in `sensor_gyro[1]`.
-    rows : int
-    samples : dict of str to array
-        Some of its rows, by field.
+    at : (N,) array of int
+        Where the messages of its rows begin.
+    row : dtype
+        The fields of a row.
+    data : (B,) array of uint8
+        The file.
     """
 
     topic: str
     number: int
-    subscription: int
-    rows: int
-    samples: Mapping[str, Array]
+    at: Places
+    row: np.dtype[np.void]
+    data: NDArray[np.uint8]
+
+    def columns(self, rows: Places | slice = slice(None)) -> dict[str, Array]:
+        """Return rows of it by field."""
+        values: Any = records(self.data, self.at[rows] + 5, self.row)
+        return {name: values[name] for name in self.row.names or ()}
+
+    @cached_property
+    def samples(self) -> Mapping[str, Array]:
+        """Some of its rows, by field."""
+        return self.columns(sampled(self.rows))
+
+    @property
+    def rows(self) -> int:
+        """Number of its rows."""
+        return len(self.at)
 
     @property
     def device(self) -> int | None:
@@ -117,22 +140,19 @@ class LogFile:
         first = head(path)
         if not first.startswith(SIGNATURE):
             raise foreign(path, first, kind)
-        self.path, self.size = path, path.stat().st_size
-        self.clock = TimeBudget(path, "what is no row")
-        self._flags, self._ends = _sections(path, first, self.size)
-        log = self._decoded(RowSelection(), counted := Counted())
-        if not any("timestamp" in d.data for d in log.data_list):
-            raise UnreadableFile(f"{path}: ends before its first row ({self.size} bytes); copy or log it again")
-        # of a damaged log, a parameter may be anything
-        known = log.initial_parameters.items()
-        self.parameters: dict[str, float] = {name: value for name, value in known if isinstance(value, int | float)}
-        self._formats = log.message_formats
-        self.instances = {
-            (d.name, d.multi_id): Instance(d.name, d.multi_id, d.msg_id, int(counted.rows[d.msg_id]), d.data)
-            for d in log.data_list
-            if "timestamp" in d.data  # else its format is damaged
-        }
-        self._row_sizes = {d.msg_id: self._row_size(d) for d in log.data_list}
+        self.path, self.data = path, np.asarray(np.memmap(path, np.uint8, "r"))
+        self.parameters: dict[str, float] = {}
+        self._formats: dict[str, list[tuple[str, int | None, str]]] = {}
+        self._added: dict[int, tuple[str, int, np.dtype[np.void]]] = {}  # topic, number and fields by subscription
+        self._lengths = np.array([[-1], [65535]]).repeat(IDS, axis=1)  # of a row; at least -1: not known
+        self._dropouts: list[tuple[int, float]] = []  # place, and duration in ms
+        self._lost, self._first_lost = 0, -1
+        self._fields = 0  # of all subscriptions
+        rows = self._messages(*_sections(path, first, len(self.data)))
+        found = dict(self._found(rows))
+        self.instances = {key: found[key] for key in sorted(found)}
+        if not self.instances:
+            raise UnreadableFile(f"{path}: ends before its first row ({len(self.data)} bytes); copy or log it again")
 
     def of(self, topic: str) -> list[Instance]:
         """Return the instances of a topic."""
@@ -140,138 +160,124 @@ class LogFile:
 
     def read(self, wanted: Collection[Instance], faults: Faults) -> dict[Instance, dict[str, Array]]:
         """Return the rows of instances, by field; what is wrong with the file goes to `faults`."""
-        rows = RowSelection(*(np.full(65536, value, np.int64) for value in (-1, -1, 0)))
-        for number, (least, most) in self._row_sizes.items():
-            rows.shortest[number], rows.longest[number] = least, most
-        for instance in wanted:
-            rows.step[instance.subscription] = 1
-        log = self._decoded(rows, counted := Counted())
+        data = {instance: instance.columns() for instance in wanted}
         faults.add(
             "bytes of the log that belong to no message that is known (cut, damaged or of a later format)",
-            counted.lost,
-            f"at byte {counted.first_lost} of {self.size}",
+            self._lost,
+            f"at byte {self._first_lost} of {len(self.data)}",
         )
-        if log.dropouts:
-            total = sum(dropout.duration for dropout in log.dropouts) / 1e3
-            first = log.dropouts[0]
+        if self._dropouts:
+            (place, first), total = self._dropouts[0], sum(duration for _, duration in self._dropouts)
+            before = [float(data[i]["timestamp"][i.at < place].max(initial=0)) for i in wanted]
+            begun = int.from_bytes(self.data[HEADER - 8 : HEADER].tobytes(), "little")
             faults.add(
-                f"dropouts, for which the logger wrote nothing ({total:.6g} s in all)",
-                len(log.dropouts),
-                f"of {first.duration / 1e3:.6g} s after t = {first.timestamp / 1e6:.3f} s",
+                f"dropouts, for which the logger wrote nothing ({total / 1e3:.6g} s in all)",
+                len(self._dropouts),
+                f"of {first / 1e3:.6g} s after t = {max(begun, *before) / 1e6:.3f} s",
             )
-        data = {(d.name, d.multi_id): d.data for d in log.data_list}
-        lacking = {instance: {name: v[:0] for name, v in instance.samples.items()} for instance in wanted}
-        return {instance: data.get((instance.topic, instance.number), lacking[instance]) for instance in wanted}
+        return data
 
-    def _row_size(self, data: Any) -> tuple[int, int]:
-        """Return the bytes of a row, without and with what its format has at its end as padding."""
-        from pyulog import ULog
+    def _messages(self, begin: int, ends: Sequence[int]) -> Places:
+        """Read the definitions, and return the places of the rows of what they define."""
+        rows, out, at, count, text = [np.empty(0, np.int64)], np.empty(BLOCK // 5 + 1, np.int64), begin, 0, 0
+        with TimeBudget(self.path, "what is no row") as clock:
+            for end in ends:
+                while at < end:
+                    at, n, lost, first, stopped = _walk(self.data[:end], at, at + BLOCK, self._lengths, out, *TYPES)
+                    rows.append(out[:n].copy())
+                    self._lost, self._first_lost = self._lost + lost, self._first_lost if self._lost else first
+                    clock.check(n + stopped)
+                    if stopped:
+                        size, kind = struct.unpack("<HB", self.data[at : at + 3].tobytes())
+                        with suppress(ValueError, KeyError, IndexError):  # of what is damaged
+                            self._define(chr(kind), at, self.data[at + 3 : at + 3 + size].tobytes())
+                        at, count, text = at + 3 + size, count + 1, text + size
+                        check_count(self.path, "parameters, dropouts and the like", count, COUNT // 2)
+                        check_size(self.path, "what describes its rows", text, TEXTS)
+        return np.concatenate(rows)
 
-        least = sum(ULog.get_field_size(field.type_str) for field in data.field_data)
+    def _define(self, kind: str, at: int, content: bytes) -> None:
+        """Take in a message: formats and parameters before the first subscription, dropouts behind it."""
+        if kind == "A":
+            number, topic = int.from_bytes(content[1:3], "little"), content[3:].decode(errors="ignore")
+            self._added.setdefault(number, ("", 0, np.dtype([])))
+            row, padding = self._row(topic)
+            self._added[number] = topic, content[0], row
+            self._lengths[:, number] = row.itemsize, row.itemsize + padding
+        elif kind == "O" and self._added:
+            self._dropouts.append((at, int.from_bytes(content, "little")))
+        elif kind == "F" and not self._added:
+            name, fields = content.decode(errors="ignore").split(":")[:2]
+            self._formats[name] = [_declared(field) for field in fields.split(";") if field]
+        elif kind == "P" and not self._added:
+            form, name = content[1 : 1 + content[0]].decode(errors="ignore").split(" ")[:2]
+            (self.parameters[name],) = np.frombuffer(content[1 + content[0] :], NUMBERS[form]).tolist()
+
+    def _found(self, rows: Places) -> Iterator[tuple[tuple[str, int], Instance]]:
+        """Yield the instances that have rows with a time; of several subscriptions of one, the first comes last."""
+        numbers = records(self.data, rows + 3, U16)
+        order = np.argsort(numbers, kind="stable")
+        rows, numbers = rows[order], numbers[order]
+        for number, (topic, instance, row) in reversed(self._added.items()):
+            at = rows[slice(*np.searchsorted(numbers, [number, number + 1]))]
+            if len(at) and "timestamp" in (row.names or ()):
+                yield (topic, instance), Instance(topic, instance, at, row, self.data)
+
+    def _row(self, topic: str) -> tuple[np.dtype[np.void], int]:
+        """Return the fields of a topic's rows, and the bytes of padding behind them."""
+        fields = list(self._flat(topic, topic, "", 0))
         padding = 0
-        for kind, count, name in reversed(self._formats[data.name].fields):
-            if not name.startswith("_padding"):
-                break
-            padding += ULog.get_field_size(kind) * max(count, 1)
-        return least, least + padding
+        while fields and fields[-1][0].startswith(PADDING):
+            padding += np.dtype(fields.pop()[1]).itemsize
+        return np.dtype(fields), padding
 
-    def _decoded(self, wanted: RowSelection, counted: Counted) -> Any:
-        """Return the log that pyulog reads in the whole messages of the file."""
-        from pyulog.exceptions import ULogException
-
-        stream, rows = io.BytesIO(), 0
-        with self.clock, self.path.open("rb") as file:
-            stream.write(file.read(HEADER) + self._flags)
-            start = HEADER + len(self._flags)
-            for end in self._ends:
-                for part in messages(file, start, end, wanted, counted):
-                    stream.write(part)
-                    before, rows = rows, int(counted.rows.sum()) + counted.others
-                    self.clock.check(rows - before)
-                    check_count(self.path, "parameters, dropouts and the like", counted.others, COUNT // 2)
-                    check_size(self.path, "what describes its rows", counted.text, TEXTS)
-                start = end
-        stream.seek(0)
-        try:
-            with _silent():
-                return bounded(self.path)(stream)
-        except ULogException as error:
-            raise UnreadableFile(f"{self.path}: cannot be decoded by pyulog ({error}); use a later pyulog") from None
+    def _flat(self, topic: str, form: str, prefix: str, depth: int) -> Iterator[tuple[str, str]]:
+        """Yield name and type of the numbers of a format, those of arrays and of formats in it too."""
+        what = f"numbers in the rows of {quote(topic)} and before it"
+        for kind, count, name in self._formats[form]:
+            for k in range(1 if count is None else count):
+                self._fields = FIELDS if depth > DEEP else self._fields + 1
+                check_count(self.path, what, self._fields, FIELDS - 1)
+                path = f"{prefix}{name}" if count is None else f"{prefix}{name}[{k}]"
+                if kind in NUMBERS:
+                    yield path, NUMBERS[kind]
+                else:
+                    yield from self._flat(topic, kind, f"{path}.", depth + 1)
 
 
-def bounded(path: Path) -> Callable[[BinaryIO], Any]:
-    """Return pyulog's reader, with a limit to the numbers of a row, which may be of arrays in arrays in arrays."""
-    from pyulog import ULog
-
-    total = 0
-
-    def numbers(formats: Mapping[str, Any], name: str, known: dict[tuple[str, int], int], depth: int = 0) -> int:
-        if depth > DEEP:
-            return FIELDS
-        if (name, depth) not in known:
-            fields = formats[name].fields if name in formats else ()
-            sizes = [
-                1 if kind in ULog._UNPACK_TYPES else numbers(formats, kind, known, depth + 1) for kind, *_ in fields
-            ]
-            counts = (max(array, 1) * size for (_, array, _), size in zip(fields, sizes, strict=True))
-            known[name, depth] = min(sum(counts), FIELDS)
-        return known[name, depth]
-
-    class Added(ULog._MessageAddLogged):  # type: ignore[misc]
-        def _parse_format(self, formats: Mapping[str, Any]) -> None:
-            nonlocal total
-            total += numbers(formats, self.message_name, {})
-            check_count(path, f"numbers in the rows of {quote(self.message_name)} and before it", total, FIELDS - 1)
-            super()._parse_format(formats)
-
-    return type("Bounded", (ULog,), {"_MessageAddLogged": Added})
+def _declared(field: str) -> tuple[str, int | None, str]:
+    """Return type, length and name of a field `float[3] x`; the length is None where it is no array."""
+    kind, name = field.split(" ")[:2]
+    kind, bracket, count = kind.partition("[")
+    length = int(count.partition("]")[0]) if bracket else 0
+    if not 0 <= length <= 0xFFFF:
+        raise ValueError(f"an array of {length} values")
+    return kind, length or None, name
 
 
-def _sections(path: Path, first: bytes, size: int) -> tuple[bytes, list[int]]:
-    """Return the message of flags as pyulog may see it, and where the parts of the file end.
+def _sections(path: Path, first: bytes, size: int) -> tuple[int, list[int]]:
+    """Return the place at which messages begin, and the ends of the parts of the file.
 
     After a crash PX4 appends what it kept to the end of the log, which may end within a message; the flags say where.
     """
     if len(first) < HEADER:
         raise UnreadableFile(f"{path}: is cut short ({size} bytes, a ULog header has {HEADER}); copy it again")
     length, kind = struct.unpack_from("<HB", first.ljust(HEADER + 3, b"\0"), HEADER)
-    if kind != ord("B") or length < 40 or len(first) < HEADER + 3 + length:
-        return b"", [size]
-    flags = bytearray(first[HEADER : HEADER + 3 + length])
-    offsets: tuple[int, ...] = struct.unpack_from("<3Q", flags, 19) if flags[11] & APPENDED else ()
-    flags[11] &= ~APPENDED  # what pyulog gets is in one piece
-    flags[19:43] = bytes(24)
-    return bytes(flags), [*sorted(o for o in offsets if HEADER + len(flags) < o < size), size]
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Keep pyulog from writing to standard output, which is the command's: only its own `print` is taken away."""
-    from pyulog import core
-
-    core.print = lambda *_, **__: None
-    try:
-        yield
-    finally:
-        vars(core).pop("print", None)  # another thread may have been faster
-
-
-def require_pyulog(kind: str) -> None:
-    """Raise ConfigError where pyulog is not installed."""
-    try:
-        import pyulog  # noqa: F401
-    except ImportError:
-        raise ConfigError(
-            f"{kind}: reads PX4 logs with pyulog, which is not installed; pip install 'driftlab[px4]'"
-        ) from None
+    begin = HEADER + 3 + length
+    if kind != ord("B") or length < FLAGS or len(first) < begin:
+        return HEADER, [size]
+    flags = int.from_bytes(first[HEADER + 11 : HEADER + 19], "little")
+    if flags & ~APPENDED:
+        raise UnreadableFile(
+            f"{path}: is of a later format, with the flags 0x{flags:X} that are not known; use a later driftlab"
+        )
+    offsets = struct.unpack_from("<3Q", first, HEADER + 19) if flags else ()
+    return begin, [*sorted(o for o in offsets if begin < o < size), size]
 
 
 IDS = 65536  # subscriptions that a file can have
-BLOCK = 2 << 20  # bytes read at a time
-LONGEST = 3 + 65535  # bytes of a message
-AHEAD = 4 * LONGEST  # bytes that must be known behind a message before it is judged
-STAMP = 8  # bytes of a time stamp, which every row has
-SAMPLED = 1024  # of the rows of a subscription, where only some are wanted, each so many-th is taken
+BLOCK = 4 << 20  # bytes between two looks at the clock
+SAMPLED = 1024  # of the rows of an instance that tell about it, each so many-th is taken, and some of the first ones
 
 _SHORTEST = np.full(256, -1, np.int64)  # bytes of a message by type; -1: no type that is known
 _LONGEST = np.full(256, 65535, np.int64)
@@ -279,86 +285,23 @@ for _kind, _size in {"F": 3, "D": 2, "I": 2, "M": 3, "P": 2, "Q": 3, "A": 4, "L"
     _SHORTEST[ord(_kind)] = _size
 for _kind, _size in {"R": 2, "S": 8, "O": 2}.items():
     _SHORTEST[ord(_kind)] = _LONGEST[ord(_kind)] = _size
-_KEPT = np.zeros(256, np.bool_)  # what a reader needs beside the rows; no text, no synchronisation
-for _kind in "FIPQARO":
-    _KEPT[ord(_kind)] = True
-_LONGEST[[ord(_kind) for _kind in "FIPQAD"]] = 10_000  # what is longer, pyulog takes for damage
-_A, _D = ord("A"), ord("D")
+_LONGEST[[ord(_kind) for _kind in "FIPQAD"]] = 10_000  # what is longer is damage
+_DEFINING = np.zeros(256, np.bool_)
+_DEFINING[[ord(_kind) for _kind in "FPAO"]] = True
+TYPES = _SHORTEST, _LONGEST, _DEFINING
+_D = ord("D")
 
 NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
 
-@dataclass
-class RowSelection:
-    """The selection of rows.
-
-    Attributes
-    ----------
-    shortest, longest : (65536,) arrays of int
-        Bytes of a row by subscription; `shortest` is -1 where the file has none of that number, or none yet: those
-        of which `longest` is known are entered where the file names them.
-    step : (65536,) array of int
-        0 for none, 1 for all, `SAMPLED` for some: the first, second, fourth and so on, and each so many-th.
-    """
-
-    shortest: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, -1, np.int64))
-    longest: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, 65535, np.int64))
-    step: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, SAMPLED, np.int64))
-
-
-@dataclass
-class Counted:
-    """The numbers of messages, and of lost bytes.
-
-    Attributes
-    ----------
-    rows : (65536,) array of int
-        Of each subscription, whether taken or not.
-    others, text : int
-        Definitions, parameters, dropouts and the like that were taken, and their bytes.
-    lost : int
-        Bytes that belong to no message that is known.
-    first_lost : int
-        Where in the file the first of them is; -1 where there is none.
-    """
-
-    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(IDS, np.int64))
-    others: int = 0
-    text: int = 0
-    lost: int = 0
-    first_lost: int = -1
-
-
-def messages(file: BinaryIO, start: int, stop: int, wanted: RowSelection, counted: Counted) -> Iterator[bytes]:
-    """Yield the definitions and the wanted rows between two places of a file, as the file has them."""
-    file.seek(start)
-    held, at, final = b"", start, False
-    while not final:
-        more = file.read(min(BLOCK, stop - at - len(held)))
-        data = np.frombuffer(held + more, np.uint8)
-        final = not more or at + len(data) >= stop
-        out = np.empty(len(data), np.uint8)
-        done, taken, lost, first, others, text = _scan(
-            data, final, wanted.shortest, wanted.longest, wanted.step, counted.rows, out, _SHORTEST, _LONGEST, _KEPT
-        )
-        counted.lost += lost
-        counted.others += others
-        counted.text += text
-        if first >= 0 and counted.first_lost < 0:
-            counted.first_lost = at + first
-        yield out[:taken].tobytes()
-        held, at = data[done:].tobytes(), at + done
-
-
-def sampled(rows: int) -> NDArray[np.int64]:
-    """Return the numbers of a subscription's rows that are taken where some are."""
-    n: NDArray[np.int64] = np.arange(rows)
-    rows_taken: NDArray[np.int64] = n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)]
-    return rows_taken
+def sampled(rows: int) -> Places:
+    """Return the numbers of an instance's rows that tell about it: the first, second, fourth and so on, and more."""
+    n: Places = np.arange(rows)
+    return np.asarray(n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)])
 
 
 @njit(cache=True, nogil=True)
-def _status(data, p, shortest, longest, least, most):  # type: ignore[no-untyped-def]
+def _status(data, p, lengths, least, most):  # type: ignore[no-untyped-def]
     """Return the kind of the bytes at p: NO message, a WHOLE one, one that the end has CUT, one of a FOREIGN type."""
     if p + 3 > len(data):
         return CUT
@@ -370,22 +313,22 @@ def _status(data, p, shortest, longest, least, most):  # type: ignore[no-untyped
         return NO
     if kind == _D and p + 5 <= len(data):
         number = data[p + 3] + 256 * data[p + 4]
-        if size - 2 < shortest[number] or size - 2 > longest[number]:
+        if size - 2 < lengths[0, number] or size - 2 > lengths[1, number]:
             return NO
     return WHOLE if p + 3 + size <= len(data) else CUT
 
 
 @njit(cache=True, nogil=True)
-def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[no-untyped-def]
+def _followed(data, p, count, lengths, least, most):  # type: ignore[no-untyped-def]
     """Return True if the message at p is whole, and what follows it can be `count` more."""
-    if _status(data, p, shortest, longest, least, most) != WHOLE:
+    if _status(data, p, lengths, least, most) != WHOLE:
         return False
     for _ in range(count):
         p += 3 + data[p] + 256 * data[p + 1]
-        status = _status(data, p, shortest, longest, least, most)
+        status = _status(data, p, lengths, least, most)
         if status == FOREIGN:  # a type that came later: its size must lead to one that is known
             after = p + 3 + data[p] + 256 * data[p + 1]
-            status = _status(data, after, shortest, longest, least, most)
+            status = _status(data, after, lengths, least, most)
             return status in (WHOLE, CUT)
         if status != WHOLE:
             return status == CUT
@@ -393,40 +336,33 @@ def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _scan(data, final, shortest, longest, step, rows, out, least, most, others_wanted):  # type: ignore[no-untyped-def]
-    """Copy what is wanted to `out`; return bytes read, written, lost, where first, and number and bytes of others."""
-    p, q, lost, first, end, others, text = 0, 0, 0, -1, len(data), 0, 0
-    while p < end and (final or p + AHEAD < end):
-        if not _followed(data, p, 1, shortest, longest, least, most):
-            if first < 0:
-                first = p
-            begin = p
-            p += 1
-            while p < end and (final or p + AHEAD < end):
-                if _followed(data, p, 2, shortest, longest, least, most):
-                    break
-                p += 1
-            lost += p - begin
+def _walk(data, p, halt, lengths, out, least, most, defining):  # type: ignore[no-untyped-def]
+    """Fill `out` with the places of rows, as far as `halt` or what defines others.
+
+    Return how far it came, their number, the bytes that were lost and where the first is, and why it stopped.
+    """
+    n, lost, first, halt = 0, 0, -1, min(halt, len(data))
+    while p < halt:
+        if _followed(data, p, 1, lengths, least, most):
+            kind = data[p + 2]
+            if defining[kind]:
+                return p, n, lost, first, True
+            size = 3 + data[p] + 256 * data[p + 1]
+            if kind == _D and lengths[0, data[p + 3] + 256 * data[p + 4]] >= 0:
+                out[n] = p
+                n += 1
+            elif kind == _D:  # of a row of what is not known, nothing can be told
+                lost, first = lost + size, p if first < 0 else first
+            p += size
             continue
-        size, kind = data[p] + 256 * data[p + 1], data[p + 2]
-        take = others_wanted[kind]
-        others += take
-        text += take * size
-        if kind == _A:
-            number = data[p + 4] + 256 * data[p + 5]
-            if shortest[number] < 0 and longest[number] > 0:
-                shortest[number] = STAMP
-        if kind == _D:
-            number = data[p + 3] + 256 * data[p + 4]
-            n, every = rows[number], step[number]
-            rows[number] = n + 1
-            some = n % every == 0 or (n < every and n & (n - 1) == 0) if every > 1 else every == 1
-            take = some and shortest[number] >= 0  # pyulog loses its way in rows of what it does not know yet
-        if take:
-            out[q : q + 3 + size] = data[p : p + 3 + size]
-            q += 3 + size
-        p += 3 + size
-    return p, q, lost, first, others, text
+        if first < 0:
+            first = p
+        begin = p
+        p += 1
+        while p < halt and not _followed(data, p, 2, lengths, least, most):
+            p += 1
+        lost += p - begin
+    return p, n, lost, first, False
 
 
 BUSES = {1: "I2C", 2: "SPI", 3: "UAVCAN", 4: "simulation", 5: "serial"}

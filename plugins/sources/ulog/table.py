@@ -16,10 +16,9 @@ accelerometer CAL_ACCn too: from the log's own parameters that is undone. TC_* a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,10 +26,9 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
 from fusion_core.errors import MissingChannel
 from fusion_core.faults import Faults
-from fusion_plugins.sources.joining import joined
+from fusion_plugins.sources.joining import FieldPath, joined, taken_apart
 from fusion_plugins.sources.ulog.file import Instance, LogFile, described, same_part, same_place
 
-PATH = re.compile(r"(?P<topic>\w+?)(?:\[(?P<number>\d+)\])?\.(?P<field>.+)")
 TIME = "time"
 AXES = ("x", "y", "z")
 UNITS = {  # of a field, by itself and by its topic: a ULog names none
@@ -45,14 +43,6 @@ UNITS = {  # of a field, by itself and by its topic: a ULog names none
 LEAST_PA = 2000.0  # no mbar is more, no Pa under 25 km less
 CALIBRATED = {"sensor_gyro": "GYRO", "sensor_accel": "ACC"}  # and what its parameters are called
 ASTRAY = 1e6  # us: a time stamp that stands out from the four about it by more is damaged; disorder of less is sorted
-
-
-class ColumnPath(NamedTuple):
-    """A path taken apart."""
-
-    topic: str
-    number: int | None
-    field: str
 
 
 class ULogTopics(Table):
@@ -77,14 +67,14 @@ class ULogTopics(Table):
     def has(self, path: str) -> bool:
         """Return True if there is such a topic with such a field."""
         instance = self.instance(path)
-        return instance is not None and taken_apart(path).field in _fields(instance)
+        return instance is not None and _column(path).field in _fields(instance)
 
     def unit(self, path: str) -> str | None:
         """Return the unit that PX4's messages have for a field, where it is known."""
-        column, instance = taken_apart(path), self.instance(path)
+        column, instance = _column(path), self.instance(path)
         if column == ("sensor_baro", column.number, "pressure") and instance is not None:
             return "Pa" if np.median(instance.samples["pressure"]) > LEAST_PA else "mbar"  # since 1.14, before
-        return UNITS.get((column.topic, column.field)) or UNITS.get(("", column.field))
+        return UNITS.get((column.name, column.field)) or UNITS.get(("", column.field))
 
     def about(self, path: str) -> Mapping[str, str]:
         """Return device number and instance, and the n of the CAL_GYROn_ID (CAL_ACCn_ID) that is the device's."""
@@ -98,12 +88,10 @@ class ULogTopics(Table):
 
     def instance(self, path: str) -> Instance | None:
         """Return the instance that a path names."""
-        if not PATH.fullmatch(path):
-            return None
-        column = taken_apart(path)
+        column = _column(path)
         if column.number is not None:
-            return self.log.instances.get((column.topic, column.number))
-        return self.default(column.topic)
+            return self.log.instances.get((column.name, column.number))
+        return self.default(column.name) if column.field else None
 
     def default(self, topic: str) -> Instance | None:
         """Return the instance of a topic that belongs to the gyro."""
@@ -154,7 +142,7 @@ class ULogTopics(Table):
         values: dict[str, Array] = {}
         for instance in instances:
             fields = [path for path in paths if named[path] is instance]
-            columns = [self._column(instance, data[instance], taken_apart(path).field) for path in fields]
+            columns = [self._column(instance, data[instance], _column(path).field) for path in fields]
             if instance is leading:
                 values |= {path: column[order] for path, column in zip(fields, columns, strict=True)}
             else:
@@ -220,7 +208,7 @@ class ULogTopics(Table):
     def _check_temperatures(self, named: Mapping[str, Instance], data: Mapping[Instance, Mapping[str, Array]]) -> None:
         """Raise MissingChannel where a temperature that is asked for was never measured."""
         for path, instance in named.items():
-            field = taken_apart(path).field
+            field = _column(path).field
             if field != "temperature" or not np.all(np.isnan(data[instance][field])) or not len(data[instance][field]):
                 continue
             others = [
@@ -238,13 +226,8 @@ class ULogTopics(Table):
             )
 
 
-def taken_apart(path: str) -> ColumnPath:
-    """Return topic, number and field of a path that matches `PATH`."""
-    match = PATH.fullmatch(path)
-    if match is None:
-        return ColumnPath(path, None, "")
-    number = match["number"]
-    return ColumnPath(match["topic"], None if number is None else int(number), match["field"])
+def _column(path: str) -> FieldPath:
+    return taken_apart(path) or FieldPath(path, None, "")
 
 
 def before_1_11(instance: Instance) -> bool:

@@ -164,6 +164,22 @@ def test_a_chunk_whose_checksum_is_wrong_is_left_out(tmp_path):
     assert what.startswith("bytes that are no whole record, lost; `mcap recover IN -o OUT` repairs it")
 
 
+def test_bytes_that_are_lost_are_counted_once(tmp_path):
+    """Of a chunk that is read for its rows, and for what is joined to them."""
+    path = bag(tmp_path, "mcap")
+    whole = bytearray(path.read_bytes())
+    first = next(at for op, at, _ in records(bytes(whole)) if op == 6)
+    struct.pack_into("<I", whole, first + 9 + 24, 12345)
+    path.write_bytes(whole)
+    lost = []
+    for channels in (CHANNELS, {**CHANNELS, "temperature": FIELDS["temperature"]}):
+        faults = Faults()
+        read(Rosbag(path=path, channels=channels), 1000, faults)
+        lost += [fault.count for fault in faults.found.values()]
+    assert len(lost) == 2
+    assert lost[0] == lost[1]
+
+
 def test_what_a_recorder_left_in_the_write_ahead_log(tmp_path):
     """The last transactions of a bag that was not closed are in a file beside it."""
     path = bag(tmp_path, "sqlite3")
