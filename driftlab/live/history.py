@@ -38,20 +38,12 @@ WIDTH = 0.5  # s of a row, to begin with
 
 @dataclass(frozen=True)
 class View:
-    """The rows of a history at one moment; nothing in it changes any more.
+    """The rows of a history at one moment; nothing in it changes any more."""
 
-    Attributes
-    ----------
-    generation : int
-        How often rows that were there before have been changed. Of one generation, all rows but the last stay.
-    width : float
-        Of a row, s.
-    rows : (N, C) array
-    """
-
+    # how often rows that were there before have been changed. Of one generation, all rows but the last stay
     generation: int
-    width: float
-    rows: Array
+    width: float  # of a row, s
+    rows: Array  # (N, C)
 
     def since(self, generation: int, start: int) -> tuple[int, Array]:
         """Return place and rows from the last on of the first `start` rows of a generation, which the reader has."""

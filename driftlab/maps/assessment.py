@@ -38,30 +38,15 @@ GRID = 400
 
 @dataclass(frozen=True, eq=False)
 class MapVerdict:
-    """Quality of a map and of the soak it was fitted on.
-
-    Attributes
-    ----------
-    fitted : FittedMap
-    settings : ThermalMap
-        It was fitted with.
-    soak : SoakSummary
-    axes : tuple of str
-    memory : MemoryVerdict
-        Whether the bias remembers which temperatures came before.
-    placements : Placements or None
-        Of the unit, where its input is known by its length alone.
-    used : Used or None
-        Share of the soak that is used; None where that is not known.
-    """
+    """Quality of a map and of the soak it was fitted on."""
 
     fitted: FittedMap
-    settings: ThermalMap
+    settings: ThermalMap  # with which it was fitted
     soak: SoakSummary
     axes: tuple[str, ...]
-    memory: MemoryVerdict
-    placements: Placements | None = None
-    used: Used | None = None
+    memory: MemoryVerdict  # whether the bias remembers which temperatures came before
+    placements: Placements | None = None  # of the unit, where its input is known by its length alone
+    used: Used | None = None  # share of the soak that is used; None where that is not known
 
     @cached_property
     def map(self) -> FittedMap:
@@ -231,45 +216,24 @@ SHORT = 0.03  # of the range: fewer samples in less than that are not reported
 
 @dataclass(frozen=True, eq=False)
 class Thin:
-    """A range of temperature with few samples.
+    """A range of temperature with few samples."""
 
-    Attributes
-    ----------
-    start, stop : float
-        degC.
-    found, needed : float
-        Samples a kelvin: the fewest there, and with how many white noise is no more than the curve's deviation.
-    """
-
-    start: float
-    stop: float
-    found: float
-    needed: float
+    start: float  # degC
+    stop: float  # degC
+    found: float  # fewest samples a kelvin there
+    needed: float  # samples a kelvin with which white noise is no more than the curve's deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Distribution of a soak's samples over its temperatures.
+    """Distribution of a soak's samples over its temperatures."""
 
-    Attributes
-    ----------
-    T, density : (CELLS,) arrays
-        Middle of each cell, degC, and samples a kelvin about it.
-    share : float
-        Of the range, that has samples.
-    holes : tuple of pairs
-        Ranges without a sample, degC.
-    thin : tuple of Thin
-    hours : dict of str to float
-        Warming, cooling, and neither.
-    """
-
-    T: Array
-    density: Array
-    share: float
-    holes: tuple[tuple[float, float], ...]
+    T: Array  # (CELLS,): middle of each cell, degC
+    density: Array  # (CELLS,): samples a kelvin about it
+    share: float  # of the range, that has samples
+    holes: tuple[tuple[float, float], ...]  # ranges without a sample, degC
     thin: tuple[Thin, ...]
-    hours: dict[str, float]
+    hours: dict[str, float]  # warming, cooling, and neither
 
     def as_json(self) -> dict[str, Any]:
         """Return it for programs."""

@@ -35,32 +35,16 @@ Progress = Callable[..., None] | None
 
 @dataclass(frozen=True, eq=False)
 class RecordedSoak(SigmaCurve):
-    """Recordings, N samples in all, and the map that is fitted to them.
+    """Recordings, N samples in all, and the map that is fitted to them."""
 
-    Attributes
-    ----------
-    subject : Subject
-        The unit, its noise as measured, its curve as fitted.
-    chamber : Chamber
-        With the range that is asked for.
-    parts : tuple of ((N_r,), (N_r, d)) arrays
-        Temperature and bias of each recording, degC and SI.
-    dt : float
-        From one sample to the next, s.
-    map : FittedMap
-    temperature, sigma, misfit : (G,) and (G, d) arrays
-        Over the range: uncertainty of the map, SI; NaN where nothing was seen; and the part of it that the kind of
-        map is to blame for.
-    """
-
-    subject: UnitModel
-    chamber: Chamber
-    parts: tuple[tuple[Array, Array], ...]
-    dt: float
+    subject: UnitModel  # the unit, its noise as measured, its curve as fitted
+    chamber: Chamber  # with the range that is asked for
+    parts: tuple[tuple[Array, Array], ...]  # T (N_r,), degC, and bias (N_r, d), SI, of each recording
+    dt: float  # from one sample to the next, s
     map: FittedMap
-    temperature: Array
-    sigma: Array
-    misfit: Array
+    temperature: Array  # (G,): over the range, degC
+    sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
+    misfit: Array  # (G, d): the part of it that the kind of map is to blame for
 
     @property
     def T(self) -> Array:

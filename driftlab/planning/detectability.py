@@ -46,38 +46,18 @@ Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the error
 
 @dataclass(frozen=True)
 class Detectability:
-    """Detectability of one effect on a planned recording.
+    """Detectability of one effect on a planned recording."""
 
-    Attributes
-    ----------
-    name : str
-        Its name in the loop.
-    effect : Effect
-        In the middle of its hyper-parameters.
-    nats : float
-        Of one of the stated size.
-    threshold : float
-        Nats that the loop requires at short times; it requires better predictions of left-out parts too.
-    found_from : float
-        Smallest size in SI, from lowest to highest on each axis, that the loop would find in half of all recordings;
-        infinite where none.
-    best, worst : float
-        The same, the smallest and the largest over its hyper-parameters.
-    nats_found : float
-        Of one of twice the smallest size; 0 where none is search.
-    left : dict of str to float
-        Share of the nats that is left where another effect may take its part.
-    """
-
-    name: str
-    effect: Effect
-    nats: float
-    threshold: float
+    name: str  # its name in the loop
+    effect: Effect  # in the middle of its hyper-parameters
+    nats: float  # of one of the stated size
+    threshold: float  # nats that the loop requires at short times; it requires better predictions of left-out parts too
+    # smallest size in SI, from lowest to highest on each axis, that is found in half of all recordings; infinite: none
     found_from: float
-    best: float
-    worst: float
-    nats_found: float
-    left: dict[str, float]
+    best: float  # the smallest of these over its hyper-parameters
+    worst: float  # the largest
+    nats_found: float  # of one of twice the smallest size; 0 where none is found
+    left: dict[str, float]  # share of the nats that is left where another effect may take its part
 
     @property
     def found(self) -> bool:
@@ -92,33 +72,15 @@ class Detectability:
 
 @dataclass(frozen=True)
 class DetectabilityReport:
-    """Detectability of effects on a planned recording.
+    """Detectability of effects on a planned recording."""
 
-    Attributes
-    ----------
-    effects : tuple of Detectability
-        The effects, the one found at the smallest size first.
-    silent : tuple of str
-        Effects that the recording cannot show at all.
-    size : float
-        The size whose nats are given, from lowest to highest, SI.
-    shown : BiasUnit
-        Unit of the bias.
-    still : tuple of str
-        Channels that are held: effects that follow them are not seen.
-    curve_known : bool
-        Whether the map's curve is the unit's own.
-    only : str
-        `warms up` or `cools down`, where the recording does nothing else.
-    """
-
-    effects: tuple[Detectability, ...]
-    silent: tuple[str, ...]
-    size: float
-    shown: BiasUnit
-    still: tuple[str, ...]
-    curve_known: bool
-    only: str
+    effects: tuple[Detectability, ...]  # the effects, the one found at the smallest size first
+    silent: tuple[str, ...]  # effects that the recording cannot show at all
+    size: float  # the size whose nats are given, from lowest to highest, SI
+    shown: BiasUnit  # unit of the bias
+    still: tuple[str, ...]  # channels that are held: effects that follow them are not seen
+    curve_known: bool  # whether the map's curve is the unit's own
+    only: str  # `warms up` or `cools down`, where the recording does nothing else
 
 
 def predict_detectability(

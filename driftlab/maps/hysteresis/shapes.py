@@ -38,28 +38,15 @@ SAME = 1e-6  # of a signature: a difference that is rounding
 
 @dataclass(frozen=True, eq=False)
 class MemoryShapes:
-    """Shapes of the bias of the slots that memories may add, in order of their kinds.
+    """Shapes of the bias of the slots that memories may add, in order of their kinds."""
 
-    Attributes
-    ----------
-    kinds : tuple of str
-        Of each shape (J,); first those that add, then those that act on the curve's input.
-    added : (S, A) array
-        What a coefficient of 1 adds, of the first A.
-    inputs : (S, J - A) array
-        Temperature that the curve sees, of the others, degC: of lags, and of every other play.
-    brief : (J,) array of bool
-        Which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
-        after the sensor, or stands beside it.
-    broken : tuple of str
-        Effects that could not be tried, and why.
-    """
-
-    kinds: tuple[str, ...]
-    added: Array
-    inputs: Array
+    kinds: tuple[str, ...]  # of each shape (J,); first those that add, then those that act on the curve's input
+    added: Array  # (S, A): what a coefficient of 1 adds, of the first A
+    inputs: Array  # (S, J - A): temperature that the curve sees, of the others, degC: of lags, and of every other play
+    # (J,): which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
+    # after the sensor, or stands beside it
     brief: NDArray[np.bool_]
-    broken: tuple[str, ...] = ()
+    broken: tuple[str, ...] = ()  # effects that could not be tried, and why
 
 
 def shapes_of(soak: SoakSummary) -> MemoryShapes:
