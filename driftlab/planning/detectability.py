@@ -260,7 +260,9 @@ class MonteCarlo:
             Which hyper-parameters are near enough to those of a shape to count as found.
         """
         case = _Case(self, effects, shapes, alike)
-        return [self._smallest(case, j, start) for j, start in enumerate(starts)]
+        sizes = [self._smallest(case, j, start) for j, start in enumerate(starts)]
+        self.search.squares.forget()  # no other effect asks for these fits
+        return sizes
 
     def _smallest(self, case: _Case, j: int, start: float) -> float:
         power = next((k for k in POWERS if case.passes(j, start * 2.0**k)), None)
