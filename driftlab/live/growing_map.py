@@ -46,24 +46,10 @@ READINGS = 1 << 16  # that show the steps of the thermometer: twice as many at m
 
 
 class GrowingMap:
-    """The map of a soak that goes on.
+    """The map of a soak that goes on, written to `path` at the end.
 
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    settings : ThermalMap
-        The map to fit.
-    path : Path
-        Where it is written at the end.
-    wanted : float or None
-        The sigma to be reached, in SI.
-    asked : pair of float or None
-        The temperatures over which it is, degC; None: those so far.
-    until_reached : bool
-        Whether the run is to end then.
-    publish : callable
-        Called by the second thread with the status of the map, whenever there is a new one.
+    `wanted` is the sigma to be reached in SI, over the temperatures `asked` (degC; None: those so far), after which the
+    run is to end if `until_reached`. A second thread calls `publish` with the status, whenever there is a new one.
     """
 
     def __init__(

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.filtering.segment import runs
+from driftlab.maps.fit import axes_of
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
@@ -43,10 +44,18 @@ class MapVerdict:
     fitted: FittedMap
     settings: ThermalMap  # with which it was fitted
     soak: SoakSummary
-    axes: tuple[str, ...]
-    memory: MemoryVerdict  # whether the bias remembers which temperatures came before
     placements: Placements | None = None  # of the unit, where its input is known by its length alone
     used: Used | None = None  # share of the soak that is used; None where that is not known
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return axes_of(self.fitted)
+
+    @cached_property
+    def memory(self) -> MemoryVerdict:
+        """Verdict on whether the bias remembers which temperatures came before."""
+        return memory_of(self.soak)
 
     @cached_property
     def map(self) -> FittedMap:
@@ -165,18 +174,6 @@ class MapVerdict:
             return ""
         sigma = np.max(self.fitted.sigma(np.linspace(start, stop, 50), start), axis=0) * unit.factor
         return f", the curve is known there only to {', '.join(text(v, 2) for v in sigma)} {unit.shown}"
-
-
-def judge(
-    fitted: FittedMap,
-    settings: ThermalMap,
-    soak: SoakSummary,
-    axes: tuple[str, ...],
-    placements: Placements | None = None,
-    used: Used | None = None,
-) -> MapVerdict:
-    """Return the verdict on a map that was fitted with settings on a soak, with its placements and the share used."""
-    return MapVerdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
 
 
 def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit) -> str:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from driftlab.config import Config, with_recording
-from driftlab.maps.fit import samples
+from driftlab.maps.fit import gather
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, RatedProfile, SearchResult, SigmaCurve
 from driftlab.planning.unit_model import UnitModel
@@ -105,20 +104,8 @@ def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tup
     DataError
         If a recording cannot be used.
     """
-    parts, steps = [], []
-    for name in recordings:
-        seen: list[tuple[float, int]] = []
-        parts.append(samples(with_recording(config, name), faults, partial(_note, seen)))
-        time, count = np.array(seen, dtype=np.float64).T
-        steps.append(np.diff(time) / np.diff(count))
-    spacing = np.concatenate(steps)  # an epoch is as long as the recording's samples, where these are further apart
-    if not len(spacing):  # a minute or so
-        return parts, max(float(config.filter.update_interval), 1.0) if config.filter else 1.0
-    return parts, float(np.median(spacing))
-
-
-def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
-    seen.append((time, count))
+    soaks = [gather(with_recording(config, name), (), faults) for name in recordings]
+    return [(soak.T, soak.bias) for soak in soaks], float(np.median([soak.interval for soak in soaks]))
 
 
 def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:

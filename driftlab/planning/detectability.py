@@ -216,22 +216,7 @@ def effects_in(
 
 
 class MonteCarlo:
-    """Realisations of one planned recording.
-
-    Attributes
-    ----------
-    search : Search
-        The recording, without effects.
-    unit : UnitModel
-    noise : (d, n, m) array
-        Noise of each realisation, SI.
-    curve : (d, n) array
-        The map's curve, SI.
-    noises : list of LocalLevel
-        Of the rows of each axis.
-    price : float
-        Log of how many candidates the loop tries there.
-    """
+    """Realisations of one planned recording, a search without effects; `price` is the log of the candidates there."""
 
     def __init__(self, search: Search, unit: UnitModel, price: float, seed: int = 0) -> None:
         self.search, self.unit, self.price = search, unit, price
@@ -239,7 +224,7 @@ class MonteCarlo:
         interval, shape = evidence.interval, (len(unit.axes), len(evidence), REALISATIONS)
         white = rng.normal(size=shape) * (unit.noise / np.sqrt(interval))[:, None, None]
         walk = np.cumsum(rng.normal(size=shape), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]
-        self.noise, self.noises = white + walk, noises(unit, interval)
+        self.noise, self.noises = white + walk, noises(unit, interval)  # (d, n, m) in SI, and of the rows of each axis
         self.curve = unit.curve(evidence.rows([chunk["temperature"] for chunk in evidence.chunks])).T
 
     def smallest(
@@ -247,17 +232,10 @@ class MonteCarlo:
     ) -> list[float]:
         """Return the sizes in SI from which on most realisations pass, one for each shape; infinite where none helps.
 
-        Parameters
-        ----------
-        effects : sequence of Effect
-            One effect with the hyper-parameters that the loop tries.
-        shapes : sequence of (n, d) arrays
-            Its signatures, of one SI unit. Of an effect on the map's input it is the whole curve, the map's own part
-            with it: with its slope it grows.
-        starts : sequence of float
-            Sizes near which the answers may be.
-        alike : (S, effects) array of bool
-            Which hyper-parameters are near enough to those of a shape to count as found.
+        `effects` are one effect with the hyper-parameters that the loop tries, `shapes` (n, d) its signatures of one SI
+        unit; of an effect on the map's input the whole curve, the map's own part with it: with its slope it grows. The
+        answers may be near `starts`, and `alike` (S, effects) says which hyper-parameters are near enough to those of a
+        shape to count as found.
         """
         case = _Case(self, effects, shapes, alike)
         sizes = [self._smallest(case, j, start) for j, start in enumerate(starts)]

@@ -139,14 +139,8 @@ def _values(search: Search, unit: UnitModel, effect: Effect, axis: int) -> Array
 class Information:
     """Information of a planned recording on the shapes of effects.
 
-    Attributes
-    ----------
-    effects : tuple of Effect
-        The effects.
-    G : (d, K, K) array
-        Inner products of the columns, white, with map and level taken out.
-    b : (d, K) array
-        Theirs with what was measured.
+    G (d, K, K) are inner products of the columns, white, with map and level taken out, b (d, K) theirs with what was
+    measured.
     """
 
     def __init__(self, search: Search, unit: UnitModel, effects: Sequence[Effect]) -> None:

@@ -210,13 +210,8 @@ class Levels:
 def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -> Levels:
     """Return bias and scale factor from the levels (P, d) of the placements.
 
-    Parameters
-    ----------
-    level : (P, d) array
-    roots : (P, r) arrays, one an axis
-        Of the covariance of the levels.
-    length, unsure : float
-        Of the input, and its deviation, the same in all placements.
+    `roots` (P, r), one an axis, are of the covariance of the levels; `length` is that of the input and `unsure` its
+    deviation, the same in all placements.
     """
     d = level.shape[1]
     deviation = np.concatenate([np.full(d, BIAS * length), np.full(d, SCALE)])

@@ -98,14 +98,8 @@ class FollowingCurves:
 class SoakContrasts:
     """The contrasts of one soak.
 
-    Attributes
-    ----------
-    blocks : SoakRows
-    y : (K, d) array
-        The bias, in `scale` (d,).
-    Z : (K, m) array
-        The contrasts, white noise of all blocks alike.
-    laws : list of (eigenvalues (m,), eigenvectors (m, m))
+    `y` (K, d) is the bias of its blocks in `scale` (d,), Z (K, m) are the contrasts, white noise of all blocks alike,
+    and `laws` the eigenvalues (m,) and eigenvectors (m, m) of each law.
     """
 
     def __init__(self, soak: SoakSummary) -> None:
