@@ -31,7 +31,7 @@ from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
-from driftlab.recordings.identity import identity, sha256
+from driftlab.recordings.identity import identity, of_file
 from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
@@ -400,7 +400,8 @@ def _span(name: str) -> tuple[str, float, float]:
         return name.identity()["sha256"], -np.inf, np.inf
     path, span = part_of(name)
     start, stop = span.get("start"), span.get("stop")
-    return sha256(path), -np.inf if start is None else start, np.inf if stop is None else stop
+    known = str(of_file(path).get("sha256", path))
+    return known, -np.inf if start is None else start, np.inf if stop is None else stop
 
 
 def show(result: ExplainResult, given: Mapping[str, Any]) -> None:

@@ -20,7 +20,7 @@ from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
-from driftlab.maps.assessment import MapVerdict, judge
+from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.kind_selection import KindComparison, candidates, divide
 from driftlab.maps.kind_selection import compare as compare_kinds
@@ -235,7 +235,7 @@ def _fitted(
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, soak, more)
-    verdict = judge(fitted, settings, soak.brief(), axes_of(fitted), soak.placements, soak.used)
+    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

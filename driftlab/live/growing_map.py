@@ -46,24 +46,10 @@ READINGS = 1 << 16  # that show the steps of the thermometer: twice as many at m
 
 
 class GrowingMap:
-    """The map of a soak that goes on.
+    """The map of a soak that goes on, written to `path` at the end.
 
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    settings : ThermalMap
-        The map to fit.
-    path : Path
-        Where it is written at the end.
-    wanted : float or None
-        The sigma to be reached, in SI.
-    asked : pair of float or None
-        The temperatures over which it is, degC; None: those so far.
-    until_reached : bool
-        Whether the run is to end then.
-    publish : callable
-        Called by the second thread with the status of the map, whenever there is a new one.
+    `wanted` is the sigma to be reached in SI, over the temperatures `asked` (degC; None: those so far), after which the
+    run is to end if `until_reached`. A second thread calls `publish` with the status, whenever there is a new one.
     """
 
     def __init__(
@@ -231,24 +217,9 @@ def soaking(
     until_reached: bool = False,
     read: Collection[Path] = (),
 ) -> GrowingMap:
-    """Return the map that is fitted while a config's device is run, from a user's texts.
+    """Return the map of a `kind` that is fitted while a config's device is run, from a user's texts.
 
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    path : Path
-        The map's file.
-    kind : str, optional
-        Of the map, in place of the config's.
-    sigma : str, optional
-        The sigma to be reached, `3 deg/h`.
-    span : str, optional
-        The temperatures over which it is, `-20..50 degC`.
-    until_reached : bool
-        Whether the run is to end then.
-    read : collection of Path
-        Files that the map must not replace.
+    `sigma` (`3 deg/h`) is to be reached over `span` (`-20..50 degC`); files that are `read` must not be replaced.
 
     Raises
     ------
@@ -277,60 +248,28 @@ GRID = 121  # temperatures of the curve
 
 @dataclass(frozen=True, eq=False)
 class GrowingMapStatus:
-    """The status of a map while its soak goes on.
+    """The status of a map while its soak goes on."""
 
-    Attributes
-    ----------
-    kind : str
-        Of the map.
-    samples : int
-        Epochs at rest so far.
-    seen : pair of float
-        Smallest and largest temperature so far, degC.
-    asked : pair of float or None
-        The range over which the map is wanted; None: that so far.
-    coverage : float
-        Share of that range in which there are samples.
-    missing : tuple of pairs
-        Its parts that have none, degC.
-    sweeps : int
-        How often the temperature went up or down.
-    T : (G,) array
-        Temperatures of the curve, within the range and what was seen, degC; empty until there is one.
-    bias, sigma : (G, d) arrays
-        The curve and its standard deviation, in SI.
-    wanted : float or None
-        The sigma to be reached, in SI.
-    reached : bool
-        Whether the whole range is covered and sigma is nowhere larger than wanted.
-    why : str
-        Why there is no curve yet; empty where there is one.
-    memory : Memory or None
-        Whether the bias remembers which temperatures came before; None until there is a curve.
-    unused, unused_share
-        How much of the soak is not used and why, in words where it is much, and the share.
-    axes, unit
-        What the axes are called, and in which unit a bias is shown.
-    """
-
-    kind: str
-    samples: int = 0
-    seen: Range = (np.nan, np.nan)
-    asked: Range | None = None
-    coverage: float = 0.0
-    missing: tuple[Range, ...] = ()
-    sweeps: int = 1
+    kind: str  # of the map
+    samples: int = 0  # epochs at rest so far
+    seen: Range = (np.nan, np.nan)  # smallest and largest temperature so far, degC
+    asked: Range | None = None  # the range over which the map is wanted; None: that so far
+    coverage: float = 0.0  # share of that range in which there are samples
+    missing: tuple[Range, ...] = ()  # its parts that have none, degC
+    sweeps: int = 1  # how often the temperature went up or down
+    # (G,): temperatures of the curve, within the range and what was seen, degC; empty until there is one
     T: Array = field(default_factory=lambda: np.empty(0))
-    bias: Array = field(default_factory=lambda: np.empty((0, 0)))
-    sigma: Array = field(default_factory=lambda: np.empty((0, 0)))
-    wanted: float | None = None
-    reached: bool = False
-    why: str = "no sample at rest so far"
+    bias: Array = field(default_factory=lambda: np.empty((0, 0)))  # (G, d), SI
+    sigma: Array = field(default_factory=lambda: np.empty((0, 0)))  # (G, d): standard deviation of the curve, SI
+    wanted: float | None = None  # the sigma to be reached, in SI
+    reached: bool = False  # whether the whole range is covered and sigma is nowhere larger than wanted
+    why: str = "no sample at rest so far"  # why there is no curve yet; empty where there is one
+    # whether the bias remembers which temperatures came before; None until there is a curve
     memory: MemoryVerdict | None = None
-    unused: str = ""
-    unused_share: float = 0.0
-    axes: tuple[str, ...] = ()
-    unit: BiasUnit = RATE
+    unused: str = ""  # how much of the soak is not used and why, in words, where it is much
+    unused_share: float = 0.0  # that share
+    axes: tuple[str, ...] = ()  # their names
+    unit: BiasUnit = RATE  # in which a bias is shown
 
     @property
     def range(self) -> Range:

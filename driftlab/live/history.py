@@ -13,24 +13,18 @@ import json
 import time
 import uuid
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from driftlab.live.status import UPDATES
+from driftlab.filtering.segment import RunSegment
+from driftlab.live.status import UPDATES, Status
 from driftlab.storage.json import plain
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from driftlab.filtering.segment import RunSegment
-    from driftlab.live.status import Status
-    from fusion_core.chunk import Array
-    from fusion_core.model import Flags
-
+from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 CAPACITY = 3600  # rows
 WIDTH = 0.5  # s of a row, to begin with
@@ -38,20 +32,12 @@ WIDTH = 0.5  # s of a row, to begin with
 
 @dataclass(frozen=True)
 class View:
-    """The rows of a history at one moment; nothing in it changes any more.
+    """The rows of a history at one moment; nothing in it changes any more."""
 
-    Attributes
-    ----------
-    generation : int
-        How often rows that were there before have been changed. Of one generation, all rows but the last stay.
-    width : float
-        Of a row, s.
-    rows : (N, C) array
-    """
-
+    # how often rows that were there before have been changed. Of one generation, all rows but the last stay
     generation: int
-    width: float
-    rows: Array
+    width: float  # of a row, s
+    rows: Array  # (N, C)
 
     def since(self, generation: int, start: int) -> tuple[int, Array]:
         """Return place and rows from the last on of the first `start` rows of a generation, which the reader has."""
@@ -60,19 +46,10 @@ class View:
 
 
 class History:
-    """Rows of a live run, thinned.
+    """Rows of a live run, thinned, each at first of `width` s; `full` is the way to make room.
 
-    A row has the time of its last sample first. Columns whose name ends in `_low` have the smallest of its values, in
-    `_high` the largest, all others the last.
-
-    Parameters
-    ----------
-    names : list of str
-        Of the C columns, the first of which is `t`.
-    width : float
-        Of a row at first, s.
-    full : {"widen", "forget"}
-        The way to make room.
+    A row has the time of its last sample, `t`, first. Columns whose name ends in `_low` have the smallest of its
+    values, in `_high` the largest, all others the last.
     """
 
     def __init__(self, names: list[str], width: float, full: Literal["widen", "forget"], capacity: int = CAPACITY):
@@ -131,22 +108,10 @@ def column_names(axes: Sequence[str]) -> list[str]:
 
 
 class LiveHistory:
-    """Status and history of a live run.
+    """Status and history of a live run whose recording is at the path `recorded`, if there is one.
 
-    Parameters
-    ----------
-    axes : sequence of str
-        Of the tracked sensor.
-    recorded : str
-        Path of the recording; empty where there is none.
-
-    Attributes
-    ----------
-    status : bytes
-        JSON, the line of `--json` and: `run` (another for every run), `lines`, `recording` and, when the run has ended,
-        `ended`.
-    histories : dict of str to History
-        The `whole` run and the `last` minutes.
+    `status` is JSON, the line of `--json` and: `run` (another for every run), `lines`, `recording` and, when the run
+    has ended, `ended`. `histories` are of the `whole` run and of the `last` minutes.
     """
 
     def __init__(self, axes: Sequence[str], recorded: str = "") -> None:

@@ -19,16 +19,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from email.parser import BytesParser
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from driftlab.live.history import LiveHistory
 from driftlab.storage.hdf5 import reason
 from fusion_core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from driftlab.live.history import LiveHistory
 
 LOOPBACK = "127.0.0.1"
 OURS = {LOOPBACK, "localhost", "::1"}
@@ -44,21 +42,9 @@ TYPES = {"/": "text/html; charset=utf-8", "/status.json": "application/json", "/
 
 
 class Server:
-    """Serves one run.
+    """Serves status and history of one run and the page `html`, at a port; 0: any that is free.
 
-    Parameters
-    ----------
-    port : int
-        0 for any that is free.
-    html : str
-        The page.
-    watch : LiveHistory
-        Status and history of the run.
-
-    Raises
-    ------
-    ConfigError
-        If the port cannot be had.
+    Raises ConfigError if the port cannot be had.
     """
 
     def __init__(self, port: int, html: str, watch: LiveHistory) -> None:

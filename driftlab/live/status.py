@@ -29,54 +29,26 @@ Phase = Literal["getting ready", "listening", "writing the results", "fitting th
 
 @dataclass
 class Status:
-    """The status of a live run.
+    """The status of a live run."""
 
-    Attributes
-    ----------
-    phase : {"getting ready", "listening", "writing the results", "fitting the map"}
-        The run does not listen to its device before the filter is compiled.
-    t : float
-        Time of the last sample, s.
-    samples, recorded : int
-        Samples so far, and rows of them that are safe in the recording.
-    waiting : float or None
-        Seconds of samples so far while the first alignment is waited for; None from then on.
-    bias, sigma : (d,) arrays
-        Of the tracked sensor and its standard deviation, in SI.
-    temperature, temperature_rate : float
-        degC and K/s; NaN where there is none.
-    nis : float
-        Of the last updates, per measured component: 1 where the model is right.
-    moving, refused : bool
-        Whether the unit moved at the last update, by its sensors, and whether the filter refused it.
-    faults : Faults
-        Those that the source reported.
-    noted : Faults
-        Those for which samples were left out.
-    align : float
-        Length of the alignment, s.
-    map : GrowingMapStatus or None
-        Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
-    """
-
-    phase: Phase = "getting ready"
-    t: float = np.nan
-    samples: int = 0
-    recorded: int = 0
-    waiting: float | None = 0.0
-    bias: Array = field(default_factory=lambda: np.empty(0))
-    sigma: Array = field(default_factory=lambda: np.empty(0))
-    temperature: float = np.nan
-    temperature_rate: float = np.nan
-    moving: bool = False
-    refused: bool = False
-    faults: Faults = field(default_factory=Faults)
-    noted: Faults = field(default_factory=Faults)
-    align: float = 0.0
+    phase: Phase = "getting ready"  # a run does not listen to its device before the filter is compiled
+    t: float = np.nan  # time of the last sample, s
+    samples: int = 0  # so far
+    recorded: int = 0  # rows that are safe in the recording
+    waiting: float | None = 0.0  # s of samples so far while the first alignment is waited for; None from then on
+    bias: Array = field(default_factory=lambda: np.empty(0))  # (d,): of the tracked sensor, SI
+    sigma: Array = field(default_factory=lambda: np.empty(0))  # (d,): its standard deviation
+    temperature: float = np.nan  # degC; NaN where there is none
+    temperature_rate: float = np.nan  # K/s
+    moving: bool = False  # whether the unit moved at the last update, by its sensors
+    refused: bool = False  # whether the filter refused that update
+    faults: Faults = field(default_factory=Faults)  # that the source reported
+    noted: Faults = field(default_factory=Faults)  # for which samples were left out
+    align: float = 0.0  # length of the alignment, s
     axes: tuple[str, ...] = ()
     m: int = 1
     sensor: Sensor | None = None
-    map: GrowingMapStatus | None = None
+    map: GrowingMapStatus | None = None  # of the map that is fitted meanwhile; it is replaced, never changed
     _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
     _came: deque[tuple[float, int]] = field(default_factory=deque)
     _heard: float = np.nan  # host time of the last sample, or when it was first listened [s]

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.filtering.segment import runs
+from driftlab.maps.fit import axes_of
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
@@ -38,30 +39,23 @@ GRID = 400
 
 @dataclass(frozen=True, eq=False)
 class MapVerdict:
-    """Quality of a map and of the soak it was fitted on.
-
-    Attributes
-    ----------
-    fitted : FittedMap
-    settings : ThermalMap
-        It was fitted with.
-    soak : SoakSummary
-    axes : tuple of str
-    memory : MemoryVerdict
-        Whether the bias remembers which temperatures came before.
-    placements : Placements or None
-        Of the unit, where its input is known by its length alone.
-    used : Used or None
-        Share of the soak that is used; None where that is not known.
-    """
+    """Quality of a map and of the soak it was fitted on."""
 
     fitted: FittedMap
-    settings: ThermalMap
+    settings: ThermalMap  # with which it was fitted
     soak: SoakSummary
-    axes: tuple[str, ...]
-    memory: MemoryVerdict
-    placements: Placements | None = None
-    used: Used | None = None
+    placements: Placements | None = None  # of the unit, where its input is known by its length alone
+    used: Used | None = None  # share of the soak that is used; None where that is not known
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return axes_of(self.fitted)
+
+    @cached_property
+    def memory(self) -> MemoryVerdict:
+        """Verdict on whether the bias remembers which temperatures came before."""
+        return memory_of(self.soak)
 
     @cached_property
     def map(self) -> FittedMap:
@@ -182,18 +176,6 @@ class MapVerdict:
         return f", the curve is known there only to {', '.join(text(v, 2) for v in sigma)} {unit.shown}"
 
 
-def judge(
-    fitted: FittedMap,
-    settings: ThermalMap,
-    soak: SoakSummary,
-    axes: tuple[str, ...],
-    placements: Placements | None = None,
-    used: Used | None = None,
-) -> MapVerdict:
-    """Return the verdict on a map that was fitted with settings on a soak, with its placements and the share used."""
-    return MapVerdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
-
-
 def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit) -> str:
     """Return the answer to whether a bias remembers which temperatures came before, in words."""
     named = zip(axes, memory.none_larger_than, strict=True)
@@ -231,45 +213,24 @@ SHORT = 0.03  # of the range: fewer samples in less than that are not reported
 
 @dataclass(frozen=True, eq=False)
 class Thin:
-    """A range of temperature with few samples.
+    """A range of temperature with few samples."""
 
-    Attributes
-    ----------
-    start, stop : float
-        degC.
-    found, needed : float
-        Samples a kelvin: the fewest there, and with how many white noise is no more than the curve's deviation.
-    """
-
-    start: float
-    stop: float
-    found: float
-    needed: float
+    start: float  # degC
+    stop: float  # degC
+    found: float  # fewest samples a kelvin there
+    needed: float  # samples a kelvin with which white noise is no more than the curve's deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Distribution of a soak's samples over its temperatures.
+    """Distribution of a soak's samples over its temperatures."""
 
-    Attributes
-    ----------
-    T, density : (CELLS,) arrays
-        Middle of each cell, degC, and samples a kelvin about it.
-    share : float
-        Of the range, that has samples.
-    holes : tuple of pairs
-        Ranges without a sample, degC.
-    thin : tuple of Thin
-    hours : dict of str to float
-        Warming, cooling, and neither.
-    """
-
-    T: Array
-    density: Array
-    share: float
-    holes: tuple[tuple[float, float], ...]
+    T: Array  # (CELLS,): middle of each cell, degC
+    density: Array  # (CELLS,): samples a kelvin about it
+    share: float  # of the range, that has samples
+    holes: tuple[tuple[float, float], ...]  # ranges without a sample, degC
     thin: tuple[Thin, ...]
-    hours: dict[str, float]
+    hours: dict[str, float]  # warming, cooling, and neither
 
     def as_json(self) -> dict[str, Any]:
         """Return it for programs."""

@@ -159,40 +159,19 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class GatheredSoak:
-    """The samples at rest of one or more recordings, joined.
+    """The samples at rest of one or more recordings, joined."""
 
-    Attributes
-    ----------
-    T, bias : (N,) and (N, d) arrays
-        Temperature in degC, without the thermometer's steps, and tracked bias in SI, in the order of time.
-    names : list of str
-        Names of the recordings.
-    starts : list of int
-        Where each of them begins.
-    interval : float
-        Between samples, s.
-    about : mapping of str to str
-        Facts on the device that all recordings have alike.
-    placements : Placements or None
-        Where the direction of the sensor's input is not known.
-    windows : tuple of Chunk
-        The epochs of the samples, with all that was recorded; empty where they were not to be kept.
-    used : Used
-        Share of the recordings that they are.
-    steps : Steps
-        Of the thermometer.
-    """
-
-    T: Array
-    bias: Array
-    names: list[str]
-    starts: list[int]
-    interval: float
-    about: Mapping[str, str] = field(default_factory=dict)
-    placements: Placements | None = None
+    T: Array  # (N,): temperature in degC, without the thermometer's steps, in the order of time
+    bias: Array  # (N, d): tracked bias, SI
+    names: list[str]  # names of the recordings
+    starts: list[int]  # where each of them begins
+    interval: float  # between samples, s
+    about: Mapping[str, str] = field(default_factory=dict)  # facts on the device that all recordings have alike
+    placements: Placements | None = None  # where the direction of the sensor's input is not known
+    # the epochs of the samples, with all that was recorded; empty where they were not to be kept
     windows: tuple[Chunk, ...] = ()
-    used: Used = field(default_factory=Used)
-    steps: Steps = NO_STEPS
+    used: Used = field(default_factory=Used)  # share of the recordings that they are
+    steps: Steps = NO_STEPS  # of the thermometer
 
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""

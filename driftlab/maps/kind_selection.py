@@ -48,41 +48,19 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """One kind with its settings, and how it did.
+    """One kind with its settings, and how it did."""
 
-    Attributes
-    ----------
-    name : str
-        As one says it: `polynomial, order 3`.
-    settings : ThermalMap or None
-        None: no map, a constant.
-    rms : (d,) array
-        Left-out error of each axis, in SI; NaN where it failed.
-    error, sigma : float
-        Over all axes, and its standard error.
-    more, more_sigma : float
-        By how much it is above the smallest, and the standard error of that difference.
-    freedom : float or None
-        Degrees of freedom of its curve, where they decided.
-    fitted : FittedMap or None
-        On all blocks.
-    left : (K, d) array
-        Left-out errors of the blocks, levels taken off; NaN where they are not scored.
-    failed : str
-        Why it could not be fitted; empty where it could.
-    """
-
-    name: str
-    settings: ThermalMap | None
-    rms: Array
-    error: float
-    sigma: float
-    more: float = 0.0
-    more_sigma: float = 0.0
-    freedom: float | None = None
-    fitted: FittedMap | None = None
-    left: Array | None = None
-    failed: str = ""
+    name: str  # as one says it: `polynomial, order 3`
+    settings: ThermalMap | None  # None: no map, a constant
+    rms: Array  # (d,): left-out error of each axis, in SI; NaN where it failed
+    error: float  # over all axes
+    sigma: float  # its standard error
+    more: float = 0.0  # by how much it is above the smallest
+    more_sigma: float = 0.0  # standard error of that difference
+    freedom: float | None = None  # degrees of freedom of its curve, where they decided
+    fitted: FittedMap | None = None  # on all blocks
+    left: Array | None = None  # (K, d): left-out errors of the blocks, levels taken off; NaN where they are not scored
+    failed: str = ""  # why it could not be fitted; empty where it could
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,30 +288,14 @@ MIN_SHARE = 0.5  # of the blocks to be scored
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """Division of K blocks for cross-validation.
+    """Division of K blocks for cross-validation."""
 
-    Attributes
-    ----------
-    fold : (K,) array
-        Number of the fold: its blocks are left out together; -1: never.
-    part : (K,) array
-        Number of the part: its errors stand for one another.
-    scored : (K,) array of bool
-        Blocks whose temperature is also among those that were not left out with them.
-    levels : bool
-        Whether a constant is taken off each level.
-    level : (K,) array
-        Number of the level: its blocks share a constant.
-    what : str
-        The parts, in words.
-    """
-
-    fold: Index
-    part: Index
-    scored: NDArray[np.bool_]
-    levels: bool
-    level: Index
-    what: str
+    fold: Index  # (K,): number of the fold: its blocks are left out together; -1: never
+    part: Index  # (K,): number of the part: its errors stand for one another
+    scored: NDArray[np.bool_]  # (K,): blocks whose temperature is also among those that were not left out with them
+    levels: bool  # whether a constant is taken off each level
+    level: Index  # (K,): number of the level: its blocks share a constant
+    what: str  # the parts, in words
 
     @property
     def share(self) -> float:

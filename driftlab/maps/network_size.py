@@ -147,18 +147,9 @@ def select(
 ) -> Selection:
     """Find how many neurons a network needs, for the bias and for its derivative.
 
-    Parameters
-    ----------
-    settings : ThermalMap
-        A network; all but its size and its target is taken from it.
-    T, bias : (N,) and (N, d) arrays
-        The soak, degC, and the bias in SI.
-    neurons : ints
-        Sizes to try, ascending. It ends early where the temperatures do not determine so many weights.
-    seed : int
-        Of the division into parts.
-    progress : function, optional
-        Called with the networks done, and their number.
+    The soak is T (N,) in degC and bias (N, d) in SI. All but size and target is taken from the settings; sizes are
+    tried in ascending order until the temperatures do not determine so many weights. `seed` is of the division into
+    parts; `progress` is called with the networks done, and their number.
 
     Raises
     ------
@@ -167,12 +158,12 @@ def select(
     DataError
         If the soak cannot be divided, or does not determine the smallest network.
     """
-    settings, sizes = _network(settings), _sizes(neurons)
+    network, sizes = check_selection(settings, neurons)
     if len(T) < MIN_SAMPLES:
         raise EmptyRecording(f"selection: has {len(T)} samples, expected at least {MIN_SAMPLES}; use a longer soak")
     bins = np.minimum(((T - T.min()) * (BINS / (np.ptp(T) or 1.0))).astype(np.intp), BINS - 1)
     parts = [BinnedPart(T[k], bias[k], bins[k]) for k in split(len(T), seed)]
-    maps = _fit_all(settings, sizes, parts[0], progress)
+    maps = _fit_all(network, sizes, parts[0], progress)
     return _compare(maps, parts, seed)
 
 
@@ -195,20 +186,17 @@ def _compare(maps: dict[Key, FittedMap], parts: list[BinnedPart], seed: int) -> 
     )
 
 
-def _network(settings: ThermalMap) -> NetworkMap:
+def check_selection(settings: ThermalMap, neurons: Iterable[int]) -> tuple[NetworkMap, tuple[int, ...]]:
+    """Return the network and the sizes to try; raises ConfigError where the map is none, or there is no size."""
+    sizes = tuple(neurons)
     if not isinstance(settings, NetworkMap):
         raise ConfigError(
             f"--select: kind {settings.kind} is no network, expected one; give --kind onnx_network, or leave --select "
             "out"
         )
-    return settings
-
-
-def _sizes(neurons: Iterable[int]) -> tuple[int, ...]:
-    sizes = tuple(neurons)
     if not sizes or sizes[0] < 1:
         raise ConfigError("--neurons-max: expected at least 1; write e.g. --neurons-max 10")
-    return sizes
+    return settings, sizes
 
 
 def _fit_all(
@@ -250,7 +238,7 @@ def settings_selected(
 
     `progress`, where given, is called with texts. Raises as `select` does.
     """
-    network, sizes = _network(settings), _sizes(neurons)
+    network, sizes = check_selection(settings, neurons)
 
     def report(done: int, count: int) -> None:
         if progress is not None:
@@ -261,9 +249,3 @@ def settings_selected(
     chosen = selection.of(network.target).chosen
     tried = f"{chosen} neurons of {selection.bias.neurons[0]} to {selection.bias.neurons[-1]}"
     return network.model_copy(update={"neurons": chosen}), selection, tried
-
-
-def check_selection(settings: ThermalMap, neurons: Iterable[int]) -> None:
-    """Raise ConfigError where the map is no network, or there is no size to try."""
-    _network(settings)
-    _sizes(neurons)

@@ -9,20 +9,16 @@ axes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab.soak.blocks import means, runs
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.soak_noise import summed
 from fusion_core.wandering import WalkContrasts, bounds, contrasts, rows_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import FittedMap, ThermalMap
 
 AVERAGED = 30.0  # s: as the reference of every table of errors
 MAX_ROWS = 120  # rows whose covariance is written down

@@ -25,25 +25,13 @@ SHORTEST = 300.0  # s, that a staircase holds a level
 
 @dataclass(frozen=True)
 class Chamber:
-    """Abilities of the chamber, and the range that is asked of it.
+    """Abilities of the chamber, and the range that is asked of it."""
 
-    Attributes
-    ----------
-    low, high : float
-        The range of temperatures that the map is for, degC.
-    start : float
-        Temperature of chamber and body at the beginning, degC.
-    rate : float
-        Fastest change, K/s.
-    lag : float
-        Time constant with which the unit's body follows, s.
-    """
-
-    low: float
-    high: float
-    start: float
-    rate: float
-    lag: float
+    low: float  # lowest temperature that the map is for, degC
+    high: float  # highest, degC
+    start: float  # temperature of chamber and body at the beginning, degC
+    rate: float  # fastest change, K/s
+    lag: float  # time constant with which the unit's body follows, s
 
     @property
     def swing(self) -> float:
@@ -58,22 +46,12 @@ class Chamber:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Set points of a chamber.
+    """Set points of a chamber."""
 
-    Attributes
-    ----------
-    name : str
-        A description in words.
-    family : str
-        `staircase`, `ramps` or `mixed`.
-    time, temperature : (M,) arrays
-        Set points in s, from 0 on, and degC; straight lines in between.
-    """
-
-    name: str
-    family: ProfileShape
-    time: Array
-    temperature: Array
+    name: str  # a description in words
+    family: ProfileShape  # `staircase`, `ramps` or `mixed`
+    time: Array  # (M,): of the set points, from 0 on, s
+    temperature: Array  # (M,): set points, degC; straight lines in between
 
     @property
     def duration(self) -> float:

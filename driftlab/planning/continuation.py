@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from driftlab.config import Config, with_recording
-from driftlab.maps.fit import samples
+from driftlab.maps.fit import gather
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, RatedProfile, SearchResult, SigmaCurve
 from driftlab.planning.unit_model import UnitModel
@@ -35,32 +34,16 @@ Progress = Callable[..., None] | None
 
 @dataclass(frozen=True, eq=False)
 class RecordedSoak(SigmaCurve):
-    """Recordings, N samples in all, and the map that is fitted to them.
+    """Recordings, N samples in all, and the map that is fitted to them."""
 
-    Attributes
-    ----------
-    subject : Subject
-        The unit, its noise as measured, its curve as fitted.
-    chamber : Chamber
-        With the range that is asked for.
-    parts : tuple of ((N_r,), (N_r, d)) arrays
-        Temperature and bias of each recording, degC and SI.
-    dt : float
-        From one sample to the next, s.
-    map : FittedMap
-    temperature, sigma, misfit : (G,) and (G, d) arrays
-        Over the range: uncertainty of the map, SI; NaN where nothing was seen; and the part of it that the kind of
-        map is to blame for.
-    """
-
-    subject: UnitModel
-    chamber: Chamber
-    parts: tuple[tuple[Array, Array], ...]
-    dt: float
+    subject: UnitModel  # the unit, its noise as measured, its curve as fitted
+    chamber: Chamber  # with the range that is asked for
+    parts: tuple[tuple[Array, Array], ...]  # T (N_r,), degC, and bias (N_r, d), SI, of each recording
+    dt: float  # from one sample to the next, s
     map: FittedMap
-    temperature: Array
-    sigma: Array
-    misfit: Array
+    temperature: Array  # (G,): over the range, degC
+    sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
+    misfit: Array  # (G, d): the part of it that the kind of map is to blame for
 
     @property
     def T(self) -> Array:
@@ -121,20 +104,8 @@ def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tup
     DataError
         If a recording cannot be used.
     """
-    parts, steps = [], []
-    for name in recordings:
-        seen: list[tuple[float, int]] = []
-        parts.append(samples(with_recording(config, name), faults, partial(_note, seen)))
-        time, count = np.array(seen, dtype=np.float64).T
-        steps.append(np.diff(time) / np.diff(count))
-    spacing = np.concatenate(steps)  # an epoch is as long as the recording's samples, where these are further apart
-    if not len(spacing):  # a minute or so
-        return parts, max(float(config.filter.update_interval), 1.0) if config.filter else 1.0
-    return parts, float(np.median(spacing))
-
-
-def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
-    seen.append((time, count))
+    soaks = [gather(with_recording(config, name), (), faults) for name in recordings]
+    return [(soak.T, soak.bias) for soak in soaks], float(np.median([soak.interval for soak in soaks]))
 
 
 def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:

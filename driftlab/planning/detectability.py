@@ -46,38 +46,18 @@ Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the error
 
 @dataclass(frozen=True)
 class Detectability:
-    """Detectability of one effect on a planned recording.
+    """Detectability of one effect on a planned recording."""
 
-    Attributes
-    ----------
-    name : str
-        Its name in the loop.
-    effect : Effect
-        In the middle of its hyper-parameters.
-    nats : float
-        Of one of the stated size.
-    threshold : float
-        Nats that the loop requires at short times; it requires better predictions of left-out parts too.
-    found_from : float
-        Smallest size in SI, from lowest to highest on each axis, that the loop would find in half of all recordings;
-        infinite where none.
-    best, worst : float
-        The same, the smallest and the largest over its hyper-parameters.
-    nats_found : float
-        Of one of twice the smallest size; 0 where none is search.
-    left : dict of str to float
-        Share of the nats that is left where another effect may take its part.
-    """
-
-    name: str
-    effect: Effect
-    nats: float
-    threshold: float
+    name: str  # its name in the loop
+    effect: Effect  # in the middle of its hyper-parameters
+    nats: float  # of one of the stated size
+    threshold: float  # nats that the loop requires at short times; it requires better predictions of left-out parts too
+    # smallest size in SI, from lowest to highest on each axis, that is found in half of all recordings; infinite: none
     found_from: float
-    best: float
-    worst: float
-    nats_found: float
-    left: dict[str, float]
+    best: float  # the smallest of these over its hyper-parameters
+    worst: float  # the largest
+    nats_found: float  # of one of twice the smallest size; 0 where none is found
+    left: dict[str, float]  # share of the nats that is left where another effect may take its part
 
     @property
     def found(self) -> bool:
@@ -92,33 +72,15 @@ class Detectability:
 
 @dataclass(frozen=True)
 class DetectabilityReport:
-    """Detectability of effects on a planned recording.
+    """Detectability of effects on a planned recording."""
 
-    Attributes
-    ----------
-    effects : tuple of Detectability
-        The effects, the one found at the smallest size first.
-    silent : tuple of str
-        Effects that the recording cannot show at all.
-    size : float
-        The size whose nats are given, from lowest to highest, SI.
-    shown : BiasUnit
-        Unit of the bias.
-    still : tuple of str
-        Channels that are held: effects that follow them are not seen.
-    curve_known : bool
-        Whether the map's curve is the unit's own.
-    only : str
-        `warms up` or `cools down`, where the recording does nothing else.
-    """
-
-    effects: tuple[Detectability, ...]
-    silent: tuple[str, ...]
-    size: float
-    shown: BiasUnit
-    still: tuple[str, ...]
-    curve_known: bool
-    only: str
+    effects: tuple[Detectability, ...]  # the effects, the one found at the smallest size first
+    silent: tuple[str, ...]  # effects that the recording cannot show at all
+    size: float  # the size whose nats are given, from lowest to highest, SI
+    shown: BiasUnit  # unit of the bias
+    still: tuple[str, ...]  # channels that are held: effects that follow them are not seen
+    curve_known: bool  # whether the map's curve is the unit's own
+    only: str  # `warms up` or `cools down`, where the recording does nothing else
 
 
 def predict_detectability(
@@ -254,22 +216,7 @@ def effects_in(
 
 
 class MonteCarlo:
-    """Realisations of one planned recording.
-
-    Attributes
-    ----------
-    search : Search
-        The recording, without effects.
-    unit : UnitModel
-    noise : (d, n, m) array
-        Noise of each realisation, SI.
-    curve : (d, n) array
-        The map's curve, SI.
-    noises : list of LocalLevel
-        Of the rows of each axis.
-    price : float
-        Log of how many candidates the loop tries there.
-    """
+    """Realisations of one planned recording, a search without effects; `price` is the log of the candidates there."""
 
     def __init__(self, search: Search, unit: UnitModel, price: float, seed: int = 0) -> None:
         self.search, self.unit, self.price = search, unit, price
@@ -277,7 +224,7 @@ class MonteCarlo:
         interval, shape = evidence.interval, (len(unit.axes), len(evidence), REALISATIONS)
         white = rng.normal(size=shape) * (unit.noise / np.sqrt(interval))[:, None, None]
         walk = np.cumsum(rng.normal(size=shape), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]
-        self.noise, self.noises = white + walk, noises(unit, interval)
+        self.noise, self.noises = white + walk, noises(unit, interval)  # (d, n, m) in SI, and of the rows of each axis
         self.curve = unit.curve(evidence.rows([chunk["temperature"] for chunk in evidence.chunks])).T
 
     def smallest(
@@ -285,20 +232,15 @@ class MonteCarlo:
     ) -> list[float]:
         """Return the sizes in SI from which on most realisations pass, one for each shape; infinite where none helps.
 
-        Parameters
-        ----------
-        effects : sequence of Effect
-            One effect with the hyper-parameters that the loop tries.
-        shapes : sequence of (n, d) arrays
-            Its signatures, of one SI unit. Of an effect on the map's input it is the whole curve, the map's own part
-            with it: with its slope it grows.
-        starts : sequence of float
-            Sizes near which the answers may be.
-        alike : (S, effects) array of bool
-            Which hyper-parameters are near enough to those of a shape to count as found.
+        `effects` are one effect with the hyper-parameters that the loop tries, `shapes` (n, d) its signatures of one SI
+        unit; of an effect on the map's input the whole curve, the map's own part with it: with its slope it grows. The
+        answers may be near `starts`, and `alike` (S, effects) says which hyper-parameters are near enough to those of a
+        shape to count as found.
         """
         case = _Case(self, effects, shapes, alike)
-        return [self._smallest(case, j, start) for j, start in enumerate(starts)]
+        sizes = [self._smallest(case, j, start) for j, start in enumerate(starts)]
+        self.search.squares.forget()  # no other effect asks for these fits
+        return sizes
 
     def _smallest(self, case: _Case, j: int, start: float) -> float:
         power = next((k for k in POWERS if case.passes(j, start * 2.0**k)), None)

@@ -23,13 +23,7 @@ SIGMA_EXCESS = 0.1  # over the best, for the sake of discrimination
 
 
 class DiscriminationCriterion:
-    """The criterion for effects of some kinds.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The effects.
-    """
+    """The criterion for effects of some kinds, `names`."""
 
     def __init__(self, unit: UnitModel, chamber: Chamber, hours: float, kinds: Collection[str]) -> None:
         self.unit, self.lag = unit, chamber.lag

@@ -62,34 +62,17 @@ def rms(values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RatedProfile(SigmaCurve):
-    """A profile, and the expected uncertainty of its map.
-
-    Attributes
-    ----------
-    profile : Profile
-    temperature : (G,) array
-        Over the range, degC.
-    sigma : (G, d) array
-        Of the map that will be fitted, SI.
-    noise : (G, d) array
-        The part of it that the unit's noise makes; the rest is the misfit of the kind. With a family: the whole of it.
-    covered : (float, float)
-        Lowest and highest temperature of the body, degC.
-    share : float
-        Of the range that is covered.
-    place : str
-        With a family, the part of the range that is soaked: `lower`, `middle`, `upper`, or `whole`.
-    without_family : (G, d) array
-        With a family, the root mean square error of the map without it that is best for its units.
-    """
+    """A profile, and the expected uncertainty of its map."""
 
     profile: Profile
-    temperature: Array
-    sigma: Array
+    temperature: Array  # (G,): over the range, degC
+    sigma: Array  # (G, d): of the map that will be fitted, SI
+    # (G, d): the part that the unit's noise makes, the rest is the misfit of the kind; with a family all of it
     noise: Array
-    covered: tuple[float, float]
-    share: float
-    place: str = ""
+    covered: tuple[float, float]  # lowest and highest temperature of the body, degC
+    share: float  # of the range that is covered
+    place: str = ""  # with a family, the part of the range that is soaked: `lower`, `middle`, `upper`, or `whole`
+    # (G, d): with a family, the root mean square error of the map without it that is best for its units
     without_family: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod

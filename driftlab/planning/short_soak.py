@@ -37,38 +37,19 @@ NEARLY = 1.1  # of the least sigma: as good, where no sigma is asked for
 
 @dataclass(frozen=True, eq=False)
 class ShortSoakPlan:
-    """Result of a search for the shortest soak.
-
-    Attributes
-    ----------
-    family : Family
-    chamber : Chamber
-    noise, walk : (d,) arrays
-        Densities that are planned with, SI.
-    hours : tuple of float
-        Lengths that are tabled, the longest first.
-    tried : tuple of RatedProfile
-        Of each share and length the best place.
-    chosen : RatedProfile
-        The shortest that reaches the target; without one, the shortest that is nearly as good as any.
-    target : float or None
-        Sigma to reach, rms over the range of the worst axis, SI.
-    reached : bool
-        Whether the target is.
-    own_hours : float or None
-        Length without the family; None where no length of the table's will do.
-    """
+    """Result of a search for the shortest soak."""
 
     family: Family
     chamber: Chamber
-    noise: Array
-    walk: Array
-    hours: tuple[float, ...]
-    tried: tuple[RatedProfile, ...]
+    noise: Array  # (d,): density that is planned with, SI
+    walk: Array  # (d,): density, SI
+    hours: tuple[float, ...]  # lengths that are tabled, the longest first
+    tried: tuple[RatedProfile, ...]  # of each share and length the best place
+    # the shortest that reaches the target; without one, the shortest that is nearly as good as any
     chosen: RatedProfile
-    target: float | None
-    reached: bool
-    own_hours: float | None
+    target: float | None  # sigma to reach, rms over the range of the worst axis, SI
+    reached: bool  # whether the target is
+    own_hours: float | None  # length without the family; None where no length of the table's will do
 
     def best(self, share: float, hours: float) -> RatedProfile | None:
         """Return the rating of a share of the range in so many hours."""

@@ -30,9 +30,11 @@ from driftlab.noise.local_level import LocalLevel, one_step
 from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, FileSource
+from fusion_core.thermal.penalised import smooth_lines
 
 SEED = 20  # of the simulated noise, by which the map is smoothed
 MOST = 20_000  # means: those of a longer recording are longer than the loop's
+MAX_CURVES = 153  # of a map, about one a kelvin: with more of its own it stands as straight lines
 
 Body = Callable[[Array], Array]  # temperature (N,) in degC at t (N,) in s
 
@@ -84,7 +86,11 @@ def _search(unit: UnitModel, recordings: Sequence[tuple[Array, Array, Array]], i
         records.append(Record(str(k), True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0))))
     evidence = Evidence(tuple(records), unit.channel, unit.axes, unit.unit, interval, unit.align)
     T = np.concatenate([T for _, T, _ in recordings])
-    columns = EffectRegressors(evidence, unit.map.basis((float(T.min()), float(T.max()))))
+    domain = float(T.min()), float(T.max())
+    basis = unit.map.basis(domain)
+    if basis is not None and len(basis.penalty) > MAX_CURVES:
+        basis = smooth_lines(domain)
+    columns = EffectRegressors(evidence, basis)
     d = len(unit.axes)
     search = Search(LeastSquares(columns, np.full(d, 1e-4), np.ones(d)), lambda text: None, (), (), parts(columns))
     search.fresh()
@@ -133,14 +139,8 @@ def _values(search: Search, unit: UnitModel, effect: Effect, axis: int) -> Array
 class Information:
     """Information of a planned recording on the shapes of effects.
 
-    Attributes
-    ----------
-    effects : tuple of Effect
-        The effects.
-    G : (d, K, K) array
-        Inner products of the columns, white, with map and level taken out.
-    b : (d, K) array
-        Theirs with what was measured.
+    G (d, K, K) are inner products of the columns, white, with map and level taken out, b (d, K) theirs with what was
+    measured.
     """
 
     def __init__(self, search: Search, unit: UnitModel, effects: Sequence[Effect]) -> None:

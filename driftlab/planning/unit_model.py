@@ -30,40 +30,20 @@ SWING = 100.0  # times the noise of a minute: that of a curve that nobody knows
 
 @dataclass(frozen=True)
 class UnitModel:
-    """A unit whose map is planned, of d axes.
+    """A unit whose map is planned, of d axes."""
 
-    Attributes
-    ----------
-    channel, axes, unit
-        Whose bias it is, names of its axes, and its unit.
-    map : ThermalMap
-        The settings of the kind that will be fitted.
-    noise, walk : (d,) arrays
-        Densities of the bias's white noise and random walk, SI.
-    noise_of : str
-        Where they are from.
-    shape : function of T (N,) -> (N, d), or None
-        The curve that is to be found, as far as it is known.
-    shape_of : str
-        Where it is from.
-    interval, align : float
-        Duration of an epoch, and how long a unit is aligned, s.
-    curve_known : bool
-        Whether the shape is the unit's own, or one that is taken for want of it.
-    """
-
-    channel: str
-    axes: tuple[str, ...]
-    unit: BiasUnit
-    map: ThermalMap
-    noise: Array
-    walk: Array
-    noise_of: str
-    shape: Curve | None
-    shape_of: str
-    interval: float = 1.0
-    align: float = 60.0
-    curve_known: bool = True
+    channel: str  # whose bias it is
+    axes: tuple[str, ...]  # names
+    unit: BiasUnit  # of the bias
+    map: ThermalMap  # the settings of the kind that will be fitted
+    noise: Array  # (d,): density of the bias's white noise, SI
+    walk: Array  # (d,): density of its random walk, SI
+    noise_of: str  # where they are from
+    shape: Curve | None  # the curve that is to be found, as far as it is known
+    shape_of: str  # where it is from
+    interval: float = 1.0  # duration of an epoch, s
+    align: float = 60.0  # how long a unit is aligned, s
+    curve_known: bool = True  # whether the shape is the unit's own, or one that is taken for want of it
 
     @property
     def d(self) -> int:

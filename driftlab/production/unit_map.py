@@ -34,7 +34,7 @@ from driftlab.evaluation.scores import HORIZONS
 from driftlab.family.record import Figure
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.identification.config_edit import host_of, with_tracked
-from driftlab.maps.assessment import MapVerdict, judge
+from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.soak.blocks import means, runs
@@ -110,7 +110,7 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMa
     settings = map_settings(config, None if named else USUAL)
     soak = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, soak)
-    verdict = judge(fitted, settings, soak.brief(), axes_of(fitted), soak.placements, soak.used)
+    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
     return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict)
 
 

@@ -10,8 +10,8 @@ single readings of a thermometer show of its steps is looked at before they are 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from itertools import islice
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.thermal.thermometer import READINGS, readings, started
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 Index = NDArray[np.int64]
 

@@ -15,9 +15,11 @@ from driftlab.storage.in_memory import InMemoryName
 from fusion_core.contracts import FileSource, Source
 from fusion_core.errors import UnreadableFile
 
+STANDARD_INPUT = Path("-")
+
 
 def identity(name: str) -> dict[str, Any]:
-    """Return the identity of a recording: its name, and length and hash of its file (or samples).
+    """Return the identity of a recording: its name, and length and hash of its file (or samples), as `of_file`.
 
     Raises
     ------
@@ -65,7 +67,12 @@ def beforehand(source: Source | None) -> Callable[[], None]:
 
 
 def of_file(path: Path) -> dict[str, Any]:
-    """Return length and hash of a file, or of a folder that is one recording; raises UnreadableFile."""
+    """Return length and hash of a file, or of a folder that is one recording; raises UnreadableFile.
+
+    Nothing is known of standard input, which is not kept.
+    """
+    if path == STANDARD_INPUT:
+        return {}
     digest = sha256(path)
     return {"bytes": sum(part.stat().st_size for part in _parts(path)), "sha256": digest}
 

@@ -29,24 +29,12 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class Content:
-    """Words of a recording, and the values that they begin with.
+    """Words of a recording, and the values that they begin with."""
 
-    Attributes
-    ----------
-    words : (K,) array of uint64
-        Each once, in rising order.
-    values : (K, d) array
-        The sensor's, SI.
-    step : (d,) array
-        Usual step from sample to sample.
-    sparse : int
-        One in so many words is kept.
-    """
-
-    words: Words
-    values: Array
-    step: Array
-    sparse: int
+    words: Words  # (K,): each once, in rising order
+    values: Array  # (K, d): the sensor's, SI
+    step: Array  # (d,): usual step from sample to sample
+    sparse: int  # one in so many words is kept
 
     def thinned(self, sparse: int) -> Content:
         """Return the content with one in so many words."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
+from driftlab.config import Config
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import FileSource
+from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
-
-    from driftlab.config import Config
-    from fusion_core.contracts import Sensor
 
 ROWS = 65_536  # of a chunk read at once
 LONG = 600.0  # s between samples that are noted

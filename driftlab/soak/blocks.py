@@ -53,27 +53,13 @@ def means(values: Array, starts: Index, weight: Array | None = None) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SoakRows:
-    """Means of a soak, in the order of time.
+    """Means of a soak, in the order of time."""
 
-    Attributes
-    ----------
-    t : (R,) array
-        Their middles, s.
-    T : (R,) array
-        Temperature as measured, degC.
-    bias : (R, d) array
-        Of the tracked sensor, SI.
-    span : (R,) array
-        How long each was measured, s.
-    channels : mapping of str to (R,) or (R, k) array
-        What else was recorded, for effects.
-    """
-
-    t: Array
-    T: Array
-    bias: Array
-    span: Array
-    channels: Mapping[str, Array] = field(default_factory=dict)
+    t: Array  # (R,): their middles, s
+    T: Array  # (R,): temperature as measured, degC
+    bias: Array  # (R, d): of the tracked sensor, SI
+    span: Array  # (R,): how long each was measured, s
+    channels: Mapping[str, Array] = field(default_factory=dict)  # (R,) or (R, k): what else was recorded
 
     def part(self, where: NDArray[np.bool_]) -> SoakRows:
         """Return the rows of which `where` (R,) is true."""
@@ -177,29 +163,15 @@ _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SoakSummary(SoakRows):
-    """Rows of the samples that a map was fitted on, and their cells, for its assessment.
+    """Rows of the samples that a map was fitted on, and their cells, for its assessment."""
 
-    Attributes
-    ----------
-    domain : tuple of float
-        Lowest and highest temperature, degC.
-    way, recording : (R,) arrays
-        Of each row: +1 warming, -1 cooling or 0, and from which recording it is.
-    count : (3, CELLS) array
-        Samples in each cell on no way, warming, and cooling.
-    cell_T, cell_bias : (3, CELLS) and (3, CELLS, d) arrays
-        Their means; NaN where there are none.
-    white : (d,) array
-        Standard deviation of the white noise of a sample.
-    """
-
-    domain: tuple[float, float]
-    way: Index
-    recording: Index
-    count: Array
-    cell_T: Array
-    cell_bias: Array
-    white: Array
+    domain: tuple[float, float]  # lowest and highest temperature, degC
+    way: Index  # (R,): +1 warming, -1 cooling or 0
+    recording: Index  # (R,): number of the recording that a row is from
+    count: Array  # (3, CELLS): samples in each cell on no way, warming, and cooling
+    cell_T: Array  # (3, CELLS): their mean temperature; NaN where there are none
+    cell_bias: Array  # (3, CELLS, d): their mean bias
+    white: Array  # (d,): standard deviation of the white noise of a sample
 
     @property
     def edges(self) -> Array:

@@ -40,43 +40,22 @@ FLAT = 0.2  # of the input, on an axis: with less nothing of its scale shows
 
 @dataclass(frozen=True, eq=False)
 class ScaleChange:
-    """Change of the scale factor of one axis, from the coldest to the warmest temperature.
+    """Change of the scale factor of one axis, from the coldest to the warmest temperature."""
 
-    Attributes
-    ----------
-    determined : bool
-        Whether the placements separate it from the change of the bias.
-    value, sigma : float
-        Where determined.
-    """
-
-    determined: bool
-    value: float = 0.0
-    sigma: float = 0.0
+    determined: bool  # whether the placements separate it from the change of the bias
+    value: float = 0.0  # where determined
+    sigma: float = 0.0  # its deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Estimates from P placements.
+    """Estimates from P placements."""
 
-    Attributes
-    ----------
-    up : (P, d) array
-        Direction of the input in each.
-    levels : Levels
-        Of bias and scale factor.
-    changes : tuple of ScaleChange
-        Of the scale factor of each axis.
-    blocks : Blocks
-        The samples.
-    errors : tuple of (K, r) arrays, one an axis
-        Root of the covariance of the blocks' errors: their noise, less the part that levels and scale have taken.
-    """
-
-    up: Array
-    levels: Levels
-    changes: tuple[ScaleChange, ...]
-    blocks: Blocks
+    up: Array  # (P, d): direction of the input in each
+    levels: Levels  # of bias and scale factor
+    changes: tuple[ScaleChange, ...]  # of the scale factor of each axis
+    blocks: Blocks  # the samples
+    # (K, r) an axis: root of the covariance of the blocks' errors, their noise less what levels and scale have taken
     errors: tuple[Array, ...]
 
     def widened(self, fitted: FittedMap, smoother: Smoother) -> FittedMap:
@@ -205,32 +184,16 @@ STEPS = 20
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Bias and scale factor of d axes from P placements.
+    """Bias and scale factor of d axes from P placements."""
 
-    Attributes
-    ----------
-    bias, sigma : (d,) arrays
-        In the mean over the samples, and its deviation; scale factors that are not determined are part of that.
-    given_scale : (d,) array
-        The deviation where scale factors that are not determined are what they should be.
-    scale, scale_sigma : (d,) arrays
-        Scale factor less 1.
-    lengths : (P,) array
-        Residuals of the lengths, in the unit of the bias.
-    expected : (P,) array
-        Its deviation by the noise of the levels.
-    prior : float
-        Deviation of a bias of which nothing is known.
-    """
-
-    bias: Array
-    sigma: Array
-    given_scale: Array
-    scale: Array
-    scale_sigma: Array
-    lengths: Array
-    expected: Array
-    prior: float
+    bias: Array  # (d,): in the mean over the samples
+    sigma: Array  # (d,): its deviation; scale factors that are not determined are part of that
+    given_scale: Array  # (d,): the deviation where scale factors that are not determined are what they should be
+    scale: Array  # (d,): scale factor less 1
+    scale_sigma: Array  # (d,): its deviation
+    lengths: Array  # (P,): residuals of the lengths, in the unit of the bias
+    expected: Array  # (P,): their deviation by the noise of the levels
+    prior: float  # deviation of a bias of which nothing is known
 
     @property
     def scale_determined(self) -> Array:
@@ -247,13 +210,8 @@ class Levels:
 def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -> Levels:
     """Return bias and scale factor from the levels (P, d) of the placements.
 
-    Parameters
-    ----------
-    level : (P, d) array
-    roots : (P, r) arrays, one an axis
-        Of the covariance of the levels.
-    length, unsure : float
-        Of the input, and its deviation, the same in all placements.
+    `roots` (P, r), one an axis, are of the covariance of the levels; `length` is that of the input and `unsure` its
+    deviation, the same in all placements.
     """
     d = level.shape[1]
     deviation = np.concatenate([np.full(d, BIAS * length), np.full(d, SCALE)])

@@ -23,6 +23,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
+from fusion_core.thermal.curve_error import nested
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, sawtooth, steps_of
 
 WALKS = (5e-5, 2e-4, 1e-3, 5e-3)  # K/s/sqrt(s), of the rate
@@ -90,9 +91,7 @@ def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
     grid = np.asarray(error.T)
     off = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
     depth = np.stack([grid[0] + steps.size - grid, grid - grid[-1] + steps.size]) / steps.size
-    modes = np.maximum(depth, 0.0)[:, :, None] * off
-    more = tuple(tuple(map(tuple, mode)) for mode in modes.tolist())
-    error = error.model_copy(update={"modes": (*more, *error.modes)})
+    error = error.model_copy(update={"modes": (*nested(np.maximum(depth, 0.0)[:, :, None] * off), *error.modes)})
     return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
 
 
@@ -105,13 +104,7 @@ def _offset(T: Array, size: float) -> float:
 class _Levels:
     """The levels that readings show: how likely they are at a temperature.
 
-    Parameters
-    ----------
-    means, count : (K,) arrays
-        Of groups of readings, in degC, and how many each.
-    offset : float
-        One of the levels, degC.
-    steps : Steps
+    `means` (K,) in degC and `count` (K,) are of groups of readings, `offset` is one of the levels in degC.
     """
 
     def __init__(self, means: Array, count: Array, offset: float, steps: Steps) -> None:

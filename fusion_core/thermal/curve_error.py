@@ -42,6 +42,14 @@ class Misfit(Frozen):
     noise: Annotated[FiniteFloat, Field(ge=0)]
 
 
+Modes = tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
+
+
+def nested(modes: Array) -> Modes:
+    """Return modes (r, G, d) as a record holds them."""
+    return tuple(tuple(map(tuple, mode)) for mode in modes.tolist())
+
+
 class CurveError(Frozen):
     """The error of a fitted curve.
 
@@ -60,7 +68,7 @@ class CurveError(Frozen):
     """
 
     T: tuple[FiniteFloat, ...]
-    modes: tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
+    modes: Modes
     bend: tuple[FiniteFloat, ...]
     holes: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
     misfits: tuple[Misfit, ...] = ()

@@ -17,7 +17,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.errors import SingularFit
-from fusion_core.thermal.curve_error import CurveError, Misfit
+from fusion_core.thermal.curve_error import CurveError, Misfit, nested
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.soak_noise import (
     MIN_BLOCKS,
@@ -72,26 +72,15 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     """Return a map whose curve is off by its answer to errors of the blocks that it was fitted on.
 
     They are in the place of the noise that the fit has seen; a misfit that it has seen, and what holes may hide, stay.
-
-    Parameters
-    ----------
-    fitted : FittedMap
-        One that does not tell how sure it is stays as it is.
-    errors : (K, r) arrays, one an axis
-        Root of their covariance.
+    `errors` (K, r), one an axis, are roots of their covariance. A map that does not tell how sure it is stays as it is.
     """
     error = fitted.record.error
     if error is None:
         return fitted
     grid = np.asarray(error.T)
     more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
-    r = max(map(len, more))
-    modes = np.zeros((r, len(grid), len(more)))
-    for axis, of_axis in enumerate(more):
-        modes[: len(of_axis), :, axis] = of_axis
     modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    joined = (*modes_kept, *(tuple(map(tuple, mode)) for mode in modes.tolist()))
-    error = error.model_copy(update={"modes": joined})
+    error = error.model_copy(update={"modes": (*modes_kept, *nested(_stacked(more)))})
     return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
 
 
@@ -139,12 +128,8 @@ def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> Curve
 def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tuple[Array, Array]:
     """Return the densities (d,) of white noise and walk in what a map leaves of samples, in its unit, per second.
 
-    Parameters
-    ----------
-    T, left : (N,) and (N, d) arrays
-        The samples in the order of time, one each dt in s, and what the map leaves of them.
-    smoother : function
-        How the map answers to their noise.
+    The samples T (N,) are in the order of time, one each dt in s, `left` (N, d) is what the map leaves of them, and
+    `smoother` how it answers to their noise.
     """
     blocks = blocks_of(T, left)
     contrasts = Contrasts(blocks)
@@ -165,16 +150,17 @@ def _joined(
     misfits: tuple[Misfit, ...] = (),
 ) -> CurveError:
     """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
-    r = max(len(modes) for modes in per_axis)
-    modes = np.zeros((r + len(holes), len(grid), len(per_axis)))
+    hidden = [np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend) for low, high in holes]
+    modes = nested(np.concatenate([_stacked(per_axis), np.reshape(hidden, (-1, len(grid), len(bend)))]))
+    return CurveError(T=tuple(grid.tolist()), modes=modes, bend=tuple(bend.tolist()), holes=holes, misfits=misfits)
+
+
+def _stacked(per_axis: Sequence[Array]) -> Array:
+    """Return the modes (r, G) of each axis as those of all (r, G, d)."""
+    modes = np.zeros((max(map(len, per_axis)), per_axis[0].shape[1], len(per_axis)))
     for axis, of_axis in enumerate(per_axis):
         modes[: len(of_axis), :, axis] = of_axis
-    for k, (low, high) in enumerate(holes):
-        modes[r + k] = np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend)
-    return CurveError(
-        T=tuple(grid.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes.tolist()),
-        bend=tuple(bend.tolist()), holes=holes, misfits=misfits,
-    )  # fmt: skip
+    return modes
 
 
 def _check_holes(kind: str, error: CurveError, swing: Array) -> None:

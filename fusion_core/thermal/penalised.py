@@ -28,21 +28,12 @@ RIDGE = 1e-10  # of the mean diagonal: what neither values nor penalty determine
 
 @dataclass(frozen=True, eq=False)
 class Penalised:
-    """A fit.
+    """A fit."""
 
-    Attributes
-    ----------
-    coefficients : (n,) array
-        That of the least criterion.
-    operator : (n, m) array
-        Takes y to the coefficients.
-    root : (n, n) array
-        root root' is the covariance of the coefficients, where the values differ from a curve by noise of variance
-        1 / w, up to one factor, which is found from them, and the curve is as smooth as the penalty has it.
-    """
-
-    coefficients: Array
-    operator: Array
+    coefficients: Array  # (n,): that of the least criterion
+    operator: Array  # (n, m): takes y to the coefficients
+    # (n, n): root root' is the covariance of the coefficients, where the values differ from a curve by noise of
+    # variance 1 / w, up to one factor, which is found from them, and the curve is as smooth as the penalty has it
     root: Array
 
 

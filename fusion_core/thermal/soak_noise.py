@@ -135,16 +135,9 @@ class BlockNoise:
 
 
 class Contrasts:
-    """Contrasts of K blocks that no free curve of T can make.
+    """Contrasts of K blocks that no free curve of T can make: straight pieces X (K, p) between `knots` (p,).
 
-    Attributes
-    ----------
-    knots : (p,) array
-        Of the free curve, X (K, p) its straight pieces.
-    covariance : (K, K) array
-        Of a walk.
-    white : (K,) array
-        Variance of white noise, 1 in the mean block.
+    `covariance` (K, K) is that of a walk, `white` (K,) the variance of white noise, 1 in the mean block.
     """
 
     def __init__(self, blocks: Blocks, more: Array | None = None) -> None:

@@ -46,6 +46,7 @@ PARTS = 6  # directions in which it is free
 SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
+TINY = 1e-300
 
 
 class FreeCurve:
@@ -87,40 +88,24 @@ def laws_of(blocks: SoakRows, recording: Index) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class FollowingCurves:
-    """Curves that follow J inputs, as a soak makes them.
+    """Curves that follow J inputs, as a soak makes them."""
 
-    Attributes
-    ----------
-    coefficients : (J, p, d) array
-        Of the splines.
-    partly : (J, d) array of bool
-        Whether a part of the curve follows, or all of it.
-    added : (S, J, d) array
-        The bias that each adds on the slots.
-    """
-
-    coefficients: Array
-    partly: NDArray[np.bool_]
-    added: Array
+    coefficients: Array  # (J, p, d): of the splines
+    partly: NDArray[np.bool_]  # (J, d): whether a part of the curve follows, or all of it
+    added: Array  # (S, J, d): the bias that each adds on the slots
 
 
 class SoakContrasts:
     """The contrasts of one soak.
 
-    Attributes
-    ----------
-    blocks : SoakRows
-    y : (K, d) array
-        The bias, in `scale` (d,).
-    Z : (K, m) array
-        The contrasts, white noise of all blocks alike.
-    laws : list of (eigenvalues (m,), eigenvectors (m, m))
+    `y` (K, d) is the bias of its blocks in `scale` (d,), Z (K, m) are the contrasts, white noise of all blocks alike,
+    and `laws` the eigenvalues (m,) and eigenvectors (m, m) of each law.
     """
 
     def __init__(self, soak: SoakSummary) -> None:
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
         self._starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
-        self.blocks, self._soak, recording = soak.coarsened(self._starts), soak, soak.recording[self._starts]
+        self.blocks, self.soak, recording = soak.coarsened(self._starts), soak, soak.recording[self._starts]
         bias = self.blocks.bias
         self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
@@ -162,7 +147,7 @@ class SoakContrasts:
 
     def means(self, values: Array) -> Array:
         """Return the means (K, ...) of values of the slots (S, ...) over the blocks."""
-        return means(values, self._starts, self._soak.span)
+        return means(values, self._starts, self.soak.span)
 
     @cached_property
     def u(self) -> Array:
@@ -170,14 +155,24 @@ class SoakContrasts:
         return np.asarray(self.Z.T @ self.y)
 
     @cached_property
+    def log_w(self) -> Array:
+        """Half the sum of log w of each noise (R,)."""
+        return np.concatenate([np.sum(np.log(self.weights(own)), axis=1) / 2 for own, _ in self.laws])
+
+    @cached_property
+    def Q(self) -> Array:
+        """Squares (R, d) of the bias under each noise."""
+        return np.concatenate([self.weights(own) @ (V.T @ self.u) ** 2 for own, V in self.laws])
+
+    @cached_property
     def without(self) -> Array:
         """Log-likelihood (R, d) of each noise without a memory, but for a constant."""
-        logs = []
-        for own, V in self.laws:
-            w = self.weights(own)
-            squares = np.maximum(w @ (V.T @ self.u) ** 2, 1e-300)
-            logs.append(np.sum(np.log(w), axis=1)[:, None] / 2 - len(own) / 2 * np.log(squares))
-        return np.concatenate(logs)
+        return self.likelihood(self.Q)
+
+    def likelihood(self, left: Array, noises: Index | slice = slice(None)) -> Array:
+        """Return the log-likelihood (R, ...) of noises that leave such squares (R, ...), but for a constant."""
+        log_w = self.log_w[noises].reshape(-1, *[1] * (left.ndim - 1))
+        return np.asarray(log_w - len(self.u) / 2 * np.log(np.maximum(left, TINY)))
 
     def of(self, values: Array) -> Array:
         """Return values of slots (S, ...) in the contrasts (m, ...)."""
@@ -254,7 +249,7 @@ class SoakContrasts:
         there, late = self.late(inputs)
         each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
-        here, p = self.curve(self._soak.T), self.splines.shape[1]
+        here, p = self.curve(self.soak.T), self.splines.shape[1]
         slots = np.stack([(one - here) @ bent[:p] for one in there], axis=1)
         J, d = slots.shape[1:]
         regressors = self.Z.T @ late  # (J, m, P)

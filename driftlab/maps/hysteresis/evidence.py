@@ -22,13 +22,13 @@ likelihoods to a power where no model is the true one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, SoakContrasts, log_mean
+from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, TINY, SoakContrasts, log_mean
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
@@ -36,7 +36,6 @@ SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn h
 POWER = 1.645  # deviations, one-sided 95 %
 MAX_T = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is
-TINY = 1e-300
 TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
 FORM = 0.02  # of a size: what the true form may have more or less than the shapes of a grid
 FORMED = 0.08  # the same of inputs, of whose grid every other is tried; their curves' own covariance apart
@@ -46,75 +45,65 @@ LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: les
 
 @dataclass(frozen=True, eq=False)
 class ShapeEvidence:
-    """Evidence for shapes in the contrasts of a soak.
+    """Evidence for J shapes in the contrasts of a soak; A, B and Q are the sums above, R' noises are thinned."""
 
-    Attributes
-    ----------
-    log_w, Q, A, B : (R,), (R, d), (R, J, d) and (R, J, d) arrays
-        The sums above, log_w half of that of log w.
-    m : int
-        Number of contrasts.
-    prior : (J,) array
-        Of the shapes; its sum is 1.
-    thin, both : (R',) and (2, P) arrays of int
-        Noises and shapes of which there are pairs.
-    gram : (R', P, d) array
-        Inner products of these under these.
-    followed : (2, R', I, d) array
-        Log-likelihoods where the whole curve, and a part of it, follow an input, of the last I shapes.
-    """
-
-    log_w: Array
-    Q: Array
-    A: Array
-    B: Array
-    m: int
-    prior: Array
-    thin: Index
-    both: Index
-    gram: Array
+    contrasts: SoakContrasts
+    z: Array  # (m, J, d): the shapes; those that add to the bias, the first, are alike on all axes
+    kinds: tuple[str, ...]  # (J,)
+    # (2, R', I, d): log-likelihoods where the whole curve, and a part of it, follow an input, of the last I shapes
     followed: Array
 
-    @classmethod
-    def of(
-        cls, contrasts: SoakContrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None
-    ) -> ShapeEvidence:
-        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`.
+    @property
+    def m(self) -> int:
+        """Number of contrasts."""
+        return len(self.z)
 
-        Those that are no inputs are alike on all axes.
-        """
-        logs, Q, gram = [], [], []
-        names = np.array(kinds)
-        m, J, d = z.shape
-        added = J if followed is None else J - followed.shape[2]
-        places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
-        some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
-        i, k = np.triu_indices(len(some), 1)
-        i, k = i[some[i] < added], k[some[i] < added]
-        for own, V in contrasts.laws:
-            w = contrasts.weights(own)
-            logs.append(np.sum(np.log(w), axis=1) / 2)
-            Q.append(w @ (V.T @ contrasts.u) ** 2)
-            few = (V.T @ z[:, some].reshape(m, -1)).reshape(m, -1, d)
-            gram.append((w[::THIN] @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(-1, len(i), d))
-        prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
-        R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-        sums = [np.concatenate(part) for part in (logs, Q, gram)]
-        each = zip(_sums(contrasts, z[:, :added, :1]), _sums(contrasts, z[:, added:]), strict=True)
-        A, B = (np.concatenate(both, axis=1) for both in each)
-        whole = np.empty((2, len(R), 0, d)) if followed is None else followed
-        return cls(sums[0], sums[1], A, B, m, prior, R, np.stack([some[i], some[k]]), sums[2], whole)
-
-    def made(self, contrasts: SoakContrasts, z: Array) -> ShapeEvidence:
-        """Return that of inputs (m, I, d) whose forms the soak made: for their sizes alone."""
-        A, B = _sums(contrasts, z)
-        old = self.A[:, : self.added], self.B[:, : self.added]
-        return replace(self, A=np.concatenate([old[0], A], axis=1), B=np.concatenate([old[1], B], axis=1))
+    @property
+    def Q(self) -> Array:
+        """Squares (R, d) without a memory."""
+        return self.contrasts.Q
 
     @cached_property
-    def none(self) -> Array:
-        """Log-likelihood of each noise without a memory (R, d)."""
-        return np.asarray(self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.Q, TINY)))
+    def _sums(self) -> tuple[Array, Array]:
+        """A and B (R, J, d)."""
+        each = zip(self._sums_of(self.z[:, : self.added, :1]), self._sums_of(self.z[:, self.added :]), strict=True)
+        A, B = (np.concatenate(both, axis=1) for both in each)
+        return A, B
+
+    def _sums_of(self, z: Array) -> tuple[Array, Array]:
+        """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
+        m, J, _ = z.shape
+        A, B = [], []
+        for own, V in self.contrasts.laws:
+            w, turned = self.contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
+            both = turned * (V.T @ self.contrasts.u)[:, None]
+            B.append((w @ both.reshape(m, -1)).reshape(-1, *both.shape[1:]))
+            A.append(np.broadcast_to((w @ (turned**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
+        return np.concatenate(A), np.concatenate(B)
+
+    @cached_property
+    def prior(self) -> Array:
+        """Prior probability (J,) of the shapes."""
+        return np.array([1.0 / self.kinds.count(kind) for kind in self.kinds]) / len(set(self.kinds))
+
+    @property
+    def added(self) -> int:
+        """Number of shapes that add to the bias: two inputs of one curve at once look like a sharp bend of it."""
+        return int(self.z.shape[1] - self.followed.shape[2])
+
+    @cached_property
+    def _thin(self) -> Index:
+        """Noises (R',) under which there are pairs."""
+        return np.arange(len(self.Q)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
+
+    @cached_property
+    def _both(self) -> Index:
+        """Shapes (2, P) of which there are pairs."""
+        names = np.array(self.kinds)
+        places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(self.kinds)]
+        some = np.concatenate([own[(own < self.added) | (own[0] >= self.added)][::COARSE] for own in places])
+        i, k = np.triu_indices(len(some), 1)
+        return np.stack([some[i], some[k]])[:, some[i] < self.added]
 
     @cached_property
     def t2(self) -> Array:
@@ -124,36 +113,53 @@ class ShapeEvidence:
     @cached_property
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
-        each = self._of(self.log_w, self.Q, self.t2, 1)
-        either = log_mean(log_mean(self.followed)) - log_mean(self.none[self.thin])
+        each = self._of(slice(None), self.t2, 1)
+        either = log_mean(log_mean(self.followed)) - log_mean(self.contrasts.without[self._thin])
         either = np.sum(np.logaddexp(0.0, either) - np.log(2), axis=1)
         each[self.added :] = np.logaddexp(each[self.added :], either) - np.log(2)
         return each
 
-    @property
-    def added(self) -> int:
-        """Number of shapes that add to the bias: two inputs of one curve at once look like a sharp bend of it."""
-        return int(self.A.shape[1] - self.followed.shape[2])
-
     @cached_property
     def pairs(self) -> tuple[Array, Array]:
-        """t^2 of each of `both` (R', P, d), and their log evidence (P,), its prior apart."""
-        i, k = self.both
-        A, B, single = (values[self.thin] for values in (self.A, self.B, self.t2))
-        a, b, c = A[:, i], A[:, k], self.gram
+        """t^2 of each pair of shapes (R', P, d), and their log evidence (P,), its prior apart."""
+        (i, k), (A, B) = self._both, (values[self._thin] for values in self._sums)
+        single, a, b, c = self.t2[self._thin], A[:, i], A[:, k], self._gram
         det = a * b - c**2
         apart = det > LEFT * a * b
         t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
         t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
-        return t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
+        return t2, self._of(self._thin, t2, 2)
 
-    def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
-        """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
-        base, logs = log_mean(log_w[:, None] - self.m / 2 * np.log(np.maximum(Q, TINY))), []
+    @property
+    def A(self) -> Array:
+        """Squares (R, J, d) of the shapes."""
+        return self._sums[0]
+
+    @property
+    def B(self) -> Array:
+        """Products (R, J, d) of the shapes with the bias."""
+        return self._sums[1]
+
+    @property
+    def _gram(self) -> Array:
+        """Inner products (R', P, d) of the shapes of each pair."""
+        gram, (m, _, d) = [], self.z.shape
+        some, places = np.unique(self._both, return_inverse=True)
+        i, k = places.reshape(2, -1)
+        for own, V in self.contrasts.laws:
+            few = (V.T @ self.z[:, some].reshape(m, -1)).reshape(m, len(some), d)
+            w = self.contrasts.weights(own)[::THIN]
+            gram.append((w @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(len(w), len(i), d))
+        return np.concatenate(gram)
+
+    def _of(self, noises: Index | slice, t2: Array, p: int) -> Array:
+        """Return the log evidence (J,) of t^2 (R, J, d), under some noises, of p coefficients on an axis each."""
+        base, logs = log_mean(self.contrasts.without[noises]), []
         for g in SIZES:
-            left = np.maximum(Q[:, None] - g / (1 + g) * t2, TINY)
-            with_it = log_mean(log_w[:, None, None] - self.m / 2 * np.log(left)) - p * np.log1p(g) / 2
-            logs.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - Q.shape[1] * np.log(2))
+            with_it = log_mean(self.contrasts.likelihood(self.Q[noises, None] - g / (1 + g) * t2, noises))
+            logs.append(
+                np.sum(np.logaddexp(0.0, with_it - p * np.log1p(g) / 2 - base), axis=1) - t2.shape[2] * np.log(2)
+            )
         return log_mean(np.array(logs))
 
     @cached_property
@@ -165,7 +171,7 @@ class ShapeEvidence:
     def total(self) -> float:
         """Log evidence of a memory of one shape or two, with even odds, against none."""
         each = self.pairs[1]
-        prior = np.prod(self.prior[self.both], axis=0)
+        prior = np.prod(self.prior[self._both], axis=0)
         double = log_mean(each + np.log(prior / prior.mean())) if len(each) else self.single
         return float(np.logaddexp(self.single, double) - np.log(2))
 
@@ -182,9 +188,9 @@ class ShapeEvidence:
         """Return the log evidence of the likeliest of some inputs (J,) as they are, or of all the curve; 0 without."""
         if not np.any(which):
             return 0.0
-        left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
-        each = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - log_mean(self.none)
-        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(self.none[self.thin])
+        left, none = self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], self.contrasts.without
+        each = log_mean(self.contrasts.likelihood(left)) - log_mean(none)
+        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(none[self._thin])
         return float(np.max(np.sum(np.maximum(each, whole), axis=1)))
 
     @cached_property
@@ -196,13 +202,13 @@ class ShapeEvidence:
         if not len(each) or np.max(each) <= np.max(self.of_shapes):
             return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
         squares = np.full_like(self.Q, np.nan)
-        squares[self.thin] = np.maximum(self.Q[self.thin] - t2[:, int(np.argmax(each))], TINY)
+        squares[self._thin] = np.maximum(self.Q[self._thin] - t2[:, int(np.argmax(each))], TINY)
         return squares
 
     @cached_property
     def noises(self) -> Array:
         """Probability of each noise (R, d)."""
-        like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
+        like = self.contrasts.likelihood(self.left)
         return shares(np.where(np.isnan(like), -np.inf, like))
 
     @cached_property
@@ -210,7 +216,7 @@ class ShapeEvidence:
         """Coefficients and their variances (J, d), any size as probable as any other beforehand."""
         left = np.maximum(self.Q[:, None] - self.t2, TINY)
         A = np.maximum(self.A, TINY)
-        share = shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
+        share = shares(self.contrasts.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
         each = self.B / A
         mean = np.sum(share * each, axis=0)
         return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
@@ -224,7 +230,7 @@ class ShapeEvidence:
         d, prior = self.Q.shape[1], np.log(self.prior * len(self.prior))[:, None]
         prior = prior - np.log(2) * (np.arange(len(prior)) >= self.added)[:, None]  # or the whole curve follows
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
-        needed = np.empty(self.A.shape[1:])
+        needed = np.empty(self.z.shape[1:])
         for axis in range(d):
             low, high = np.zeros(len(prior)), np.full(len(prior), MAX_T)
             for _ in range(HALVINGS):
@@ -237,7 +243,9 @@ class ShapeEvidence:
                 reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
             needed[:, axis] = np.where(low > 0.99 * MAX_T, np.inf, high)
-        spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
+        spread = np.sum(
+            (self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self._sums[0], TINY), axis=0
+        )
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
 
@@ -268,15 +276,16 @@ class Pairs:
         return shares(self.power * self.likelihoods)
 
     @classmethod
-    def of(cls, shapes: ShapeEvidence, noise: Index, contrasts: SoakContrasts, z: Array, most: int) -> Pairs:
-        """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""
-        J, d = z.shape[1:]
+    def of(cls, shapes: ShapeEvidence, noise: Index, most: int) -> Pairs:
+        """Return those of two of the shapes, the `most` likeliest, each axis (d,) under its noise."""
+        J, d = shapes.z.shape[1:]
         i, k = np.triu_indices(J, 1)
         i, k = i[i < shapes.added], k[i < shapes.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
         single = np.zeros(J)
         for axis, r in enumerate(noise):
-            G, B, Q = contrasts.gram(int(r), z[:, :, axis]), shapes.B[r, :, axis], shapes.Q[r, axis]
+            G, B = shapes.contrasts.gram(int(r), shapes.z[:, :, axis]), shapes.B[r, :, axis]
+            Q = shapes.Q[r, axis]
             a, b, c = G[i, i], G[k, k], G[i, k]
             det = a * b - c**2
             some = det > LEFT * a * b
@@ -296,18 +305,6 @@ class Pairs:
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
         return cls(which, total[order], mean[order], covariance[order], evidence)
-
-
-def _sums(contrasts: SoakContrasts, z: Array) -> tuple[Array, Array]:
-    """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
-    m, J, _ = z.shape
-    A, B = [], []
-    for own, V in contrasts.laws:
-        w, turned = contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
-        both = turned * (V.T @ contrasts.u)[:, None]
-        B.append((w @ both.reshape(m, -1)).reshape(-1, *both.shape[1:]))
-        A.append(np.broadcast_to((w @ (turned**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
-    return np.concatenate(A), np.concatenate(B)
 
 
 def shares(x: Array) -> Array:

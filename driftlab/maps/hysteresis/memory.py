@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, FollowingCurves, SoakContrasts
+from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import WAYS, SoakSummary
@@ -44,41 +44,22 @@ Answer = Literal["seen", "none", "undecided"]
 
 @dataclass(frozen=True, eq=False)
 class MemoryVerdict:
-    """Evidence of a soak for memories, in SI; d axes.
+    """Evidence of a soak for memories, in SI; d axes."""
 
-    Attributes
-    ----------
-    answer : str
-        "seen", "none" (larger than `none_larger_than`), or "undecided" (not known from this soak).
-    kinds : tuple of str
-        Kinds of effects that the soak cannot tell from one another, the likeliest first; empty unless seen.
-    size, sigma : (d,) arrays
-        Warming less cooling where it is largest, and its standard deviation; NaN where it is unknown.
-    none_larger_than : (d,) array
-        Difference that would have shown with 95 %: of up less down, where it is largest; infinite where it is unknown.
-    where : (d,) array
-        Temperature of the largest difference, degC; NaN where it is unknown.
-    why : str
-        Reason of the answer; where it is undecided, which soak would tell.
-    evidence : float
-        Natural logarithm of how much likelier the soak is with a memory than without; NaN where it was not looked for.
-    together : bool
-        Whether more than one kind is there at once.
-    T, difference, spread : (G,), (G, d) and (G, d) arrays
-        Warming less cooling over temperature in the mean over the sweeps, if there is a memory, and its standard
-        deviation; empty where it is unknown.
-    """
-
-    answer: Answer
+    answer: Answer  # "seen", "none" (larger than `none_larger_than`), or "undecided" (not known from this soak)
+    # kinds of effects that the soak cannot tell from one another, the likeliest first; empty unless seen
     kinds: tuple[str, ...]
-    size: Array
-    sigma: Array
+    size: Array  # (d,): warming less cooling where it is largest; NaN where it is unknown
+    sigma: Array  # (d,): its standard deviation
+    # (d,): up less down, where it is largest, that would have shown with 95 %; infinite where it is unknown
     none_larger_than: Array
-    where: Array
-    why: str
+    where: Array  # (d,): temperature of the largest difference, degC; NaN where it is unknown
+    why: str  # reason of the answer; where it is undecided, which soak would tell
+    # natural logarithm of how much likelier the soak is with a memory than without; NaN where it was not looked for
     evidence: float = np.nan
-    together: bool = False
-    T: Array = field(default_factory=lambda: np.empty(0))
+    together: bool = False  # whether more than one kind is there at once
+    T: Array = field(default_factory=lambda: np.empty(0))  # (G,), degC; empty where nothing is known
+    # (G, d): warming less cooling there in the mean over the sweeps, if there is a memory, and its standard deviation
     difference: Array = field(default_factory=lambda: np.empty((0, 0)))
     spread: Array = field(default_factory=lambda: np.empty((0, 0)))
 
@@ -133,13 +114,12 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
             return MemoryVerdict.unknown(d, WHY["short"])
         added = np.repeat(shapes.added[:, :, None], d, axis=2)
         z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-        likelihoods, curves = None, None
+        followed, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), None
         if shapes.inputs.size:
             noises = np.argmax(contrasts.without, axis=0)
-            slots, more, likelihoods, curves = contrasts.added_by_inputs(shapes.inputs, noises)
+            slots, more, followed, curves = contrasts.added_by_inputs(shapes.inputs, noises)
             added, z = np.concatenate([added, slots], axis=1), np.concatenate([z, more], axis=1)
-        evidence = ShapeEvidence.of(contrasts, z, shapes.kinds, likelihoods)
-        return _MemoryTest(soak, contrasts, evidence, z, added, shapes, curves).verdict()
+        return _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), added, shapes, curves).verdict()
 
 
 @cache
@@ -162,15 +142,17 @@ def _unseen(soak: SoakSummary) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _MemoryTest:
-    """Shapes and their evidence, as contrasts z (m, J, d) and as the bias that they add on the slots (S, J, d)."""
+    """Shapes, their evidence, and the bias that they add on the slots (S, J, d)."""
 
-    soak: SoakSummary
-    contrasts: SoakContrasts
     evidence: ShapeEvidence
-    z: Array
     added: Array
     shapes: MemoryShapes
     curves: FollowingCurves | None
+
+    @property
+    def contrasts(self) -> SoakContrasts:
+        """Contrasts of the soak."""
+        return self.evidence.contrasts
 
     def verdict(self) -> MemoryVerdict:
         """Return the answer."""
@@ -181,7 +163,7 @@ class _MemoryTest:
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         sized = self if total <= HINT else self._following()
         noise = np.argmax(self.evidence.noises, axis=0)
-        pairs = Pairs.of(sized.evidence, noise, self.contrasts, sized.z, PAIRS) if seen else None
+        pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
         brief = self.evidence.as_they_are(self.shapes.brief)
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
@@ -201,19 +183,19 @@ class _MemoryTest:
         if self.curves is None:
             return self
         alone, curves = self.evidence.added, self.curves.added
-        more = self.contrasts.of(curves)
-        z, added = (np.concatenate([x[:, :alone], y], axis=1) for x, y in ((self.z, more), (self.added, curves)))
-        return replace(self, evidence=self.evidence.made(self.contrasts, more), z=z, added=added)
+        both = (self.evidence.z, self.contrasts.of(curves)), (self.added, curves)
+        z, added = (np.concatenate([x[:, :alone], y], axis=1) for x, y in both)
+        return replace(self, evidence=replace(self.evidence, z=z), added=added)
 
     @property
     def _divided(self) -> bool:
         """True if each recording goes one way only."""
-        ways, recordings = self.soak.way, self.soak.recording
+        ways, recordings = self.contrasts.soak.way, self.contrasts.soak.recording
         return all(len(np.unique(ways[(recordings == k) & (ways != 0)])) < 2 for k in np.unique(recordings))
 
     @cached_property
     def _sweeps(self) -> Sweeps:
-        return Sweeps(self.soak, self.added)
+        return Sweeps(self.contrasts.soak, self.added)
 
     @cached_property
     def _openings(self) -> tuple[Array, Array]:
@@ -222,9 +204,9 @@ class _MemoryTest:
     def _larger(self) -> Array:
         """Return the largest opening (d,) of a shape that is seen with less than 95 %."""
         noises = np.argmax(self.evidence.noises, axis=0)
-        alike = np.empty((len(self.shapes.kinds),) * 2 + (self.z.shape[2],))
+        alike = np.empty((len(self.shapes.kinds),) * 2 + noises.shape)
         for axis, noise in enumerate(noises):
-            gram = self.contrasts.gram(int(noise), self.z[:, :, axis])
+            gram = self.contrasts.gram(int(noise), self.evidence.z[:, :, axis])
             size = np.maximum(np.diag(gram), 1e-300)
             alike[:, :, axis] = gram**2 / size / size[:, None]
         sizes = self.evidence.would_show(np.minimum(alike, 1.0)) * np.abs(self._openings[0])
@@ -280,11 +262,11 @@ class _MemoryTest:
 
     def _forms(self, evidence: ShapeEvidence) -> Array:
         """Return the relative error of the form of each shape (J, d): that of a curve is an estimate."""
-        forms = np.full(self.z.shape[1:], FORM)
+        forms = np.full(self.evidence.z.shape[1:], FORM)
         if self.curves is None:
             return forms
         inputs, noises = self.shapes.inputs, np.argmax(evidence.noises, axis=0)
-        there = Sweeps(self.soak, inputs[:, :, None]).shown[..., 0]
+        there = Sweeps(self.contrasts.soak, inputs[:, :, None]).shown[..., 0]
         between = np.empty((inputs.shape[1], len(noises), self.curves.coefficients.shape[1]))
         for j, axis in np.ndindex(*between.shape[:2]):
             above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, evidence.added + j, axis])

@@ -38,28 +38,15 @@ SAME = 1e-6  # of a signature: a difference that is rounding
 
 @dataclass(frozen=True, eq=False)
 class MemoryShapes:
-    """Shapes of the bias of the slots that memories may add, in order of their kinds.
+    """Shapes of the bias of the slots that memories may add, in order of their kinds."""
 
-    Attributes
-    ----------
-    kinds : tuple of str
-        Of each shape (J,); first those that add, then those that act on the curve's input.
-    added : (S, A) array
-        What a coefficient of 1 adds, of the first A.
-    inputs : (S, J - A) array
-        Temperature that the curve sees, of the others, degC: of lags, and of every other play.
-    brief : (J,) array of bool
-        Which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
-        after the sensor, or stands beside it.
-    broken : tuple of str
-        Effects that could not be tried, and why.
-    """
-
-    kinds: tuple[str, ...]
-    added: Array
-    inputs: Array
+    kinds: tuple[str, ...]  # of each shape (J,); first those that add, then those that act on the curve's input
+    added: Array  # (S, A): what a coefficient of 1 adds, of the first A
+    inputs: Array  # (S, J - A): temperature that the curve sees, of the others, degC: of lags, and of every other play
+    # (J,): which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
+    # after the sensor, or stands beside it
     brief: NDArray[np.bool_]
-    broken: tuple[str, ...] = ()
+    broken: tuple[str, ...] = ()  # effects that could not be tried, and why
 
 
 def shapes_of(soak: SoakSummary) -> MemoryShapes:
@@ -106,13 +93,12 @@ def _offered(
     if not grid:
         return [], False, []
     acting, timeless = grid[0].acts_on_input, grid[0].memory_span is None and len(cls.continuous) == 1
-    shown = _inputs if acting else _signatures
-    if not remembers(shown(grid[0], forward), shown(grid[0], backward)):
+    if not remembers(_shown(grid[0], forward), _shown(grid[0], backward)):
         return [], acting, []  # whatever its hyper-parameters
     if timeless and not acting:
         ((name, value),) = grid[0].hyper_parameters.items()
         grid = [*(grid[0].model_copy(update={name: value / by}) for by in NARROWER), *grid]
-    columns = [column for effect in grid for column in np.vstack(shown(effect, forward)).T]
+    columns = [column for effect in grid for column in np.vstack(_shown(effect, forward)).T]
     spans = [np.inf if effect.memory_span is None else effect.memory_span for effect in grid]
     return [way, np.sign(columns[0]), *columns] if timeless and not acting else columns, acting, spans
 
@@ -135,12 +121,11 @@ def _recordings(soak: SoakSummary, *, backward: bool = False) -> list[Chunk]:
     return chunks
 
 
-def _signatures(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
+def _shown(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
+    """Return the input (N, 1) that an effect makes of each recording, or its signature (N, p)."""
+    if effect.acts_on_input:
+        return [effect.input(chunk, None)[0][:, None] for chunk in recordings]
     return [effect.signature(chunk, None)[0][:, 0] for chunk in recordings]
-
-
-def _inputs(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
-    return [effect.input(chunk, None)[0][:, None] for chunk in recordings]
 
 
 Mask = NDArray[np.bool_]
@@ -150,16 +135,9 @@ OTHER = 0.5  # of an opening: almost as far
 
 
 class Sweeps:
-    """Shapes over the sweeps of a soak.
+    """Shapes over the W sweeps of a soak, of which `up` (W,) go up, at the temperatures T (G,) in degC.
 
-    Attributes
-    ----------
-    T : (G,) array
-        Temperatures, degC.
-    up : (W,) array of bool
-        Which sweeps go up.
-    shown : (W, G, J, d) array
-        What a coefficient of 1 adds there; NaN where the sweep is not.
+    `shown` (W, G, J, d) is what a coefficient of 1 adds there; NaN where the sweep is not.
     """
 
     def __init__(self, soak: SoakSummary, values: Array) -> None:
@@ -177,8 +155,11 @@ class Sweeps:
 
     def openings(self) -> tuple[Array, Array]:
         """Return the opening of each shape (J, d), warming less cooling, and at which temperature it is (J, d)."""
-        size, at = _widest(self.shown, self.up)
-        return size, self.T[at]
+        most, least = _extremes(self.shown, self.up)
+        wide = np.where(np.abs(most) >= np.abs(least), most, least)
+        known = np.isfinite(wide)
+        at = np.argmax(np.where(known, np.abs(wide), 0.0), axis=0)
+        return np.take_along_axis(np.where(known, wide, 0.0), at[None], axis=0)[0], self.T[at]
 
     def both_ways(self) -> NDArray[np.bool_]:
         """Return the shapes (J, d) that open almost as far the other way: a curve that bends has no sign."""
@@ -226,15 +207,6 @@ def _extremes(shown: Array, up: Mask) -> tuple[Array, Array]:
     low, high = np.where(np.isnan(shown), np.inf, shown), np.where(np.isnan(shown), -np.inf, shown)
     with np.errstate(invalid="ignore"):
         return high[up].max(axis=0) - low[~up].min(axis=0), low[up].min(axis=0) - high[~up].max(axis=0)
-
-
-def _widest(shown: Array, up: Mask) -> tuple[Array, Array]:
-    most, least = _extremes(shown, up)
-    wide = np.where(np.abs(most) >= np.abs(least), most, least)
-    size = np.where(np.isfinite(wide), np.abs(wide), 0.0)
-    at = np.argmax(size, axis=0)
-    chosen = np.take_along_axis(np.where(np.isfinite(wide), wide, 0.0), at[None], axis=0)[0]
-    return chosen, at
 
 
 def _mean(shown: Array) -> Array:

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from driftlab.maps.assessment import judge, text
+from driftlab.maps.assessment import MapVerdict, text
 from driftlab.soak.blocks import brief
 from driftlab.units import RATE
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -33,7 +33,7 @@ def soak(seed, width, turns=UP_DOWN, hours=8.0, walk=0.02, planted=0.0):
 
 
 def verdict(settings, T, bias):
-    return judge(settings.fit(T, bias, {}), settings, brief(T, bias, [0], DT), ("x", "y", "z"))
+    return MapVerdict(settings.fit(T, bias, {}), settings, brief(T, bias, [0], DT))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_map_that_does_not_say_how_sure_it_is_gets_no_number():
     T, bias = soak(3, 8, planted=30.0)
     known = Spline().fit(T, bias, {})
     mute = type(known)(known.record.model_copy(update={"error": None}), known.coefficients, known.spread)
-    found = judge(mute, Spline(), brief(T, bias, [0], DT), ("x", "y", "z"))
+    found = MapVerdict(mute, Spline(), brief(T, bias, [0], DT))
     first, *others = found.sentences(RATE)
     assert first.startswith("a spline with knots 1 K apart does not say how sure its curve is; it leaves x ")
     assert not any("good to" in line for line in (first, *others))

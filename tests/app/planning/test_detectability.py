@@ -6,7 +6,7 @@ import pytest
 from driftlab.identification.records import Evidence, Record
 from driftlab.identification.result import search
 from driftlab.identification.state import name_of
-from driftlab.planning.detectability import effects_in, predict_detectability
+from driftlab.planning.detectability import MonteCarlo, effects_in, predict_detectability
 from driftlab.planning.simulated_search import Information, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
 from driftlab.reports.plan_effects import cells, lines, matrix
@@ -15,6 +15,7 @@ from fusion_core.chunk import Chunk
 from fusion_plugins.effects.hysteresis import Hysteresis
 from fusion_plugins.effects.relaxation import Relaxation
 from fusion_plugins.thermal_maps.polynomial import Polynomial
+from fusion_plugins.thermal_maps.spline import Spline
 
 WHITE, WALK = np.deg2rad(3.0 / 3600), np.deg2rad(1e-5)  # rad/s/sqrt(Hz), rad/s/sqrt(s)
 HOURS = 3.0
@@ -128,3 +129,20 @@ def test_what_was_recorded_says_how_large_an_effect_may_be():
 def test_the_means_of_a_long_plan_are_longer_and_no_more(hours):
     search = planned(UNIT, lambda t: 20.0 + 30.0 * np.sin(t / 5000.0), hours * 3600.0)
     assert 18_000 <= len(search.columns.evidence.chunks[0]) <= 20_000
+
+
+@pytest.mark.parametrize("swing", [40.0, 140.0, 300.0, 5000.0])
+def test_the_curves_of_a_wide_range_are_no_more_than_those_of_a_chamber(swing):
+    """Inner products of all columns are kept, and an effect on the map's input has a set of curves for each lag."""
+    unit = UnitModel(**{**UNIT.__dict__, "map": Spline()})
+    search = planned(unit, lambda t: 20.0 + swing * (t / DURATION - 0.5), DURATION, rows=400)
+    assert min(swing, 150) - 1 <= len(search.columns.of_map([])) <= 153
+
+
+def test_the_fits_of_an_effect_are_let_go_of_with_it():
+    search = planned(UNIT, up_and_down, DURATION, rows=240)
+    effects = [Hysteresis(width="4 K"), Hysteresis(width="8 K")]
+    own = [np.column_stack([shapes(search, UNIT, one, axis)[:, 0] for axis in (0, 1)]) for one in effects]
+    sizes = MonteCarlo(search, UNIT, 1.0).smallest(effects, own, [1e-5, 1e-5], np.ones((2, 2), dtype=bool))
+    assert np.all(np.isfinite(sizes))
+    assert not search.squares._fits

@@ -27,6 +27,11 @@ def test_the_hash_of_a_folder_is_that_of_its_list_of_hashes(tmp_path):
     assert identity(str(moved))["sha256"] != found["sha256"]
 
 
+@pytest.mark.parametrize("name", ["-", "-::10:20"])
+def test_of_standard_input_which_is_not_kept_the_name_is_all(name):
+    assert identity(name) == {"name": name}
+
+
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(UnreadableFile, match=r"none.bag: cannot be read"):
         identity(str(tmp_path / "none.bag"))
