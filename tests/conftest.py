@@ -1,4 +1,4 @@
-"""What all tests share: where the measured recordings are, and small recordings made for a test."""
+"""Fixtures that all tests share: the folder of measured recordings, and a browser."""
 
 import os
 from pathlib import Path
@@ -17,7 +17,7 @@ def recordings() -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compile_without_a_notice():
-    """What a command prints is the same whether this installation has compiled its loops already or not."""
+    """Commands print the same whether this installation has compiled its loops already or not."""
     from driftlab.commands import console
 
     console.COMPILED = float("inf")
@@ -34,7 +34,7 @@ def browser():
 
 @pytest.fixture
 def opened(browser):
-    """What opens pages; at the end none may have complained, or asked for anything beyond this machine."""
+    """A function that opens pages; at the end none may have complained, or asked for anything beyond this machine."""
     from browsers import Opened
 
     pages = Opened(browser)

@@ -87,7 +87,7 @@ def config(folder, recording, bias=None, source=None, **gyro):
 
 
 def is_one_line(stderr, pattern):
-    """Whether a message is one line that begins so, names its plugin and says what to do."""
+    """Assert that a message is one line that begins so, names its plugin and says what to do."""
     assert "Traceback" not in stderr
     (line,) = stderr.splitlines()
     assert re.match(f"driftlab: {pattern}", line), line

@@ -1,4 +1,4 @@
-"""What the README and the docs show is run and checked: a page's commands in one folder, and its configs.
+"""Examples of the README and the docs are run and checked: a page's commands in one folder, and its configs.
 
 A block after `<!-- not run: WHY -->` is left out. A config is called as its first line says (`# twin.yaml`), or by the
 last name that is mentioned before it; recordings that a page does not make are small ones made here.

@@ -1,4 +1,4 @@
-"""What a case came to, and how the program is called inside a worker."""
+"""The outcome of a case, and the call of the program inside a worker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Outcome:
 
 @dataclass
 class Said:
-    """What a call of the program printed, how it ended, and which Python exception escaped from it."""
+    """The output of a call of the program, its end, and the Python exception that escaped from it."""
 
     status: int
     out: str = ""
@@ -69,7 +69,7 @@ def traceback_cause(text: str) -> str:
 
 
 class _Ended(BaseException):
-    """What `os._exit` raises inside a worker."""
+    """The exception that `os._exit` raises inside a worker."""
 
     def __init__(self, code: int) -> None:
         self.code = code

@@ -178,7 +178,7 @@ class Counts(registry().classes(ThermalMap)["spline"]):
 
 
 def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
-    """What waits then, be it much, is gathered and not fitted again and again."""
+    """Rows that wait then, be they many, are gathered and not fitted again and again."""
     folder, _ = bench
     monkeypatch.setattr("driftlab.live.growing_map.PAUSE", (0.0, 0.0))
     monkeypatch.setattr("driftlab.live.growing_map.SHARE", 0)

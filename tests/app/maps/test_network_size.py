@@ -1,4 +1,4 @@
-"""How many neurons a network needs, on curves that are made of a known number of them."""
+"""The number of neurons that a network needs, on curves that are made of a known number of them."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""What is a frame and what is not, wherever the stream is cut. Frames are packed here, with struct and zlib."""
+"""Frames and what is none, wherever the stream is cut. Frames are packed here, with struct and zlib."""
 
 import functools
 import operator
