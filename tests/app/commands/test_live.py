@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import command_line
 import h5py
 import numpy as np
 import pytest
@@ -50,9 +51,8 @@ def begin(folder, *args):
 
 
 def driftlab(folder, *args):
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, check=False)
+    done = command_line.driftlab(*args, cwd=folder)
     assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def same(a, b):
@@ -175,7 +175,7 @@ def test_mistakes_are_named(bench, args, message):
     content = yaml.safe_load((folder / "live.yaml").read_text())
     content["source"] = {"kind": "csv", "channels": {"time": {"path": "t", "unit": "s"}}}
     (folder / "file.yaml").write_text(yaml.safe_dump(content))
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, check=False)
+    done = command_line.driftlab(*args, cwd=folder)
     assert done.returncode == 2
     assert done.stderr.startswith(f"driftlab: {message}")
     assert os.listdir(folder)

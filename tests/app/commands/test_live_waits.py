@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import h5py
 import pytest
 from bench import live_bench, paced, unit_frames
+from command_line import driftlab
 
 from driftlab.commands.live import Live, _reporting
 from driftlab.config import load_config
@@ -107,7 +108,7 @@ def until(run, wanted):
 
 
 def refused(folder, *args):
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+    done = driftlab(*args, cwd=folder)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     return done.stderr
