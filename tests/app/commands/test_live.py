@@ -81,7 +81,7 @@ def sending(device, seconds, seed=0):
 def test_a_live_run_ends_cleanly_and_its_recording_gives_it_again(bench, end):
     folder, device = bench
     run = begin(folder)
-    time.sleep(2.5)  # until the port is open
+    until(run, lambda line: line["state"] == "nothing came so far")  # the port is open
     sending(device, 60)
     lines = [json.loads(run.stdout.readline())]
     while not (lines[-1]["aligned"] and lines[-1]["t_s"] > 5):
