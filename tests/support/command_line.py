@@ -1,9 +1,10 @@
-"""The command line inside this process: what a shell would see, without the second that a process takes to begin."""
+"""The command line as a shell sees it, without the second that a process takes to begin: in this one, or another."""
 
 from __future__ import annotations
 
 import gc
 import io
+import json
 import os
 import signal
 import subprocess
@@ -57,3 +58,41 @@ def driftlab(*args: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     with chdir(cwd):
         status = status_of(args, out, err)
     return subprocess.CompletedProcess(args, status, out.getvalue(), err.getvalue())
+
+
+class Elsewhere:
+    """The command line in a process with an environment, and so plugins, of its own: begun once and asked often."""
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
+
+    def __enter__(self) -> Elsewhere:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.stdin.close()
+        self.process.stdout.close()
+        self.process.wait(timeout=60)
+
+    def driftlab(self, *args: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+        """Run a command in a folder there, and return what `subprocess.run` would."""
+        self.process.stdin.write(json.dumps([list(map(str, args)), str(cwd), environment]) + "\n")
+        self.process.stdin.flush()
+        return subprocess.CompletedProcess(args, *json.loads(self.process.stdout.readline()))
+
+
+def _answer() -> None:
+    """Run the commands that standard input names, and write what each came to; what libraries print goes elsewhere."""
+    answers, sys.stdout = sys.stdout, sys.stderr
+    for line in sys.stdin:
+        args, cwd, environment = json.loads(line)
+        with patch.dict(os.environ, environment):
+            done = driftlab(*args, cwd=Path(cwd))
+        answers.write(json.dumps([done.returncode, done.stdout, done.stderr]) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    _answer()
