@@ -77,7 +77,7 @@ tools:
 	test -z "$$missing" || { apt-get update -qq && apt-get install -y -qq --no-install-recommends $$missing $(BESIDE) >/dev/null; }
 
 test: $(TEST_VENV)/ready
-	DRIFTLAB_TEST_WHEEL=1 OPENBLAS_NUM_THREADS=1 $(TEST_VENV)/bin/pytest --numprocesses $(JOBS) --dist loadfile
+	DRIFTLAB_TEST_WHEEL=1 OPENBLAS_NUM_THREADS=1 $(TEST_VENV)/bin/pytest --numprocesses $(JOBS) --dist loadfile --durations=10
 
 # bad input, kills and full disks by the thousand; a small dose of it is in the suite (up to fifteen minutes on two cores; as root
 # it also mounts small disks, and unmounts them). Failed cases are written to torture_failures

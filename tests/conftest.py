@@ -1,9 +1,27 @@
-"""What all tests share: where the measured recordings are, and small recordings made for a test."""
+"""Fixtures that all tests share: the folder of measured recordings, and a browser."""
 
 import os
 from pathlib import Path
 
 import pytest
+
+# files that take longest, though most have few tests; the campaigns of bad input last minutes, and wait for one another
+LONG = (
+    "test_torture.py", "test_explain.py", "test_docs.py", "test_ownership.py", "test_live.py", "test_shared_effects.py",
+    "test_explain_files.py", "test_unit.py", "test_plugin_examples.py", "test_family_example.py", "test_live_waits.py",
+    "test_plan.py", "test_examples.py", "test_live_web.py", "test_fleet_killed.py", "test_checkpoint.py",
+    "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py",
+)  # fmt: skip
+
+
+def pytest_configure(config):
+    """Leave the order to what follows: pytest-xdist would begin with the files that have most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest, so that at the end no process waits for another that has one of them."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
 @pytest.fixture(scope="session")
@@ -17,7 +35,7 @@ def recordings() -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compile_without_a_notice():
-    """What a command prints is the same whether this installation has compiled its loops already or not."""
+    """Commands print the same whether this installation has compiled its loops already or not."""
     from driftlab.commands import console
 
     console.COMPILED = float("inf")
@@ -34,7 +52,7 @@ def browser():
 
 @pytest.fixture
 def opened(browser):
-    """What opens pages; at the end none may have complained, or asked for anything beyond this machine."""
+    """A function that opens pages; at the end none may have complained, or asked for anything beyond this machine."""
     from browsers import Opened
 
     pages = Opened(browser)

@@ -1,4 +1,4 @@
-"""What a benchmark calls met, it has measured."""
+"""A benchmark has measured what it calls met."""
 
 import numpy as np
 import pytest

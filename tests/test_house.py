@@ -191,7 +191,7 @@ def imports():
 
 
 def circles(graph):
-    """What is left of a graph without all that imports nothing, and without what nothing imports, again and again."""
+    """Return a graph without all that imports nothing, and without what nothing imports, again and again."""
     graph = {name: set(targets) for name, targets in graph.items()}
     while gone := {name for name, targets in graph.items() if not targets & set(graph)}:
         graph = {name: targets - gone for name, targets in graph.items() if name not in gone}

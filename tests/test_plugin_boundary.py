@@ -15,6 +15,7 @@ import pytest
 import third_party
 import yaml
 from bench import Device
+from command_line import Elsewhere
 from units_at_rest import unit_at_rest
 from wheels import install, wheel
 
@@ -57,14 +58,27 @@ def recording(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def environment(site):
+    beside = os.environ.get("PYTHONPATH")
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *([beside] if beside else [])])}
+
+
+@pytest.fixture(scope="module")
+def beside(environment):
+    """The process in which the distributions are installed."""
+    with Elsewhere(environment) as found:
+        yield found
+
+
 @pytest.fixture
-def driftlab(site, tmp_path):
+def driftlab(environment, beside, tmp_path):
     def call(*args, status=0, **more):
-        beside = os.environ.get("PYTHONPATH")
-        path = os.pathsep.join([str(site), *([beside] if beside else [])])
-        environment = {**os.environ, "PYTHONPATH": path, **more}
-        command = [DRIFTLAB, *map(str, args)]
-        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        if args[0] == "live":  # whose threads end with a process of its own
+            how = {"env": environment, "cwd": tmp_path, "capture_output": True, "text": True, "timeout": 120}
+            done = subprocess.run([DRIFTLAB, *map(str, args)], **how)
+        else:
+            done = beside.driftlab(*args, cwd=tmp_path, **more)
         assert done.returncode == status, done.stderr
         return done.stdout if status == 0 else done.stderr
 
@@ -87,7 +101,7 @@ def config(folder, recording, bias=None, source=None, **gyro):
 
 
 def is_one_line(stderr, pattern):
-    """Whether a message is one line that begins so, names its plugin and says what to do."""
+    """Assert that a message is one line that begins so, names its plugin and says what to do."""
     assert "Traceback" not in stderr
     (line,) = stderr.splitlines()
     assert re.match(f"driftlab: {pattern}", line), line
@@ -97,9 +111,9 @@ def is_one_line(stderr, pattern):
 # what loading finds
 
 
-@pytest.fixture
-def rows(driftlab):
-    return json.loads(driftlab("plugins", "--json"))
+@pytest.fixture(scope="module")
+def rows(beside, site):
+    return json.loads(beside.driftlab("plugins", "--json", cwd=site).stdout)
 
 
 def of(rows, **wanted):

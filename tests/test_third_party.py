@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command_line import Elsewhere
 from units_at_rest import unit_at_rest
 from units_with_effects import make_unit
 
@@ -46,7 +47,14 @@ def environment(tmp_path_factory):
     return {**os.environ, "PYTHONPATH": str(site)}
 
 
-def test_both_are_listed_and_the_broken_one_stops_nothing(environment):
+@pytest.fixture(scope="module")
+def installed(environment):
+    """The process in which both are installed."""
+    with Elsewhere(environment) as found:
+        yield found
+
+
+def test_both_are_listed_and_the_broken_one_stops_nothing(environment, installed, tmp_path):
     done = subprocess.run([DRIFTLAB, "plugins", "--json"], env=environment, capture_output=True, text=True, check=True)
     rows = {row["module"]: row for row in json.loads(done.stdout)}
     mine = rows["driftlab_warm_up.warm_up"]
@@ -58,20 +66,29 @@ def test_both_are_listed_and_the_broken_one_stops_nothing(environment):
     assert broken["error"] == "RuntimeError: the licence server does not answer"
     assert (broken["distribution"], broken["version"]) == ("driftlab-broken", "6.6.6")
     assert rows["fusion_plugins.bias_models.random_walk"]["error"] is None
-    table = subprocess.run([DRIFTLAB, "plugins"], env=environment, capture_output=True, text=True, check=True).stdout
+    table = installed.driftlab("plugins", cwd=tmp_path).stdout
     assert "warm_up" in table
     assert "broken" in table
 
 
-def test_a_config_that_uses_it_runs(environment, tmp_path):
+def test_the_template_keeps_the_laws_and_is_typed(environment, tmp_path):
+    tests = ["-q", "-p", "no:cacheprovider", "--rootdir", tmp_path, TEMPLATE / "tests"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *tests], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout
+    assert (Path(environment["PYTHONPATH"]) / "driftlab_warm_up" / "py.typed").is_file()
+    assert (TEMPLATE / ".github" / "workflows" / "ci.yml").is_file()
+
+
+def test_a_config_that_uses_it_runs(installed, tmp_path):
     unit = unit_at_rest(seconds=900, walk=1e-8)
     transient = np.array([2e-3, -1e-3, 5e-4]) * np.exp(-unit.t / 600)[:, None]
     with h5py.File(tmp_path / "recording.h5", "w") as file:
         file["time"], file["gyro"] = unit.t, np.rad2deg(unit.gyro + transient)
         file["accel"] = unit.accel / 9.80665
     config = TEMPLATE / "warm_up.yaml"
-    args = [DRIFTLAB, "run", config, "--input", "recording.h5", "--out", "out", "--json"]
-    done = subprocess.run(args, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = installed.driftlab("run", config, "--input", "recording.h5", "--out", "out", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert "gyro_bias_x_transient" in summary["states"]
@@ -98,7 +115,7 @@ def chamber_with_a_fan(path, rng, size):
         file.create_dataset("fan", data=fan).attrs["unit"] = "1"
 
 
-def test_explain_finds_a_third_partys_effect(environment, tmp_path):
+def test_explain_finds_a_third_partys_effect(installed, tmp_path):
     rng, size = np.random.default_rng(8), np.array([6e-5, -5e-5, 4e-5])
     make_unit(tmp_path, 3, hours=(1.5, 1.2, 1.0))
     for name in ("soak", "train", "holdout"):
@@ -109,8 +126,7 @@ def test_explain_finds_a_third_partys_effect(environment, tmp_path):
     declared.write_text(text)
 
     files = ["--calibration", "soak.h5", "--train", "train.h5", "--holdout", "holdout.h5", "--out", "closed"]
-    args = [DRIFTLAB, "explain", "declared.yaml", *files, "--json"]
-    done = subprocess.run(args, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = installed.driftlab("explain", "declared.yaml", *files, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     loop = json.loads(done.stdout)
     (effect,) = loop["effects"]
@@ -122,6 +138,6 @@ def test_explain_finds_a_third_partys_effect(environment, tmp_path):
     before, after = (np.linalg.norm(loop[when]["coast_rmse_rad_s"]) for when in ("before", "after"))
     assert after < 0.3 * before
     # the new config needs the plugin, and finds it
-    again = [DRIFTLAB, "run", "closed/explained.yaml", "--input", "holdout.h5", "--out", "out", "--json"]
-    done = subprocess.run(again, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    again = ("run", "closed/explained.yaml", "--input", "holdout.h5", "--out", "out", "--json")
+    done = installed.driftlab(*again, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

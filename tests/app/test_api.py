@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
+from command_line import driftlab as command
 from units_at_rest import unit_at_rest
 
 import driftlab
@@ -62,8 +63,8 @@ def test_every_error_of_the_core_is_an_error_of_driftlab():
 def test_a_run_is_what_the_command_writes(files):
     result = driftlab.run("unit.yaml", "rest.h5::0:300")
     assert not Path("driftlab_out").exists()
-    command = [DRIFTLAB, "run", "unit.yaml", "--input", "rest.h5::0:300", "--out", "command"]
-    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    process = [DRIFTLAB, "run", "unit.yaml", "--input", "rest.h5::0:300", "--out", "command"]
+    subprocess.run(process, check=True, capture_output=True, timeout=300)
     result.save("saved")
     written = driftlab.run("unit.yaml", "rest.h5::0:300", out="written")
     for folder in ("saved", "written"):
@@ -290,8 +291,7 @@ def test_several_recordings_make_one_map(data, unit):
 
 def test_allan_is_what_the_command_says(files, data):
     result = driftlab.allan(CONFIG, data)
-    command = [DRIFTLAB, "allan", "unit.yaml", "--input", "rest.h5", "--json"]
-    said = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout)
+    said = json.loads(command("allan", "unit.yaml", "--input", "rest.h5", "--json", cwd=files).stdout)
     assert result.summary["gyro"]["x"]["white"]["value"] == said["gyro"]["x"]["white"]["value"]
     assert result.config_lines == said["config"]
     np.testing.assert_array_equal(result.gyro[:, 2], said["curves"]["gyro"]["z"]["allan"])
@@ -303,8 +303,7 @@ def test_allan_is_what_the_command_says(files, data):
 def test_compare_is_what_the_command_writes(files):
     Path("slow.yaml").write_text("extends: unit.yaml\nfilter: {gyro: {bias: {walk: 1e-6 deg/s/sqrt(s)}}}\n")
     result = driftlab.compare(["unit.yaml", "slow.yaml"], "rest.h5")
-    command = [DRIFTLAB, "compare", "unit.yaml", "slow.yaml", "--input", "rest.h5", "--out", "command"]
-    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    command("compare", "unit.yaml", "slow.yaml", "--input", "rest.h5", "--out", "command", cwd=files)
     result.save("saved")
     for name in ("summary.json", "report.html"):
         assert Path("saved", name).read_bytes() == Path("command", name).read_bytes()

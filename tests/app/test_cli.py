@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, real files."""
+"""The command line as a user meets it: real files; what one process says is what the others, in this one, say."""
 
 import json
 import subprocess
@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command_line import driftlab
 from units_at_rest import unit_at_rest
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
@@ -29,7 +30,8 @@ filter:
 """
 
 
-def driftlab(*args, cwd):
+def process(*args, cwd):
+    """Run a command as a process of its own: the installed script, a pipe for its texts."""
     return subprocess.run([DRIFTLAB, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
@@ -53,18 +55,20 @@ def bench(tmp_path_factory):
     (folder / "unit.yaml").write_text(CONFIG)
     write(folder / "soak.h5", unit_at_rest(seconds=3000, temperature=lambda t: 10 + t / 100, walk=1e-8))
     write(folder / "ramp.h5", unit_at_rest(seconds=300, temperature=lambda t: 20 + t / 100, seed=1))
-    done = driftlab("fit-map", "unit.yaml", "--input", "soak.h5", cwd=folder)
+    done = process("fit-map", "unit.yaml", "--input", "soak.h5", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "polynomial: fitted on 30,000 samples" in done.stdout
-    driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "first", cwd=folder)  # an installation compiles once
+    process("run", "unit.yaml", "--input", "ramp.h5", "--out", "first", cwd=folder)  # an installation compiles once
     return folder
 
 
 def test_run_writes_whole_outputs(bench):
-    done = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
+    done = process("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert done.returncode == 0, done.stderr
     assert "coast, 1 min" in done.stdout
     assert done.stderr == ""
+    here = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
+    assert (here.returncode, here.stdout, here.stderr) == (done.returncode, done.stdout, done.stderr)
     out = bench / "out"
     assert sorted(p.name for p in out.iterdir()) == ["estimates.h5", "report.html", "summary.json"]
     assert not (bench / "out.partial").exists()
@@ -218,7 +222,7 @@ def test_a_path_with_brackets_is_printed_as_it_is(bench):
 
 
 def test_a_name_that_is_not_utf8_is_refused(bench):
-    done = driftlab("run", "unit.yaml", "--input", "ramp\udcff.h5", cwd=bench)
+    done = process("run", "unit.yaml", "--input", "ramp\udcff.h5", cwd=bench)
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     assert r"driftlab: 'ramp\udcff.h5': is not UTF-8 text; rename the file" in done.stderr
 
@@ -226,7 +230,7 @@ def test_a_name_that_is_not_utf8_is_refused(bench):
 def test_a_run_that_dies_leaves_what_it_wrote(bench):
     """The domain is left half way through: nothing under the final name, the estimates so far under .partial."""
     write(bench / "half.h5", unit_at_rest(seconds=7200, rate=20, temperature=lambda t: 20 + t / 180))
-    done = driftlab("run", "unit.yaml", "--input", "half.h5", "--out", "half", cwd=bench)
+    done = process("run", "unit.yaml", "--input", "half.h5", "--out", "half", cwd=bench)
     assert done.returncode == 1
     assert "is outside the map's domain" in done.stderr
     assert not (bench / "half").exists()
@@ -236,9 +240,9 @@ def test_a_run_that_dies_leaves_what_it_wrote(bench):
 
 
 def test_usage_errors_exit_with_2(bench):
-    assert driftlab("run", cwd=bench).returncode == 2
-    assert driftlab("no-such-command", cwd=bench).returncode == 2
-    assert driftlab("--help", cwd=bench).returncode == 0
+    assert process("run", cwd=bench).returncode == 2
+    assert process("no-such-command", cwd=bench).returncode == 2
+    assert process("--help", cwd=bench).returncode == 0
 
 
 @pytest.mark.parametrize("name", ["a\x1b[31m.h5", "a\nnote: all is well.h5", "a\x9b2J.h5", "a\u2028b.h5"])

@@ -1,4 +1,4 @@
-"""What a config says of a unit: its serial number and its limits."""
+"""The serial number and the limits of a unit in its config."""
 
 import numpy as np
 import pytest

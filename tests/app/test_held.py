@@ -51,7 +51,7 @@ def bench(tmp_path, monkeypatch, capsys):
 
 
 def right(*texts):
-    """Whether there is a ppm in each, and nothing of a gyro."""
+    """Assert that each has a ppm, and nothing of a gyro."""
     for text in texts:
         assert "ppm" in text
         assert not WRONG.search(text), WRONG.search(text)

@@ -1,4 +1,4 @@
-"""What stands still on a steep curve, and what really moves; no code of the project."""
+"""A unit that stands still on a steep curve, and one that really moves; no code of the project."""
 
 import numpy as np
 import pytest

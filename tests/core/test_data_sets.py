@@ -1,4 +1,4 @@
-"""What an HDF5 file may cost: chunks are decoded once, and nothing is read that the file does not hold."""
+"""The cost of an HDF5 file: chunks are decoded once, and nothing is read that the file does not hold."""
 
 import h5py
 import numpy as np

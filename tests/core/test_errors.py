@@ -1,4 +1,4 @@
-"""How a moment is said."""
+"""The wording of a moment."""
 
 import pytest
 

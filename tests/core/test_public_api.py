@@ -1,4 +1,4 @@
-"""What `fusion_core` itself offers: all of it resolves, is what its module has, and is loaded only when asked for."""
+"""The names of `fusion_core` itself: each resolves, is what its module has, and is loaded only when asked for."""
 
 import ast
 import subprocess

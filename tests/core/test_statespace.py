@@ -210,7 +210,7 @@ def test_constant_velocity_random_walk_and_gauss_markov_in_closed_form(dt):
 
 
 def test_a_step_far_longer_than_the_time_constant_ends_in_the_steady_state():
-    """Where exp(-A dt) overflows: dt = 10,000 time constants."""
+    """A step of 10,000 time constants, over which exp(-A dt) overflows."""
     F, Q = van_loan([[-1.0, 0.5], [0.0, -3.0]], np.eye(2), 1e4)
     np.testing.assert_allclose(F, 0, atol=1e-300)
     A = np.array([[-1.0, 0.5], [0.0, -3.0]])

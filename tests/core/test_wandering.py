@@ -1,4 +1,4 @@
-"""What wanders: its covariance beside means of simulated samples, and the limits of its mean square."""
+"""Wandering processes: their covariance beside means of simulated samples, and the limits of their mean square."""
 
 import numpy as np
 import pytest

@@ -57,7 +57,7 @@ def test_a_prior_of_any_width_is_right(n, m, P0, q, method):
 
 
 def test_a_wide_prior_takes_gates_gaps_and_resets_as_another_does():
-    """What a sample does after P has become narrow again is the plain filter's; before, that of exact fractions."""
+    """Samples after P has become narrow again give the plain filter's result; before, that of exact fractions."""
     F, Q, H, R, z = model(3, 2, 0.01, N=40)
     Q, used = (Q + Q.T) / 2, np.ones((40, 2), dtype=bool)
     used[0, 1] = used[1] = used[7] = False

@@ -1,4 +1,4 @@
-"""What an ArduPilot vehicle does to a sample before it logs it, in float32 as its firmware has it.
+"""An ArduPilot vehicle's corrections of a sample before it is logged, in float32 as its firmware has it.
 
 Written from the formulas of AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp and vector3.cpp of ArduPilot,
 and from nothing of the program's.

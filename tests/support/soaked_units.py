@@ -38,7 +38,7 @@ def in_memory(recording):
 
 
 def soaked(recording, config=None):
-    """What a recording says, with the family's config or another."""
+    """Return what a recording says, with the family's config or another."""
     if config is None:
         config = load_config(FAMILY)
     if isinstance(config, str):

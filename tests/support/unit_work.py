@@ -1,4 +1,4 @@
-"""What workers are given in tests: functions that can be imported where they work."""
+"""Work for workers in tests: functions that can be imported where they work."""
 
 import ctypes
 import os

@@ -1,4 +1,4 @@
-"""What is valid, and is mutated: a unit at rest for three minutes, its configs and its maps."""
+"""Valid input that is mutated: a unit at rest for three minutes, its configs and its maps."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ FRAMING = {
 
 
 class Cost(NamedTuple):
-    """What a process took: bytes at its peak, s of the processor, and by the clock."""
+    """The cost of a process: bytes at its peak, s of the processor, and by the clock."""
 
     memory: int
     seconds: float
@@ -100,7 +100,7 @@ def config(kind: str, path: Path, ordinary: Path) -> dict[str, Any]:
 
 
 class Bench:
-    """What an ordinary run costs."""
+    """The cost of an ordinary run."""
 
     def __init__(self, folder: Path, case: Path) -> None:
         self.folder = folder

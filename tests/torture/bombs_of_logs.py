@@ -288,7 +288,7 @@ def archived(rng: RNG, path: Path) -> None:
 
 
 def noise(rng: RNG, path: Path) -> None:
-    """What is no frame, in a file with a hole or an archive."""
+    """Bytes that are no frame, in a file with a hole or an archive."""
     unit = [bytes(1), b"\xa5", b"\xa5\x5a", b"$", b"\xff"][rng.integers(5)]
     if rng.integers(2):
         path.write_bytes(packed("gzip", unit, many(rng, 8, 9.7)))

@@ -34,7 +34,7 @@ SEED = 20_180_509
 
 
 class Tally:
-    """What the cases of one campaign came to."""
+    """The outcomes of the cases of one campaign."""
 
     def __init__(self, name: str, seed: int, failures: Path) -> None:
         self.name, self.seed, self.failures = name, seed, failures
@@ -69,7 +69,7 @@ class Tally:
 
     @property
     def failed(self) -> int:
-        """How many cases failed."""
+        """The number of cases that failed."""
         return sum(self.counts[kind] for kind in FAILURES)
 
 

@@ -1,4 +1,4 @@
-"""How a valid config is made into another one: its quantities, its tree, its text, and the files that it extends."""
+"""Mutations of a valid config: its quantities, its tree, its text, and the files that it extends."""
 
 from __future__ import annotations
 

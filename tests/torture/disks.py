@@ -82,7 +82,7 @@ def judged(said: Said | Outcome, out: Path | None = None) -> Outcome:
 
 
 class Bench:
-    """What an undisturbed run gives, and how long a slow one takes."""
+    """The files of an undisturbed run, and the time that a slow one takes."""
 
     def __init__(self, folder: Path, case: Path) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""What a quantity is, independently of the program: a number, a unit, and nothing else.
+"""The grammar of a quantity, independently of the program: a number, a unit, and nothing else.
 
 ::
 

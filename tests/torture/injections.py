@@ -65,7 +65,7 @@ def told_by(name: str, text: str) -> str | None:
 
 
 class Elements(HTMLParser):
-    """How many elements of each kind a page has, and whether one acts by itself."""
+    """The number of elements of each kind of a page, and whether one acts by itself."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

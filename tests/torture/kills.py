@@ -55,7 +55,7 @@ def count(data: dict[str, np.ndarray] | None) -> int:
 
 
 def begins_with(long: dict[str, np.ndarray], short: dict[str, np.ndarray], N: int) -> bool:
-    """Whether the first N rows are the same, within rounding."""
+    """Tell if the first N rows are the same, within rounding."""
     for name, values in short.items():
         scale = np.nanmax(np.abs(long[name][:N]), axis=0, initial=0.0)
         if not np.all(np.abs(long[name][:N] - values[:N]) <= 1e-9 * scale + 1e-15):

@@ -1,4 +1,4 @@
-"""How a map's file is made into another one: its bytes, its record, its coefficients, its graph."""
+"""Mutations of a map's file: its bytes, its record, its coefficients, its graph."""
 
 from __future__ import annotations
 

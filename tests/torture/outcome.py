@@ -1,17 +1,15 @@
-"""What a case came to, and how the program is called inside a worker."""
+"""The outcome of a case, and the call of the program inside a worker."""
 
 from __future__ import annotations
 
-import gc
 import io
-import os
 import re
-import sys
 import threading
 import traceback
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from command_line import status_of
 
 FAILURES = ("traceback", "hang", "nonsense", "lost")  # what a campaign must not have
 KINDS = ("accepted", "clean", "undetectable", *FAILURES)
@@ -32,7 +30,7 @@ class Outcome:
 
 @dataclass
 class Said:
-    """What a call of the program printed, how it ended, and which Python exception escaped from it."""
+    """The output of a call of the program, its end, and the Python exception that escaped from it."""
 
     status: int
     out: str = ""
@@ -68,40 +66,17 @@ def traceback_cause(text: str) -> str:
     return f"{last} in {':'.join(ours[-1])}" if ours else last
 
 
-class _Ended(BaseException):
-    """What `os._exit` raises inside a worker."""
-
-    def __init__(self, code: int) -> None:
-        self.code = code
-
-
-def _end(code: int) -> None:
-    raise _Ended(code)
-
-
 def program(*args: object) -> Said:
     """Run the command line inside this process, as a shell would: the arguments in, status and texts out."""
-    from driftlab.cli import main
-
-    out, err, status, trace = io.StringIO(), io.StringIO(), 0, ""
-    before = sys.argv, os._exit, threading.excepthook, gc.freeze
-    died: list[str] = []
-    sys.argv, os._exit = ["driftlab", *map(str, args)], _end
-    gc.freeze = lambda: None  # of a process that ends; thousands of calls would keep all garbage
+    out, err, status, trace = io.StringIO(), io.StringIO(), 1, ""
+    before, died = threading.excepthook, list[str]()
     threading.excepthook = lambda hook: died.append("".join(traceback.format_exception(hook.exc_value)))
     try:
-        with redirect_stdout(out), redirect_stderr(err):
-            main()
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-        if isinstance(end.code, str):
-            err.write(end.code)
-    except _Ended as end:
-        status = end.code
+        status = status_of(args, out, err)
     except BaseException:
-        status, trace = 1, traceback.format_exc()
+        trace = traceback.format_exc()
     finally:
-        sys.argv, os._exit, threading.excepthook, gc.freeze = before
+        threading.excepthook = before
     trace = trace or "".join(died)
     return Said(status, out.getvalue(), err.getvalue(), traceback_cause(trace) if trace else "", trace)
 

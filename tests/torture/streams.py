@@ -78,7 +78,7 @@ def lines_of(name: str, stream: bytes) -> Samples:
 
 
 def other_header(stream: bytes) -> bool:
-    """Whether a line that is whole has most of the names and no number: the header of another device."""
+    """Tell if a line that is whole has most of the names and no number: the header of another device."""
     for line in stream.split(b"\n")[1:-1]:
         cells = [cell.strip() for cell in line.decode("latin-1").strip("\r \t").split(",")]
         if 2 < len(set(NAMES) & set(cells)) < 5 and not any(NUMBER.fullmatch(cell) for cell in cells):
@@ -137,7 +137,7 @@ def decoded(framing: Any, pieces: list[bytes]) -> tuple[Samples, list[int], dict
 
 
 def alike(one: Samples, other: Samples) -> bool:
-    """Whether two lists of samples are equal, NaN included."""
+    """Tell if two lists of samples are equal, NaN included."""
     if len(one) != len(other):
         return False
     return not one or bool(np.allclose(one, other, rtol=1e-6, atol=1e-300, equal_nan=True))

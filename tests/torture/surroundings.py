@@ -45,7 +45,7 @@ VALUES = {
 
 @dataclass
 class Surroundings:
-    """What a process is begun with."""
+    """The surroundings that a process is begun with."""
 
     what: str
     env: dict[str, str] = field(default_factory=lambda: dict(os.environ))

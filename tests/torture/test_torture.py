@@ -17,7 +17,7 @@ DOSES = {
     "tables": 0.03,
     "maps": 0.1,
     "streams": 0.033,
-    "surroundings": 0.125,
+    "surroundings": 0.0875,
     "extremes": 0.1,
     "injections": 0.1,
     "bombs": 0.06,

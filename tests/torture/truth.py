@@ -1,4 +1,4 @@
-"""What a run on three minutes of samples must have come to, worked out from the samples by NumPy alone.
+"""The result of a run on three minutes of samples, worked out from the samples by NumPy alone.
 
 The samples are read by an independent reader (h5py, or text cell by cell). A run that ended with 0 must have read the
 same numbers, have no NaN or infinity where the undisturbed run has none, have said what it left out and how many rows,
@@ -27,7 +27,7 @@ COAST = ("coast", "coast_sigma")  # NaN before the end of the alignment, also in
 
 @dataclass
 class Results:
-    """What a run has left."""
+    """The summary, columns and notes that a run has left."""
 
     summary: dict[str, Any]
     columns: dict[str, np.ndarray]
@@ -41,7 +41,7 @@ class Results:
         return cls(json.loads((folder / "summary.json").read_text()), columns, said.notes)
 
     def same(self, other: Results) -> bool:
-        """Whether both have the same estimates, within rounding."""
+        """Tell if both have the same estimates, within rounding."""
         if self.columns["t"].shape != other.columns["t"].shape:
             return False
         names = ("t", "x", "sigma", "bias", "bias_sigma")
@@ -158,7 +158,7 @@ class Truth:
 
 
 def plausible(found: Results) -> bool:
-    """Whether the last bias is what the rate was, seconds before: within ten deviations of both."""
+    """Tell if the last bias is what the rate was, seconds before: within ten deviations of both."""
     rate, bias, sigma = (found.columns[name] for name in ("rate", "bias", "bias_sigma"))
     last = found.columns["t"] > found.columns["t"][-1] - 20
     if np.sum(last) < 50 or not np.all(found.columns["used"][last]):

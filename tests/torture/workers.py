@@ -97,7 +97,7 @@ class Worker:
         return (int(fields[11]) + int(fields[12])) / TICKS
 
     def hangs(self) -> bool:
-        """Whether the case has taken too long."""
+        """Tell if the case has taken too long."""
         gone, limit = time.monotonic() - self.since, self.module.LIMIT
         if not self.ready:
             return gone > READY

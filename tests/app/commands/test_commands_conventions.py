@@ -1,4 +1,4 @@
-"""What every user expects of a command line."""
+"""Conventions that every user expects of a command line."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What `--enforce-limits` makes of the limits: an exit status."""
+"""Limits as an exit status: `--enforce-limits`."""
 
 import h5py
 import numpy as np

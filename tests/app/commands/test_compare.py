@@ -1,4 +1,4 @@
-"""What `driftlab compare` prints: who coasts best, then a table that no terminal cuts; the paper's tables on demand."""
+"""The output of `driftlab compare`: the best coast, a table that no terminal cuts, the paper's tables on demand."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What commands print beside their results."""
+"""Lines that commands print beside their results."""
 
 from numba.core import event
 

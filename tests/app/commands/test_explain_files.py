@@ -1,4 +1,4 @@
-"""What `explain` leaves on disk, what it refuses, and what it takes besides a map and three files."""
+"""Files of `explain`: what it leaves on disk, refuses, and takes besides a map and three recordings."""
 
 import hashlib
 import json

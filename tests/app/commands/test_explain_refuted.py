@@ -1,4 +1,4 @@
-"""Where `explain` may speak: an effect holds beyond its inputs; what predicts the test recording worse is refuted."""
+"""Limits of `explain`: an effect holds beyond its inputs; what predicts the test recording worse is refuted."""
 
 import json
 
@@ -85,7 +85,7 @@ def rising(hours=2.5):
 
 @pytest.mark.parametrize("answer", [linear, lambda u: linear(np.clip(u, 4.8, 5.2))])
 def test_beyond_the_inputs_that_were_seen_an_effect_holds_and_its_sigma_grows(tmp_path, answer):
-    """Whether the supply goes on acting beyond or not, what is predicted is no more than what was seen."""
+    """The prediction is no more than what was seen, the supply acting beyond or not."""
     closed = explained(tmp_path, linear, beyond=answer, supply=rising())
     (effect,) = closed.content["effects"]
     low, high = effect["domain"]["supply"]

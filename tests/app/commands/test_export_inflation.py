@@ -1,4 +1,4 @@
-"""What a run's folder says of its noise: the factors that the recording was made with, for both sensors."""
+"""Noise in a run's folder: the factors that the recording was made with, for both sensors."""
 
 import numpy as np
 import pytest

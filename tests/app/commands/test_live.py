@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import command_line
 import h5py
 import numpy as np
 import pytest
@@ -50,9 +51,8 @@ def begin(folder, *args):
 
 
 def driftlab(folder, *args):
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, check=False)
+    done = command_line.driftlab(*args, cwd=folder)
     assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def same(a, b):
@@ -81,7 +81,7 @@ def sending(device, seconds, seed=0):
 def test_a_live_run_ends_cleanly_and_its_recording_gives_it_again(bench, end):
     folder, device = bench
     run = begin(folder)
-    time.sleep(2.5)  # until the port is open
+    until(run, lambda line: line["state"] == "nothing came so far")  # the port is open
     sending(device, 60)
     lines = [json.loads(run.stdout.readline())]
     while not (lines[-1]["aligned"] and lines[-1]["t_s"] > 5):
@@ -175,7 +175,7 @@ def test_mistakes_are_named(bench, args, message):
     content = yaml.safe_load((folder / "live.yaml").read_text())
     content["source"] = {"kind": "csv", "channels": {"time": {"path": "t", "unit": "s"}}}
     (folder / "file.yaml").write_text(yaml.safe_dump(content))
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, check=False)
+    done = command_line.driftlab(*args, cwd=folder)
     assert done.returncode == 2
     assert done.stderr.startswith(f"driftlab: {message}")
     assert os.listdir(folder)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from bench import FRAMING, Device, frame, paced
+from command_line import driftlab
 from units_at_rest import unit_at_rest
 
 from driftlab.config import load_config, with_recording
@@ -124,9 +125,7 @@ def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording
 ])  # fmt: skip
 def test_mistakes_are_named(bench, args, message):
     folder, _ = bench
-    done = subprocess.run(
-        [DRIFTLAB, "live", "live.yaml", *args], cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = driftlab("live", "live.yaml", *args, cwd=folder)
     assert done.returncode == 2
     assert done.stderr.startswith(f"driftlab: {message}")
 
@@ -178,7 +177,7 @@ class Counts(registry().classes(ThermalMap)["spline"]):
 
 
 def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
-    """What waits then, be it much, is gathered and not fitted again and again."""
+    """Rows that wait then, be they many, are gathered and not fitted again and again."""
     folder, _ = bench
     monkeypatch.setattr("driftlab.live.growing_map.PAUSE", (0.0, 0.0))
     monkeypatch.setattr("driftlab.live.growing_map.SHARE", 0)

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import h5py
 import pytest
 from bench import live_bench, paced, unit_frames
+from command_line import driftlab
 
 from driftlab.commands.live import Live, _reporting
 from driftlab.config import load_config
@@ -37,7 +38,7 @@ def begin(folder, *args, **how):
 
 
 def noise(device, stop):
-    """What a wrong baud rate looks like."""
+    """Send what a wrong baud rate looks like."""
 
     def run():
         while not stop.wait(0.02):
@@ -107,7 +108,7 @@ def until(run, wanted):
 
 
 def refused(folder, *args):
-    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+    done = driftlab(*args, cwd=folder)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     return done.stderr
@@ -169,7 +170,7 @@ def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_was_flushed(bench):
 
 
 def test_at_the_end_each_note_is_said_once(bench):
-    """What the source reported is then among the notes of the run, which are shown until all is written."""
+    """Reports of the source are then among the notes of the run, which are shown until all is written."""
     folder, device = bench
     frames = unit_frames(60, RATE)
     run = Live(load_config(folder / "live.yaml"), duration=5.0)

@@ -64,7 +64,7 @@ def words(page):
 
 
 def rows(page):
-    """How many points the first panel's curve has."""
+    """Return the number of points of the first panel's curve."""
     return page.evaluate("document.querySelector('figure.chart').chart.content.x?.[0]?.length || 0")
 
 

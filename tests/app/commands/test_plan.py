@@ -52,6 +52,12 @@ def bench(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def target():
+    """A plan of 8 h that is to come to 1 deg/h."""
+    return driftlab.plan(UNIT, 8, range=(-20.0, 50.0), lag="5 min", sigma="1 deg/h").found
+
+
 def run(*args):
     return CliRunner().invoke(app, ["plan", *map(str, args)])
 
@@ -83,13 +89,11 @@ def test_what_it_writes_is_one_plan_and_its_page_shows_it(opened):
     assert "walk" in shown.locator("ul.remarks").last.inner_text()
 
 
-def test_a_target_is_reached_and_not_much_sooner():
-    plan = driftlab.plan("unit.yaml", 8, range=(-20.0, 50.0), lag="5 min", sigma="1 deg/h")
-    found = plan.found
-    assert found.shortest.score <= found.target
-    assert found.shortest.share >= MIN_COVERAGE
-    less = driftlab.plan("unit.yaml", 0.9 * found.shortest.profile.hours, range=(-20.0, 50.0), lag="5 min").found
-    assert less.chosen.score > found.target
+def test_a_target_is_reached_and_not_much_sooner(target):
+    assert target.shortest.score <= target.target
+    assert target.shortest.share >= MIN_COVERAGE
+    less = driftlab.plan("unit.yaml", 0.9 * target.shortest.profile.hours, range=(-20.0, 50.0), lag="5 min").found
+    assert less.chosen.score > target.target
 
 
 def test_a_plan_is_a_table_over_temperature():
@@ -116,12 +120,10 @@ def test_a_function_speaks_of_its_arguments_and_the_command_of_its_options(given
         driftlab.plan("unit.yaml", **given)
 
 
-def test_a_walk_asks_for_cycles_and_white_noise_does_not():
-    given = {"range": (-20.0, 50.0), "lag": "5 min"}
-    walking = driftlab.plan("unit.yaml", 8, **given).found
-    calm = driftlab.plan("unit.yaml", 8, walk="0 deg/s/sqrt(s)", **given).found
-    assert walking.chosen.profile.reversals > 2
-    assert walking.classic.score > 4 * walking.chosen.score
+def test_a_walk_asks_for_cycles_and_white_noise_does_not(target):
+    calm = driftlab.plan("unit.yaml", 8, walk="0 deg/s/sqrt(s)", range=(-20.0, 50.0), lag="5 min").found
+    assert target.chosen.profile.reversals > 2
+    assert target.classic.score > 4 * target.chosen.score
     assert calm.classic.score < 1.5 * calm.chosen.score
 
 

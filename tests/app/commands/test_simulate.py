@@ -1,14 +1,12 @@
 """Simulated recordings: written, read back by the sources, and used by the other commands as any recording is."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import yaml
+from command_line import driftlab
 
 from driftlab.commands.simulate import simulate, simulation
 from driftlab.config import load_config
@@ -18,16 +16,11 @@ from fusion_core.faults import Faults
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
 
-DRIFTLAB = Path(sys.executable).with_name("driftlab")
 CHANNELS = ("gyro", "accel", "temperature", "bias_truth")
 TWIN = """
 latitude: 40.9 deg
 source: {kind: synthetic, seed: 3, rate: 20 Hz, duration: 30 s, latitude: 40.9 deg}
 """
-
-
-def driftlab(*args, cwd):
-    return subprocess.run([DRIFTLAB, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What is held against limits, and how sure it is, beside Monte Carlo and the definitions."""
+"""Measurements held against limits, and their sigma, beside Monte Carlo and the definitions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is gathered from a file block by block is what the whole arrays give."""
+"""A file gathered block by block gives what the whole arrays give."""
 
 import h5py
 import numpy as np

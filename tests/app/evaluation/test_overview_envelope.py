@@ -1,4 +1,4 @@
-"""What is left of a run for the figure of its errors."""
+"""The envelope of a run's errors, for their figure."""
 
 import numpy as np
 import pytest

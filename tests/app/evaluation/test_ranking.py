@@ -1,4 +1,4 @@
-"""Who coasts best: told from yardsticks that are written down here."""
+"""The ranking by coast, told from yardsticks that are written down here."""
 
 from dataclasses import replace
 from itertools import permutations

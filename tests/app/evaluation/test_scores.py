@@ -131,7 +131,7 @@ def test_rows_may_come_in_any_blocks(seed, cuts):
 @given(seeds, st.floats(0, 1))
 @settings(max_examples=30, deadline=None)
 def test_refusing_data_never_changes_a_score(seed, part):
-    """What the filter used is a column that the scores do not read, in a run's overview too."""
+    """The mask of used samples is a column that the scores do not read, in a run's overview too."""
     rows, _ = recording(seed)
     rng = np.random.default_rng(seed)
     N = len(rows["t"])

@@ -67,7 +67,7 @@ def test_each_thing_is_said_once(changes, log, expected):
 
 
 def test_no_reference_no_heading_error():
-    """Where nothing was used there is no average to measure against: the error is not known, and not zero."""
+    """Without a used sample there is no average to measure against: the error is not known, and not zero."""
     tally, none = ScoreAccumulator(3), np.zeros((400, 3))
     moved = {"t": np.arange(400.0), "tau": np.ones(400), "still": np.zeros(400), "bias": none, "coast": none}
     tally.add({**moved, "coast_sigma": none, "rate": none + 1}, none * np.nan)

@@ -269,7 +269,7 @@ def test_no_unit_is_odd_for_what_a_soak_one_way_cannot_show() -> None:
 
 
 def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
-    """What a curve does in a gap of its soak nobody knows: a height there is no bend."""
+    """A curve is unknown in a gap of its soak: a height there is no bend."""
     units = made.deal("together", 60, 24, size=SIZE)
     family = fit_family([(unit.soaked(24, ("x",)), unit.lot) for unit in units])
     units[7].curve[:, 0] += 3 * SIZE * np.exp(-(((made.GRID - 10) / 6) ** 2))

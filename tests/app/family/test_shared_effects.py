@@ -1,4 +1,4 @@
-"""What units have in common is found where none of them shows it alone, and nothing where there is nothing."""
+"""Effects common to units are found where none of them shows one alone, and nothing where there is nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a unit says of a part of its range is what it would have said had it seen no more."""
+"""A unit cut to a part of its range says what it would have said had it seen no more."""
 
 from __future__ import annotations
 

@@ -82,10 +82,11 @@ def recording(tmp_path):
     return tmp_path
 
 
-def test_twenty_kills_change_nothing(recording):
+def test_kills_change_nothing(recording):
+    """Eight kills; the campaign `kills` of `make torture` has more, on another recording."""
     rng = np.random.default_rng(time.time_ns())
     reached = []
-    for k in range(20):
+    for k in range(8):
         child = subprocess.Popen([sys.executable, "-c", CHILD], cwd=recording, stdout=subprocess.PIPE, text=True)
         child.stdout.readline()
         if k % 4:
@@ -98,7 +99,7 @@ def test_twenty_kills_change_nothing(recording):
         if (recording / "killed").exists():
             break
     assert reached == sorted(reached)
-    assert len(set(reached)) >= 5, "the kills came at moments that differ"
+    assert len(set(reached)) >= 4, "the kills came at moments that differ"
     subprocess.run([sys.executable, "-c", CHILD], cwd=recording, check=True, capture_output=True)
     config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
     result = run(config, out=recording / "whole")

@@ -1,4 +1,4 @@
-"""How sure coasting says it is: its variance against the plain recursion, its thermometer, its vertical."""
+"""Coasting's variance against the plain recursion, its thermometer, its vertical."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""What is held back beyond what effects were fitted on, and what of it a deviation has."""
+"""Effects beyond what they were fitted on: the part that is held back, and its share of a deviation."""
 
 import numpy as np
 import pytest

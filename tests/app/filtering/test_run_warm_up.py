@@ -1,4 +1,4 @@
-"""What a live run needs compiled is compiled before the device is listened to."""
+"""A live run compiles all that it needs before the device is listened to."""
 
 import json
 import subprocess

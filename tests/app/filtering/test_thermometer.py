@@ -1,4 +1,4 @@
-"""What a coarse thermometer does to a bias that follows a map, against what is said of it."""
+"""A coarse thermometer's effect on a bias that follows a map, against what is said of it."""
 
 from itertools import pairwise
 

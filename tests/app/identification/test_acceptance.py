@@ -1,4 +1,4 @@
-"""What an effect must show, by what it says of itself and never by its name."""
+"""Acceptance of an effect goes by what it says of itself and never by its name."""
 
 from dataclasses import replace
 

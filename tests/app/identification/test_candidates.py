@@ -1,4 +1,4 @@
-"""What effects are tried: a broken one stops nothing, the same one twice confuses nothing, one not wanted stays out."""
+"""Effects to try: a broken one stops nothing, the same one twice confuses nothing, one not wanted stays out."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_what_differs_is_tried(monkeypatch):
 
 
 def test_the_same_on_another_channel_is_another_explanation():
-    """Which of two wires that carry one voltage is to blame, the recordings cannot say."""
+    """Recordings cannot say which of two wires that carry one voltage is to blame."""
     rows = evidence(known)
     twin = effect("twin", requires=property(lambda self: ("copy",)),
                   signature=lambda self, c, m: (on_each_axis(c["voltage"], len(self.axes)), None))()  # fmt: skip

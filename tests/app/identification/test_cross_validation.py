@@ -1,4 +1,4 @@
-"""What is left out, and the error there, against refitting by hand."""
+"""Parts that are left out, and the error there, against refitting by hand."""
 
 import numpy as np
 import pytest

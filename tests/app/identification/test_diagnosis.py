@@ -1,4 +1,4 @@
-"""Whether what is left is noise."""
+"""The diagnosis of residuals: noise, or something that is left."""
 
 import numpy as np
 from rows_at_rest import evidence, search_of

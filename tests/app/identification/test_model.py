@@ -1,4 +1,4 @@
-"""What is fitted to all rows: coefficients, sigma, starts, and the new map."""
+"""The model fitted to all rows: coefficients, sigma, starts, and the new map."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What recordings do not show is said in a sentence."""
+"""A sentence names each range that recordings do not show."""
 
 import numpy as np
 import pytest

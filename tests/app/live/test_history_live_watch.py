@@ -1,4 +1,4 @@
-"""What is shown of a live run is what the run says, and its estimates."""
+"""A live run is shown with what the run says, and its estimates."""
 
 import json
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What a live run says when nothing comes: how long, why, and when that is no more than usual."""
+"""The status of a live run when nothing comes: how long, why, and when that is no more than usual."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is said of a map holds: its sigma against the truth of twins, its words against what was planted."""
+"""The assessment of a map holds: its sigma against the truth of twins, its words against what was planted."""
 
 import json
 import re

@@ -85,7 +85,7 @@ def test_the_error_is_that_of_the_curve_and_of_the_noise():
 
 
 def test_a_walk_alone_is_no_shape():
-    """Where nothing follows the temperature hardly more than a straight line is taken."""
+    """Without anything that follows the temperature hardly more than a straight line is taken."""
     rng = np.random.default_rng(1)
     T = triangle()
     bias = np.cumsum(rng.normal(size=(len(T), 1)), axis=0) / DEG_H

@@ -1,15 +1,13 @@
-"""How many neurons a network needs, on curves that are made of a known number of them."""
+"""The number of neurons that a network needs, on curves that are made of a known number of them."""
 
 import json
 import re
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from command_line import driftlab
 from units_at_rest import unit_at_rest
 
 from driftlab.maps.network_size import BINS, PARTS, BinnedPart, select, split
@@ -20,7 +18,6 @@ from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
 from fusion_core.host.registry import registry
 
 NOISE = 3e-5  # rad/s, of a sample
-DRIFTLAB = Path(sys.executable).with_name("driftlab")
 
 
 def network(**settings):
@@ -213,8 +210,7 @@ def bench(tmp_path_factory):
 
 
 def fit_map(folder, *args):
-    command = [DRIFTLAB, "fit-map", "unit.yaml", "--input", "soak.h5", *args]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    return driftlab("fit-map", "unit.yaml", "--input", "soak.h5", *args, cwd=folder)
 
 
 def test_fit_map_selects_writes_and_shows(bench):

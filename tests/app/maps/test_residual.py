@@ -1,4 +1,4 @@
-"""What a map leaves of averages: white noise leaves little of itself, what is slow all."""
+"""The residual of averages after a map: white noise leaves little of itself, what is slow all."""
 
 import numpy as np
 import pytest

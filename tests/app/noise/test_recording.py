@@ -219,7 +219,7 @@ def test_motion_is_left_out(bench):
 
 
 def test_noise_that_is_not_as_declared_is_not_taken_for_motion(bench):
-    """Where nearly all moves nothing is left out, and the note says what else it may be."""
+    """Of a recording that moves nearly all the time nothing is left out, and the note says what else it may be."""
     (bench / "quiet.yaml").write_text(CONFIG + "    noise: 1e-4 deg/s/sqrt(Hz)\n")
     found = analyse(load_config(bench / "quiet.yaml", str(bench / "rest.h5")), Faults())
     (note,) = [note for note in found.notes if note.startswith("motion")]

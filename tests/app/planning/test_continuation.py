@@ -1,4 +1,4 @@
-"""What recordings leave open: the sigma that is foretold is the one that the joint fit then has."""
+"""Continued soaks: the sigma that is foretold is the one that the joint fit then has."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is foretold of effects is what the loop then does, and what textbook matrices say."""
+"""Foretold detectability of effects, beside what the loop then finds and beside textbook matrices."""
 
 import numpy as np
 import pytest

@@ -32,7 +32,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def fleet(made, tmp_path, monkeypatch):
-    """What does a fleet again, in a copy of it; gives the result, and which units (or pages) were done."""
+    """A function that does a fleet again, in a copy of it; it gives the result, and the units (or pages) done."""
     shutil.copytree(made, tmp_path / "copy", copy_function=shutil.copy2)
     monkeypatch.chdir(tmp_path / "copy")
 

@@ -1,4 +1,4 @@
-"""Which units there are: manifests and patterns, and what is wrong with them."""
+"""Units from manifests and patterns, and what is wrong with them."""
 
 from pathlib import Path
 

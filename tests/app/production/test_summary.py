@@ -1,4 +1,4 @@
-"""How far a fleet is, in words."""
+"""The progress of a fleet, in words."""
 
 import io
 import time

@@ -1,4 +1,4 @@
-"""What is said of a fleet, in sentences."""
+"""The sentences about a fleet."""
 
 from driftlab.production.summary import FleetSummary
 

@@ -1,4 +1,4 @@
-"""How sure figures are, against what soaks of the same unit scatter by."""
+"""The sigma of figures, against what soaks of the same unit scatter by."""
 
 import numpy as np
 import pytest

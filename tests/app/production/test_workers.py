@@ -34,7 +34,7 @@ with Pool(2) as pool:
 
 
 def gone(pid):
-    """Whether a process has ended; one that nobody has waited for yet is a zombie."""
+    """Tell if a process has ended; one that nobody has waited for yet is a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     except (FileNotFoundError, ProcessLookupError):

@@ -1,4 +1,4 @@
-"""What the figures of the loop show, and that a browser and matplotlib draw it."""
+"""Figures of the loop: their content, and that a browser and matplotlib draw it."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""What placements tell of an accelerometer's bias, held to units that are made up from the equation of the module."""
+"""An accelerometer's bias from its placements, held to units that are made up from the equation of the module."""
 
 import numpy as np
 import pytest

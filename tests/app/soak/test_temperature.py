@@ -27,7 +27,7 @@ def shown(T, step, noise, averaged=1):
 @pytest.mark.parametrize("averaged", [1, 10])
 @pytest.mark.parametrize(("step", "noise"), [(0.2, 0.0), (0.5, 0.02), (0.5, 0.2), (1.0, 0.0), (1.0, 0.02), (1.0, 0.2)])
 def test_the_temperature_between_the_steps(step, noise, averaged):
-    """Where it moves through them, to a twentieth of a step; nowhere is it further off than half a step."""
+    """A temperature moving through the steps is met to a twentieth of one; nowhere is it off by more than a half."""
     T = shown(RAMPS, step, noise, averaged)
     found, _ = soak_temperature(t, T, steps_of(T))
     moving = (np.abs(RAMPS - 20) < 28) & (np.abs(t - 10_800) > 1200)

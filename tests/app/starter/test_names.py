@@ -1,4 +1,4 @@
-"""What the names of columns say, as loggers, data sheets and messages write them."""
+"""Names of columns as loggers, data sheets and messages write them, and the channel that each means."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What may be replaced, who holds a folder, and what is refused before the work begins."""
+"""Results in folders: replacement, the holder, and refusals before the work begins."""
 
 # ruff: noqa: PT012, SIM117  # what is raised inside is the point
 import json
@@ -256,7 +256,7 @@ def test_results_of_a_recording_that_is_gone_are_replaced_on_demand_only(tmp_pat
 
 
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
-    """What is left then: the new results, whole, in `.partial`, with the folder that was to be replaced."""
+    """The new results are whole in `.partial`, with the folder that was to be replaced."""
     write(tmp_path / "out")
     with pytest.raises(KeyError), output_folder(tmp_path / "out") as folder:
         results(folder)

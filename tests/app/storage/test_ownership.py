@@ -109,7 +109,7 @@ def write_config(path, content):
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """What the commands read."""
+    """The files that the commands read."""
     folder = tmp_path_factory.mktemp("inputs")
     for seed, name in enumerate("abc"):
         unit = unit_at_rest(seconds=300, rate=10, seed=seed, temperature=lambda t: 20 + t / 60)

@@ -1,4 +1,4 @@
-"""What every kind of file has from its base."""
+"""Abilities that every kind of file has from its base."""
 
 import gzip
 from typing import Literal

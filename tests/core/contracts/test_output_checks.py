@@ -1,4 +1,4 @@
-"""What a plugin answers wrongly is named, and never becomes an estimate."""
+"""A wrong answer of a plugin is named, and never becomes an estimate."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What a user writes: configs, and the errors that answer."""
+"""Configs that a user writes, and the errors that answer."""
 
 import numpy as np
 import pytest

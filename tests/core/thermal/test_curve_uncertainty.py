@@ -1,4 +1,4 @@
-"""How sure a map says its curve is, against what it is off by."""
+"""The sigma of a map's curve, against what it is off by."""
 
 import numpy as np
 import pytest

@@ -29,7 +29,7 @@ def by_hand(B, y, w, penalty, lambdas):
 @pytest.mark.parametrize("hole", [0.0, 15.0])
 @pytest.mark.parametrize("curve", [np.sin, lambda T: 0.2 * T, lambda T: np.tanh(T - 8)])
 def test_it_is_the_least_of_the_criterion(curve, hole):
-    """Where the samples have a hole the penalty alone decides: the equations without it are singular there."""
+    """In a hole of the samples the penalty alone decides: the equations without it are singular there."""
     rng = np.random.default_rng(0)
     T = np.sort(rng.uniform(0, 40, m))
     T = T[np.abs(T - 20) > hole / 2]

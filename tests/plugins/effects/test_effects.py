@@ -1,4 +1,4 @@
-"""What each installed effect keeps beside the laws, and what came before a recording."""
+"""Each installed effect beside the laws, and what came before a recording."""
 
 import re
 from itertools import pairwise
@@ -118,7 +118,7 @@ def test_a_single_sample_at_a_time_is_a_split_too(kind):
 
 @every
 def test_a_config_keeps_hyper_parameters_and_coefficients(kind):
-    """What a found effect is written with, is what is read."""
+    """A found effect is read with what it is written with."""
     effect = KINDS[kind]()
     refined = {name: getattr(effect, name) * 1.2345678901234 for name in type(effect).continuous}
     found = effect.model_copy(update=refined)

@@ -13,7 +13,7 @@ from fusion_plugins.exporters.mat import Mat
 
 
 def numbers(script, folder):
-    """What Octave prints of a script, as numbers."""
+    """Return what Octave prints of a script, as numbers."""
     return np.array(octave(script, folder).split(), dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""What is a frame and what is not, wherever the stream is cut. Frames are packed here, with struct and zlib."""
+"""Frames and what is none, wherever the stream is cut. Frames are packed here, with struct and zlib."""
 
 import functools
 import operator
@@ -333,9 +333,9 @@ def test_a_third_party_adds_a_framing():
     assert count is None
 
 
-def test_a_day_of_frames_in_flat_memory():
-    """24 h at 100 Hz at full speed, as reads of 16 kB, with a torn frame and noise every hour: nothing piles up."""
-    rate, hours, read = 100, 24, 16_384
+def test_hours_of_frames_in_flat_memory():
+    """6 h at 100 Hz at full speed, as reads of 16 kB, with a torn frame and noise every hour: nothing piles up."""
+    rate, hours, read = 100, 6, 16_384
     minute = b"".join(frame(k) for k in range(60 * rate))
     dirt = frame(1)[:20] + SYNC + bytes(100)
     found, memory, rest, peaks = 0, None, b"", []
@@ -349,7 +349,7 @@ def test_a_day_of_frames_in_flat_memory():
         rest = data[whole:]
         peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     assert found + BINARY.decode(rest, memory)[0].N == hours * 3600 * rate
-    assert peaks[-1] - peaks[60] < 8192  # kB
+    assert peaks[-1] - peaks[60] < 1800  # kB, a byte a frame
 
 
 @pytest.mark.parametrize("code", [0x00, 0x0B, 0x1C, 0x1D, 0x1E, 0x1F, 0x7F])

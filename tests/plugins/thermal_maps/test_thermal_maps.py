@@ -1,4 +1,4 @@
-"""What holds for every kind of map."""
+"""Laws that hold for every kind of map."""
 
 import json
 

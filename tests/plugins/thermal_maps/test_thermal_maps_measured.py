@@ -35,7 +35,7 @@ def block_rms(T, bias, found):
 @pytest.mark.parametrize(("on", "to"), REFERENCE)
 @kinds
 def test_a_map_carries_over_to_another_run_of_the_same_board(maps, on, to, heating):
-    """What a stiff map leaves is noise. Run 2 has a wave of 45 deg/h in x that run 3 has not, so a map that is
+    """A stiff map leaves noise. Run 2 has a wave of 45 deg/h in x that run 3 has not, so a map that is
     supple enough to follow it carries it over: there the two others are bounded more loosely."""
     found = maps.fit(*heating[on], {})
     T, bias = heating[to]

@@ -1,4 +1,4 @@
-"""What every page can do, in a browser: figures that are drawn, zoomed, read, switched and printed."""
+"""Abilities of every page, in a browser: figures that are drawn, zoomed, read, switched and printed."""
 
 from pathlib import Path
 

@@ -210,7 +210,7 @@ def test_rows_without_a_clock(tmp_path):
 
 
 def test_letters_of_times_to_come(tmp_path):
-    """What follows an unknown letter cannot be read, what comes before it can, and all other messages."""
+    """Fields after an unknown letter cannot be read, those before it can, and all other messages."""
     t, units = at_rest(N=20)
     new = struct.pack("<3sBB4s16s64s", b"\xa3\x95\x80", 210, 20, b"NEW", b"QxB", b"TimeUS,What,Ever")
     body = formats() + new

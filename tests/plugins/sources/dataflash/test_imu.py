@@ -1,4 +1,4 @@
-"""What an autopilot corrected, undone: against an emulation of its firmware's forward path in float32."""
+"""Corrections of an autopilot, undone: against an emulation of its firmware's forward path in float32."""
 
 import numpy as np
 import pytest

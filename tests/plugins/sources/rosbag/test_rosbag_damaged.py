@@ -46,7 +46,7 @@ def assert_a_part(got):
     ],
 )
 def test_a_bag_cut_anywhere_is_read_up_to_there(tmp_path, kind, compression, size):
-    """What a recorder has written when the power goes: no index, no end."""
+    """A bag as a recorder has written it when the power goes: no index, no end."""
     path = bag(tmp_path, kind, compression)
     whole = path.read_bytes()
     read_so_far = 0

@@ -307,7 +307,7 @@ def test_a_device_clock_needs_a_counter():
 
 
 def test_time_runs_forward_whatever_happens(device):
-    """What the core refuses (time that runs backwards) does not come from a device, also with the host's clock."""
+    """Time that runs backwards, which the core refuses, does not come from a device, also with the host's clock."""
     faults, stop = Faults(), threading.Event()
     live = source(device.path, clock="host")
     sender = paced(device, (frame(k) for k in itertools.count() if k % 10), 200, stop)

@@ -199,7 +199,7 @@ def test_what_is_cut_off_is_counted(log, tmp_path, capfd):
 
 
 def last_end(content, size):
-    """Where the last message ends that is whole."""
+    """Return where the last message ends that is whole."""
     p = 16
     while p + 3 <= size and p + 3 + struct.unpack_from("<H", content, p)[0] <= size:
         p += 3 + struct.unpack_from("<H", content, p)[0]
