@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from itertools import takewhile
+from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -109,9 +109,13 @@ class Recorder:
         try:
             attributes = self._attributes()
         except UnreadableFile:
-            if not SIGNATURE.startswith(_begins(self.path)):  # neither of HDF5 and cut short, nor empty
-                raise
-            self._put_aside()
+            with self.path.open("rb") as file:
+                if not SIGNATURE.startswith(file.read(len(SIGNATURE))):  # neither of HDF5 and cut short, nor empty
+                    raise
+            # its writer was killed too early, or it is damaged: it is kept under another name
+            names = (self.path.with_name(f"{self.path.name}.unreadable-{k}") for k in count(1))
+            self.kept = next(name for name in names if not name.exists())
+            os.rename(self.path, self.kept)
             return
         self._check(attributes)
         self.started = float(attributes["started"])
@@ -119,14 +123,6 @@ class Recorder:
         if self.file.rows:
             with reading(self.path) as old:
                 self.last = float(old["time"][-1])
-
-    def _put_aside(self) -> None:
-        """Keep a file whose writer was killed too early, or that is damaged, under another name, and begin anew."""
-        number = 1
-        while (name := self.path.with_name(f"{self.path.name}.unreadable-{number}")).exists():
-            number += 1
-        os.rename(self.path, name)
-        self.kept = name
 
     @property
     def rows(self) -> int:
@@ -183,13 +179,8 @@ def _locked(path: Path, what: str, unfinished: list[Path]) -> Lock:
     return lock
 
 
-def _begins(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(len(SIGNATURE))
-
-
-def _made_by(mark: str, path: Path, file: h5py.File) -> bool:
-    return str(attribute(path, file, "program") or "").startswith(mark)
+def _is_recorded(path: Path, file: h5py.File) -> bool:
+    return str(attribute(path, file, "program") or "").startswith(RECORDED_MARK)
 
 
 def recorded_source(path: Path, live: Source | None = None) -> Source:
@@ -200,11 +191,13 @@ def recorded_source(path: Path, live: Source | None = None) -> Source:
     UnreadableFile
         If the file is neither.
     """
-    plain = (path.is_file() and _begins(path) != SIGNATURE) or path == Path("-")
+    import h5py
+
+    plain = (path.is_file() and not h5py.is_hdf5(path)) or path == Path("-")
     if live is not None and plain and (raw := live.of_file(path)) is not None:
         return raw
     with reading(path) as file:
-        if not _made_by(RECORDED_MARK, path, file):
+        if not _is_recorded(path, file):
             raise UnreadableFile(
                 f"{path}: was not {RECORDED_MARK}; name its channels in a config with a source for files"
             )
@@ -222,7 +215,7 @@ def started_at(path: Path) -> float | None:
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with reading(path) as file:
-        known = _made_by(RECORDED_MARK, path, file) and "started" in file.attrs
+        known = _is_recorded(path, file) and "started" in file.attrs
         return float(attribute(path, file, "started")) if known else None
 
 
