@@ -102,7 +102,7 @@ class FileSource(Source):
         Raises
         ------
         UnreadableFile
-            If the file cannot be read; also from the table, where it is found damaged later.
+            If the file cannot be read; also at the end of the block, where it is found damaged while it is open.
         """
 
     def about(self, channel: str) -> Mapping[str, str]:

@@ -76,11 +76,6 @@ class Column(NamedTuple):
     expression: pl.Expr
     kind: pl.DataType
 
-    @property
-    def struct(self) -> bool:
-        """True if it has fields instead of values."""
-        return hasattr(self.kind, "fields")
-
 
 class ParquetColumns(Table):
     """The columns of a file, and the fields of those that are structs."""
@@ -100,7 +95,7 @@ class ParquetColumns(Table):
     @cached_property
     def names(self) -> Sequence[str]:
         """Every column, and in place of a struct its fields."""
-        return [column.path for column in self.columns.values() if not column.struct]
+        return [path for path, column in self.columns.items() if not hasattr(column.kind, "fields")]
 
     def has(self, path: str) -> bool:
         """Return True if `path` is a column, or a field of a struct."""

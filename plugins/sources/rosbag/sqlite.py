@@ -65,7 +65,12 @@ class Sqlite:
                 rows = iter(base.execute(query, sorted(wanted)))
                 while True:
                     with self.clock:
-                        taken += _add_some(some, rows)
+                        most = taken + LARGE
+                        for row in rows:
+                            some.append(row)
+                            taken += len(row[2])
+                            if len(some) == ROWS or taken > most:
+                                break
                         self.clock.check(len(some))
                     read += len(some)
                     self._check_total(read, taken)
@@ -168,14 +173,3 @@ class Sqlite:
             texts += len(topic) + len(kind) + LEAST
             check_size(self.path, "the text of its definitions and topics", texts, TEXTS)
             yield Connection(number, topic, ros2_name(kind), text, language, str(form))
-
-
-def _add_some(some: list[tuple[int, int, bytes]], rows: Iterator[tuple[int, int, bytes]]) -> int:
-    """Add the next messages, and return how many bytes they have."""
-    size = 0
-    for row in rows:
-        some.append(row)
-        size += len(row[2])
-        if len(some) == ROWS or size > LARGE:
-            break
-    return size

@@ -115,21 +115,17 @@ class ULogTopics(Table):
         """Return notes on the sensors that `paths` name: their devices, and the corrections of the vehicle itself."""
         read = list(dict.fromkeys(i for path in paths if (i := self.instance(path))))
         others = [i for i in self.log.of("sensor_gyro") if i not in read]
-        lines = [f"{self.log.path.name}: read are {'; '.join(map(str, read))}"]
+        lines = [f"read are {'; '.join(map(str, read))}"]
         if others:
-            lines.append(f"{self.log.path.name}: not read are {'; '.join(map(str, others))}")
+            lines.append(f"not read are {'; '.join(map(str, others))}")
         names = [name for name in ("TC_G_ENABLE", "TC_A_ENABLE") if self.log.parameters.get(name)]
         names += [name for i in read for axis in AXES if (name := self._offset(i, axis)) and self.log.parameters[name]]
         if names:
             have = ", ".join(f"{name} = {self.log.parameters[name]:.6g}" for name in names)
-            lines.append(
-                f"{self.log.path.name}: the vehicle itself corrects by {have}; the columns read are without that"
-            )
+            lines.append(f"the vehicle itself corrects by {have}; the columns read are without that")
         if any(i.topic in CALIBRATED and before_1_11(i) for i in read):
-            lines.append(
-                f"{self.log.path.name}: is of firmware before 1.11, whose CAL_ offsets and scales were taken out"
-            )
-        return lines
+            lines.append("is of firmware before 1.11, whose CAL_ offsets and scales were taken out")
+        return [f"{self.log.path.name}: {line}" for line in lines]
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows of the topic of the first path."""

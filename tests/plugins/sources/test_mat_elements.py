@@ -78,7 +78,7 @@ def test_a_compressed_variable_with_a_wrong_checksum(tmp_path):
     body = head("time", 6, (5, 1)) + element(9, np.arange(5.0).tobytes())
     stream = packed(struct.pack("<II", 14, len(body)) + body)
     source = file_of(tmp_path / "r.mat", stream[:-1] + bytes([stream[-1] ^ 1]))
-    with source.open(source.path, Faults()) as table, pytest.raises(UnreadableFile, match="is cut short or damaged"):
+    with pytest.raises(UnreadableFile, match="is cut short or damaged"), source.open(source.path, Faults()) as table:
         list(table.blocks(["time"], 100))
 
 

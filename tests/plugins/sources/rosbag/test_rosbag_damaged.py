@@ -166,10 +166,10 @@ def test_a_chunk_whose_checksum_is_wrong_is_left_out(tmp_path):
 
 def test_bytes_that_are_lost_are_counted_once(tmp_path):
     """Of a chunk that is read for its rows, and for what is joined to them."""
-    path = bag(tmp_path, "mcap")
+    path = storage_file(write(tmp_path / "bag", "mcap", unit))
     whole = bytearray(path.read_bytes())
-    first = next(at for op, at, _ in records(bytes(whole)) if op == 6)
-    struct.pack_into("<I", whole, first + 9 + 24, 12345)
+    chunks = [at for op, at, _ in records(bytes(whole)) if op == 6]
+    struct.pack_into("<I", whole, chunks[1] + 9 + 24, 12345)
     path.write_bytes(whole)
     lost = []
     for channels in (CHANNELS, {**CHANNELS, "temperature": FIELDS["temperature"]}):
