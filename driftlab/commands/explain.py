@@ -31,7 +31,7 @@ from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
-from driftlab.recordings.identity import identity, of_file
+from driftlab.recordings.identity import identity
 from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
@@ -396,12 +396,10 @@ def _share(config: Config, name: str, other: str, contents: dict[str, Content]) 
 
 
 def _span(name: str) -> tuple[str, float, float]:
-    if isinstance(name, InMemoryName):
-        return name.identity()["sha256"], -np.inf, np.inf
-    path, span = part_of(name)
+    content = identity(name).get("sha256", "-")  # of standard input, which is one recording
+    span = {} if isinstance(name, InMemoryName) else part_of(name)[1]
     start, stop = span.get("start"), span.get("stop")
-    known = str(of_file(path).get("sha256", path))
-    return known, -np.inf if start is None else start, np.inf if stop is None else stop
+    return content, -np.inf if start is None else start, np.inf if stop is None else stop
 
 
 def show(result: ExplainResult, given: Mapping[str, Any]) -> None:

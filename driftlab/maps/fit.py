@@ -205,7 +205,7 @@ def gather(
     *,
     keep: bool = False,
 ) -> GatheredSoak:
-    """Return the samples of all recordings (`samples`); `keep`: with their epochs, as much memory as they take."""
+    """Return the samples of all recordings; `keep`: with their epochs, as much memory as they take."""
     configs = [with_recording(config, item) for item in recordings] or [config]
     used = Used()
     parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
@@ -241,12 +241,6 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
         "plugins": ", ".join(f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(settings)),
         "settings": settings.model_dump_json(exclude={"path"}),
     }
-
-
-def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
-    """Return temperature (N,) and tracked bias (N, d) of the epochs at rest of the config's source."""
-    found = gather(config, (), faults, progress)
-    return found.T, found.bias
 
 
 class _Samples(NamedTuple):

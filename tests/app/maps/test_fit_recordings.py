@@ -6,7 +6,7 @@ import pytest
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog
-from driftlab.maps.fit import fit_map, samples
+from driftlab.maps.fit import fit_map, gather
 from fusion_core.faults import Faults
 
 pytestmark = pytest.mark.recordings
@@ -73,7 +73,8 @@ def test_a_map_of_one_sweep_fits_the_other(recordings):
 
     for a, b, expected in ((2, 3, [23, 25, 25]), (3, 2, [35, 21, 23])):
         fitted = fit_map(sweep(a), [], "polynomial", Faults())
-        T, bias = samples(sweep(b), Faults())
+        soak = gather(sweep(b), [], Faults())
+        T, bias = soak.T, soak.bias
         inside = (fitted.domain[0] <= T) & (fitted.domain[1] >= T)
         left = bias[inside] - fitted.bias(T[inside])
         left = left[: len(left) // 25 * 25].reshape(-1, 25, 3).mean(axis=1)
@@ -83,7 +84,7 @@ def test_a_map_of_one_sweep_fits_the_other(recordings):
 
 def test_what_cannot_be_used_is_reported(recordings):
     config, faults = pan(recordings), Faults()
-    samples(config, faults)
+    gather(config, [], faults)
     assert any("flagged as not valid" in line for line in faults.lines())
 
 
