@@ -179,9 +179,9 @@ def tests_of(
         names.append(soaked.unit)
         lots.append(lot)
         curves.append(statistics.of(soaked, lot))
-        rows.append(row_of(of.get(soaked.unit), d))
-    figures = np.array(rows).reshape(-1, len(FIGURES), 2, d)
-    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, :, 0].swapaxes(0, 1)]
+        rows.append(np.full((2, len(FIGURES), d), np.nan) if soaked.unit not in of else of[soaked.unit].table(FIGURES, d))
+    figures = np.array(rows).reshape(-1, 2, len(FIGURES), d)
+    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}
     p = []
@@ -190,23 +190,14 @@ def tests_of(
         of_curves |= {} if law is None else {name: law}
         p.append(_chance(law, own, name))
     for k, name in enumerate(FIGURES):
-        usual, off = figure_law(name, figures[:, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
+        usual, off = figure_law(name, figures[:, :, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
         of_figures |= {} if usual is None else {name: usual}
-        p.append(_of_figure(usual, name, figures[:, k], lots, off))
+        p.append(_of_figure(usual, name, figures[:, :, k], lots, off))
     tests = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
     return Tests(
         names, tests, np.concatenate(p, axis=1), np.concatenate(values, axis=1),
         TailLaws(curves=of_curves, figures=of_figures),
     )  # fmt: skip
-
-
-def row_of(record: UnitRecord | None, d: int) -> Array:
-    """Return value and sigma (figures, 2, d) of a unit."""
-    row = np.full((len(FIGURES), 2, d), np.nan)
-    for k, name in enumerate(FIGURES):
-        if record is not None and name in record.figures and len(record.figures[name].value) == d:
-            row[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
-    return row
 
 
 def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLaw | None, list[dict[str, float]]]:

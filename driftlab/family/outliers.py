@@ -37,17 +37,15 @@ from driftlab.family.outlier_tests import (
     CurveStatistics,
     Tests,
     figure_law,
-    row_of,
     tests_of,
     unscaled,
 )
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import PER, UnitRecord
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
-PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
 FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")),
     "hysteresis": ("walk", "residual", "coast"),
@@ -340,9 +338,9 @@ def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
 
 def _odd_figures(family: Family, records: list[UnitRecord]) -> list[LotOutlier]:
     odd = []
-    table, lots = np.array([row_of(record, len(family.axes)) for record in records]), [r.lot for r in records]
+    table, lots = np.array([r.table(FIGURES, len(family.axes)) for r in records]), [r.lot for r in records]
     for k, name in enumerate(FIGURES):
-        law, off = figure_law(name, table[:, k], lots)
+        law, off = figure_law(name, table[:, :, k], lots)
         for axis, (called, shifts) in enumerate(zip(family.axes, off if law else (), strict=False)):
             for lot, by in shifts.items():
                 assert law is not None

@@ -32,12 +32,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.family.record import PER
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
 MIN_UNITS = 10  # for a chart, or an index
 LEVEL = "level"
-PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
 
 
 @dataclass(frozen=True)

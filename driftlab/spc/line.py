@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 from driftlab.config import Limits
 from driftlab.family.outliers import SHAPE, LotOutlier
-from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
     MIN_UNITS,
-    PER,
     SIGMAS,
     Capability,
     ChartScale,
@@ -239,7 +238,7 @@ def _ordered(
         if record.state == "done":
             axes, si = axes or record.axes, si or record.bias_unit
             names.append((record.unit, record.lot, record.date))
-            rows.append(_figures(record, len(axes)))
+            rows.append(record.table(FIGURES, len(axes)))
     place, order = _places([date for _, _, date in names])
     n, d = len(rows), len(axes)
     units, lots, dates = (tuple(names[j][k] for j in place) for k in range(3))
@@ -250,17 +249,6 @@ def _ordered(
     table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
     unit = default_unit(si) if unit is None else unit
     return LineReport(units=units, lots=lots, dates=dates, order=order, axes=axes, unit=unit), table
-
-
-def _figures(record: UnitRecord, d: int) -> Array:
-    """Return values and deviations (2, figures, d) of a record."""
-    table = np.full((2, len(FIGURES), d), np.nan)
-    for k, name in enumerate(FIGURES):
-        if (figure := record.figures.get(name)) is not None:
-            for part, numbers in zip(table, (figure.value, figure.sigma), strict=True):
-                own = np.array(numbers[:d], dtype=np.float64)
-                part[k, : len(own)] = np.where(np.isfinite(own), own, np.nan)
-    return table
 
 
 def _places(dates: list[str]) -> tuple[list[int], str]:
