@@ -40,7 +40,8 @@ def soaked(kind: Kind, unit: Made, program: str, seed: int) -> UnitInformation:
 
 def family_of(kind: Kind, seed: int) -> Family:
     units = [(soaked(kind, unit, "whole", seed), "") for unit in kind.units(UNITS, seed)]
-    return fit_family(units).model_copy(update={"bands": measure_bands(units, fit_family)})
+    family = fit_family(units)
+    return family.model_copy(update={"bands": measure_bands(family, units)})
 
 
 def own_maps(found: UnitInformation, T: np.ndarray) -> Maps:

@@ -92,8 +92,7 @@ def gaussian(seen: tuple[float, float], d: int) -> Band:
 
 def deviation(B: Array, covariance: Array) -> Array:
     """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
-    variance = np.einsum("nq,dqp,np->nd", B, covariance, B, optimize=True)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    return np.sqrt(np.maximum(np.sum((B @ covariance) * B, axis=2), 0.0)).T
 
 
 def variance_of_curve(B: Array, covariance: Array) -> Array:

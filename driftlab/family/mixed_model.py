@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
@@ -28,7 +29,16 @@ from driftlab.family.bands import Bands
 from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
-from driftlab.family.reml import Index, Means, RemlFit, VarianceComponents, fit_axis, means_of, outlier_weights
+from driftlab.family.reml import (
+    Index,
+    Means,
+    RemlFit,
+    VarianceComponents,
+    fit_axis,
+    means_of,
+    outlier_weights,
+    root_of,
+)
 from driftlab.family.tail_law import TailLaws
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
@@ -47,8 +57,9 @@ MIN_SHARE = 0.02  # of all units, likewise
 
 
 def fit_family(
-    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, each: ParallelMap = serial
-) -> Family:
+    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0,
+    each: ParallelMap = serial, start: Family | None = None,
+) -> Family:  # fmt: skip
     """Return the family of units.
 
     Parameters
@@ -60,6 +71,8 @@ def fit_family(
         Of the sample of SAMPLE units that Sigma is of, where there are more.
     each : ParallelMap, optional
         Goes through the axes.
+    start : Family, optional
+        One of nearly these units: its domain is taken, and EM begins with its law.
 
     Raises
     ------
@@ -68,13 +81,15 @@ def fit_family(
         was seen by MIN_UNITS of them.
     """
     knots, axes, lots = _survey(units)
+    knots = knots if start is None else start.knots
     n, d, numbers = len(lots), len(axes), numbered(lots)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
     present, lot = np.unique([numbers[lots[k]] for k in chosen], return_inverse=True)
     J, h, names = _sample(units, knots, set(chosen.tolist()))
-    fits = list(each(_fit, ((J[:, axis], h[:, axis], lot, knots.peaks) for axis in range(d)), at_once=1))
+    laws = [None] * d if start is None else list(map(VarianceComponents, start.Sigma, start.Lambda))
+    fits = list(each(_fit, ((J[:, axis], h[:, axis], lot, knots.peaks, laws[axis]) for axis in range(d)), at_once=1))
     w = np.stack([fit.w for fit in fits], axis=1)
     if n > SAMPLE:
         del J, h
@@ -91,7 +106,7 @@ def fit_family(
     )  # fmt: skip
 
 
-def _fit(of_axis: tuple[Array, Array, Index, Array]) -> RemlFit:
+def _fit(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | None]) -> RemlFit:
     return fit_axis(*of_axis)
 
 
@@ -202,6 +217,36 @@ class Posterior:
 
     c: Array
     covariance: Array
+
+    @cached_property
+    def root(self) -> tuple[Array, Array]:
+        """L (d, q, q) with the covariance L L', and its inverse."""
+        return root_of(self.covariance)
+
+    def informed(self, J: Array, h: Array) -> Posterior:
+        """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
+        L, _ = self.root
+        back = L.transpose(0, 2, 1)
+        V = np.linalg.inv(np.eye(L.shape[2]) + back @ J @ L)
+        a = back @ (h[..., None] - J @ self.c[..., None])
+        return Posterior(self.c + (L @ (V @ a))[..., 0], L @ V @ back)
+
+    def distance(self, J: Array, h: Array) -> Array:
+        """Return the distance (d,) from this law of a unit whose soak has J (d, q, q) and h (d, q), noise included.
+
+        The mean square of the coefficients in the directions on which the soak has more information than the law; 1 is
+        expected of a Gaussian one.
+        """
+        part = np.flatnonzero(np.any(J, axis=(0, 1)))
+        J, h = J[:, part][:, :, part], h[:, part]
+        L, _ = root_of(self.covariance[:, part][:, :, part])
+        back = L.transpose(0, 2, 1)
+        gain, U = np.linalg.eigh(back @ J @ L)
+        a = (U.transpose(0, 2, 1) @ (back @ (h[..., None] - J @ self.c[:, part, None])))[..., 0]
+        seen = gain > 1.0
+        squares = np.where(seen, a**2 / np.where(seen, gain + gain**2, 1.0), 0.0).sum(axis=1)
+        count = seen.sum(axis=1)
+        return np.where(count > 0, squares / np.maximum(count, 1), 1.0)
 
 
 class LotEffect(BaseModel):
@@ -335,14 +380,7 @@ class Family(BaseModel):
         before = self.marginal(lot)
         if soaked is None:
             return before
-        J, h = self.information_of(soaked)
-        c, covariance = np.empty_like(before.c), np.empty_like(before.covariance)
-        for k in range(len(self.axes)):
-            L, _, _ = VarianceComponents(before.covariance[k], before.covariance[k]).root()
-            V = np.linalg.inv(np.eye(L.shape[1]) + L.T @ J[k] @ L)
-            c[k] = before.c[k] + L @ (V @ (L.T @ (h[k] - J[k] @ before.c[k])))
-            covariance[k] = L @ V @ L.T
-        return Posterior(c, covariance)
+        return before.informed(*self.information_of(soaked))
 
     def information_of(self, soaked: UnitInformation) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) of a soak on the family's knots.

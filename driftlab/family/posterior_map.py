@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.band_calibration import PASSES, distance
+from driftlab.family.band_calibration import PASSES
 from driftlab.family.bands import Band, deviation, gaussian
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
@@ -105,7 +105,8 @@ class UnitPosterior:
         if bands is None:
             return None
         limit = bands.far_of(self.family.knots.domain, (self.band.low, self.band.high))
-        return np.asarray(distance(self.family, self.soaked, self.lot) / limit)
+        before = self.family.marginal(self.lot)
+        return np.asarray(before.distance(*self.family.information_of(self.soaked)) / limit)
 
     def map(self, provenance: Mapping[str, str]) -> FittedMap:
         """Return its posterior map."""
@@ -131,7 +132,7 @@ def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | 
     own = densities_of(soaked.recordings, soaked.knots.step) if own is None else own
     white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
     walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
-    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+    return soaked.with_noise(white, walk)
 
 
 def informed_where_unknown(soaked: UnitInformation, family: Family, record: UnitRecord) -> UnitInformation:
@@ -139,16 +140,14 @@ def informed_where_unknown(soaked: UnitInformation, family: Family, record: Unit
 
     Where it does, or repeated sweeps need a larger one, it stays as it is.
     """
-    if family.bands is None or not {"noise", "walk"} <= set(record.figures):
+    if family.bands is None:
         return soaked
-    noise, walk = (record.figures[name] for name in ("noise", "walk"))
-    own = [np.array(part, dtype=float) for part in (noise.value, noise.sigma, walk.value, walk.sigma)]
-    hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
+    (white, walk), (white_sigma, walk_sigma) = own = record.table(("noise", "walk"), len(family.axes))
+    hidden = (walk <= 0) & (soaked.walk < PASSES * walk_sigma)
     if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
         return soaked
-    pooled = with_pooled_noise(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
-    walks = np.where(hidden, pooled.walk, soaked.walk)
-    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
+    pooled = with_pooled_noise(soaked, family, Densities(white, white_sigma, walk, walk_sigma, soaked.walk))
+    return soaked.with_noise(soaked.white, np.where(hidden, pooled.walk, soaked.walk))
 
 
 def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:

@@ -142,7 +142,7 @@ def _fitted(
     except ValueError as error:
         return None, NOTHING, None, str(error)
     progress(Stage("the family, units left out"))
-    bands = measure_bands(units.with_rows(), fit, each)
+    bands = measure_bands(family, units.with_rows(), each)
     return family.model_copy(update={"bands": bands}), common, units, ""
 
 
