@@ -89,9 +89,7 @@ def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
         yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
 
 
-def _measured(
-    of_all: Family, whole: tuple[float, float], fold: tuple[Pairs, Pairs]
-) -> list[list[tuple[Array, Array]]]:
+def _measured(of_all: Family, whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[list[tuple[Array, Array]]]:
     """Return, of each part, z and g of the units that were left out of their family in a fold, and their distances."""
     family, measured = fit_family(fold[0], start=of_all), [list[tuple[Array, Array]]() for _ in PARTS]
     marginal = {lot: family.marginal(lot) for _, lot in fold[1]}

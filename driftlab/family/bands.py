@@ -85,14 +85,10 @@ class Bands(BaseModel):
         return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
 
 
-def gaussian(seen: tuple[float, float], d: int) -> Band:
-    """Return the band of a family that nothing is measured on, where a unit saw from low to high degC: factors of 1."""
-    return Band(*seen, np.ones((len(LEVELS), d)))
-
-
 def deviation(B: Array, covariance: Array) -> Array:
     """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
-    return np.sqrt(np.maximum(np.sum((B @ covariance) * B, axis=2), 0.0)).T
+    variance = np.sum((B @ covariance) * B, axis=2)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0))).T
 
 
 def variance_of_curve(B: Array, covariance: Array) -> Array:

@@ -179,7 +179,7 @@ def tests_of(
         names.append(soaked.unit)
         lots.append(lot)
         curves.append(statistics.of(soaked, lot))
-        rows.append(np.full((2, len(FIGURES), d), np.nan) if soaked.unit not in of else of[soaked.unit].table(FIGURES, d))
+        rows.append(of[soaked.unit].table(FIGURES, d) if soaked.unit in of else np.full((2, len(FIGURES), d), np.nan))
     figures = np.array(rows).reshape(-1, 2, len(FIGURES), d)
     values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
     of_curves: dict[str, TailLaw] = {}

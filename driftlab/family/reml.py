@@ -182,11 +182,11 @@ def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) ->
     return EStep(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
 
 
-def m_step(expected: EStep, w: Array, prior: SmoothPrior | None, *, lots: bool) -> VarianceComponents:
-    """Return the law that maximises the expected likelihood."""
+def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> VarianceComponents:
+    """Return the law that maximises the expected likelihood, with the prior of Sigma about Psi where there is one."""
     scatter, count = expected.scatter, float(w.sum())
-    if prior is not None:
-        scatter, count = scatter + prior.scatter, count + WEIGHT
+    if Psi is not None:
+        scatter, count = scatter + WEIGHT * Psi, count + WEIGHT
     Sigma = scatter / count
     return VarianceComponents((Sigma + Sigma.T) / 2, expected.between if lots else np.zeros_like(Sigma))
 
@@ -219,24 +219,26 @@ def fit_axis(J: Array, h: Array, lot: Index, peaks: Array, start: VarianceCompon
     EM begins with the law `start`, or with a smooth prior's.
     """
     w, lots = np.ones(len(J)), int(lot.max()) > 0
-    prior = initial_prior(peaks, initial_scale(J, h))
+    spread = initial_scale(J, h)
+    prior = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])  # rough: no curve goes on anywhere
     if start is not None:
         law = start
         w, _ = weights(e_step(law, J, h, lot, w), w, len(w) + WEIGHT)
     else:
-        law = VarianceComponents(prior.mean, 0.1 * prior.mean if lots else np.zeros_like(prior.mean))
+        Psi = smooth(peaks, prior)[0]
+        law = VarianceComponents(Psi, 0.1 * Psi if lots else np.zeros_like(Psi))
         for _ in range(SMOOTH):
             w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
             expected = e_step(law, J, h, lot, w)
             prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
-            law = VarianceComponents(prior.mean, expected.between if lots else law.Lambda)
+            law = VarianceComponents(smooth(peaks, prior)[0], expected.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MAX_STEPS + 1):
         expected, older_w = e_step(law, J, h, lot, w), w
         if not settled and steps % HYPER == 1:
             older, prior = prior, likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
-            settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
-        later = m_step(expected, w, prior, lots=lots)
+            settled = steps > 1 and bool(np.max(np.abs(older - prior)) < 0.1)
+        later = m_step(expected, w, smooth(peaks, prior)[0], lots=lots)
         law, moved = later, change(law, later)
         if HYPER <= steps <= FROZEN:
             w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
@@ -282,19 +284,6 @@ def _nearest(expected: EStep) -> Array:
     return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothPrior:
-    """An inverse Wishart law: `mean` (q, q) is its expectation, of the logarithms `numbers` of a0, a1, s, l, r."""
-
-    mean: Array
-    numbers: Array
-
-    @property
-    def scatter(self) -> Array:
-        """Contribution to a scatter matrix (q, q)."""
-        return WEIGHT * self.mean
-
-
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
     a0, a1, s, length, r = np.exp(numbers)
@@ -307,22 +296,15 @@ def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     return np.sum(parts, axis=0), np.stack([2 * parts[0], 2 * parts[1], 2 * parts[2], by_length, 2 * parts[3]])
 
 
-def initial_prior(peaks: Array, spread: float) -> SmoothPrior:
-    """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
-    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
-    return SmoothPrior(smooth(peaks, numbers)[0], numbers)
-
-
-def likeliest_prior(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> SmoothPrior:
-    """Return the prior under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
+def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) -> Array:
+    """Return the numbers of Psi under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
     from scipy.optimize import Bounds, minimize
 
     scale = np.log(np.sqrt(np.trace(scatter) / (len(peaks) * count)))
     low = np.array([scale - 9] * 3 + [np.log(2 * (peaks[1] - peaks[0])), scale - 9])
     high = np.array([scale + 4] * 3 + [np.log(3 * np.ptp(peaks)), scale + 1])
-    begin: npt.NDArray[np.float64] = np.clip(start.numbers, low + 1e-6, high - 1e-6)
 
-    def cost(numbers: npt.NDArray[np.float64]) -> tuple[float, Array]:
+    def cost(numbers: Array) -> tuple[float, Array]:
         """Return - log p of the module's text, a draw, and its derivatives."""
         nu, (Psi, by_numbers) = len(peaks) + 6.0, smooth(peaks, numbers)
         own, inverse = _log_det(nu * Psi)
@@ -331,8 +313,9 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: SmoothPri
         value = ((nu + count) * with_units - nu * own) / 2
         return value / count, np.tensordot(by_numbers, slope, 2) / count
 
-    best = minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25}).x
-    return SmoothPrior(smooth(peaks, best)[0], best)
+    begin, bounds = np.clip(start, low + 1e-6, high - 1e-6), Bounds(low, high)
+    best: Array = minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}).x
+    return best
 
 
 def _log_det(matrix: Array) -> tuple[float, Array]:

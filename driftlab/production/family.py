@@ -18,7 +18,8 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
-from driftlab.family.file import read_family
+from driftlab.family.bands import deviation
+from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, find_odd_lots, find_outliers
 from driftlab.family.parallel import ParallelMap, serial
@@ -33,7 +34,7 @@ from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-from fusion_core.errors import ConfigError, MapError
+from fusion_core.errors import ConfigError
 
 NOTHING = SharedEffects("nothing_common", (), (), 0, 0, 0)
 
@@ -147,15 +148,9 @@ def _fitted(
 
 
 def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, SharedEffects]:
-    family = read_family(path)
-    units = ("channel", family.channel, status.channel), ("unit", family.bias_unit, status.bias_unit)
-    for what, has, wanted in units:
-        if has != wanted:
-            raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
+    family = load_family(path, channel=status.channel, bias_unit=status.bias_unit)
     try:
-        for soaked, _ in store:
-            family.information_of(soaked)
-            break
+        family.information_of(next(iter(store))[0])
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
     return family, NOTHING if family.common_effects is None else SharedEffects.from_json(family.common_effects)
@@ -185,10 +180,11 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     """Return the spread of the family, in a sentence."""
     low, high = family.knots.domain
     B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
-    mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
-    whole = [float(np.hypot(a, b)) for a, b in zip(about, between, strict=True)]
+    mean, whole = (
+        np.sqrt(np.mean(deviation(B, C) ** 2, axis=0)) for C in (family.mu_covariance, family.Sigma + family.Lambda)
+    )
 
-    def listed(values: Sequence[float]) -> str:
+    def listed(values: Array) -> str:
         texts = (f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
         return f"{', '.join(texts)} {unit.shown}"
 
@@ -197,11 +193,6 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
         f"{of}, {low:g} to {high:g} °C: they spread by {listed(whole)} about a mean map that is known to "
         f"{listed(mean)} (1 sigma, rms over the range)"
     )
-
-
-def _rms(B: Array, covariance: Array) -> list[float]:
-    """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
-    return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
 
 
 class UnitSpool:

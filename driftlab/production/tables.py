@@ -22,7 +22,7 @@ import numpy as np
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.mixed_model import Family
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
+from driftlab.family.posterior_map import informed_where_unknown, posterior_of
 from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.production.store import NEW, UNITS, UnitRef
@@ -260,12 +260,11 @@ def _of_unit(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) ->
     soaked = common.apart(soaked, lot)
     if not common.effects:
         soaked = informed_where_unknown(soaked, family, record)
-    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
-    T = temperatures(family)
+    unit_posterior, T = posterior_of(family, soaked, lot), temperatures(family)
+    posterior = unit_posterior.posterior
     path = place.folder / UNITS / place.unit / MAP
     new = path.with_name(f".{MAP}{NEW}")
-    provenance = {"unit": place.unit, "lot": lot}
-    family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
+    unit_posterior.map({"unit": place.unit, "lot": lot}).save(new)
     os.replace(new, path)
     before = family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
@@ -273,7 +272,7 @@ def _of_unit(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) ->
     return OfTheFamily(
         family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
         (family.knots.values(T) @ posterior.c.T).T.astype(np.float32),
-        np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
+        np.sqrt(np.mean(unit_posterior.sigma_at(T) ** 2, axis=0)),
         np.sqrt(np.array(off) / family.knots.q),
         sizes[0].c[:, 0] if sizes else None, sizes[0].sigma[:, 0] if sizes else None,
     )  # fmt: skip

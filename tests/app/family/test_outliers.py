@@ -10,7 +10,7 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
-from driftlab.family.file import read_family, save_family
+from driftlab.family.file import load_family, save_family
 from driftlab.family.mixed_model import fit_family
 from driftlab.family.outlier_tests import CurveStatistics
 from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_odd_lots, find_outliers, simes
@@ -162,7 +162,7 @@ def test_new_units_are_held_against_a_family_that_has_not_seen_them(tmp_path) ->
     laws = find_outliers(family, pairs, [unit.record(25, ("x",)) for unit in old]).laws
     file = tmp_path / "family.json"
     save_family(file, family.model_copy(update={"laws": laws}))
-    family = read_family(file)
+    family = load_family(file)
     new = [(unit.soaked(25, ("x",)), "unheard of") for unit in units[100:]]
     records = [unit.record(25, ("x",)) for unit in units[100:]]
     odd = find_outliers(family, new, records, fitted=False).odd
