@@ -89,8 +89,3 @@ def deviation(B: Array, covariance: Array) -> Array:
     """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
     variance = np.sum((B @ covariance) * B, axis=2)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))).T
-
-
-def variance_of_curve(B: Array, covariance: Array) -> Array:
-    """Return the variance (N,) of a curve B (N, q) c on one axis, c of the covariance (q, q)."""
-    return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))

@@ -21,7 +21,7 @@ from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.bands import deviation
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
-from driftlab.family.outliers import LotOutlier, Outlier, find_odd_lots, find_outliers
+from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
@@ -107,7 +107,7 @@ def analyse(
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
         family = family.model_copy(update={"laws": outliers.laws})
-        lots, line = reconcile(find_odd_lots(family, records, shown=unit), line)
+        lots, line = reconcile(outliers.lots, line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
