@@ -26,7 +26,7 @@ from driftlab.family.bands import LEVELS, Bands, Typical, deviation
 from driftlab.family.mixed_model import Family, FamilyUnits, Posterior, fit_family
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
-from driftlab.family.unit_noise import common_walk, densities_of
+from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
 
 PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.4, 0.7) for at in (0.0, 0.5, 1.0))
@@ -121,10 +121,10 @@ def _typical(units: Sequence[UnitInformation]) -> Typical:
     with_rows = [soaked for soaked in units if soaked.recordings]
     if with_rows:
         some = [with_rows[k] for k in np.unique(np.linspace(0, len(with_rows) - 1, ALIKE).astype(int))]
-        alike = np.exp(middle["white"]) * common_walk([soaked.recordings for soaked in some], some[0].knots.step)
-        likely = np.median([densities_of(soaked.recordings, soaked.knots.step).likely for soaked in some], axis=0)
-        more = np.exp(middle["walk"]) / np.maximum(likely, tiny)
-        middle["walk"] = np.log(np.maximum(alike * np.where(more > PASSES, more, 1.0), tiny))
+        alike, likely = common_walk([soaked.recordings for soaked in some], some[0].knots.step)
+        more = np.exp(middle["walk"]) / np.maximum(np.median(likely, axis=0), tiny)
+        walk = np.exp(middle["white"]) * alike * np.where(more > PASSES, more, 1.0)
+        middle["walk"] = np.log(np.maximum(walk, tiny))
     return Typical(
         white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
         white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
