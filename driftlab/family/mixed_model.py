@@ -7,7 +7,7 @@ information on the rest: its posterior there is that of a unit like it. d axes, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol
@@ -30,7 +30,6 @@ from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
 from driftlab.family.reml import (
-    Index,
     Means,
     RemlFit,
     VarianceComponents,
@@ -89,7 +88,8 @@ def fit_family(
     present, lot = np.unique([numbers[lots[k]] for k in chosen], return_inverse=True)
     J, h, names = _sample(units, knots, set(chosen.tolist()))
     laws = [None] * d if start is None else list(map(VarianceComponents, start.Sigma, start.Lambda))
-    fits = list(each(_fit, ((J[:, axis], h[:, axis], lot, knots.peaks, laws[axis]) for axis in range(d)), at_once=1))
+    of_axes = ((J[:, axis], h[:, axis], lot, knots.peaks, laws[axis]) for axis in range(d))
+    fits = list(each(fit_axis, of_axes, at_once=1))
     w = np.stack([fit.w for fit in fits], axis=1)
     if n > SAMPLE:
         del J, h
@@ -104,10 +104,6 @@ def fit_family(
         weights={name: w[k].tolist() for k, name in enumerate(names) if np.any(w[k] < 0.5)},
         steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
     )  # fmt: skip
-
-
-def _fit(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | None]) -> RemlFit:
-    return fit_axis(*of_axis)
 
 
 def _survey(units: FamilyUnits) -> tuple[SplineBasis, tuple[str, ...], list[str]]:
@@ -162,25 +158,22 @@ def _means_of_all(
     units: FamilyUnits, knots: SplineBasis, fits: list[RemlFit], present: Array, lot: list[int]
 ) -> list[Means]:
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
-    d, q, G = len(fits), knots.q, max(lot) + 1
-    roots = [fit.law.root() for fit in fits]
-    centres = np.zeros((d, G, q))
-    for axis, fit in enumerate(fits):
-        centres[axis] = fit.expected.means.mu
-        centres[axis, present] += fit.expected.means.shifts
+    d, q, G, one = len(fits), knots.q, max(lot) + 1, np.eye(knots.q)
+    L, inverse, spread = (np.stack(part) for part in zip(*(fit.law.root() for fit in fits), strict=True))
+    limits, back = np.array([fit.limit for fit in fits]), L.transpose(0, 2, 1)
+    centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[:, None], G, axis=1)
+    centres[:, present] += np.stack([fit.expected.means.shifts for fit in fits])
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
     for g, (soaked, _) in zip(lot, units, strict=True):
         J, h = marginalised(soaked, knots)
-        for axis, (L, inverse, _) in enumerate(roots):
-            A, a = L.T @ J[axis] @ L, L.T @ h[axis]
-            K = np.eye(q) - np.linalg.inv(A + np.eye(q))
-            own = a - K @ a
-            z = own - K @ (inverse @ centres[axis, g])
-            w = float(outlier_weights(z @ z / np.trace(K), fits[axis].limit))
-            V = np.linalg.inv(A + w * np.eye(q)) if w < 1 else np.eye(q) - K
-            information[axis, g] += w * (np.eye(q) - w * V)
-            weighted[axis, g] += w * V @ a
-    return [means_of(information[k], weighted[k], lots).turned(L) for k, (L, _, lots) in enumerate(roots)]
+        A, a = back @ J @ L, back @ h[..., None]
+        K = one - np.linalg.inv(A + one)
+        z = (a - K @ (a + inverse @ centres[:, g, :, None]))[..., 0]
+        w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
+        V = np.linalg.inv(A + w * one)
+        information[:, g] += w * (one - w * V)
+        weighted[:, g] += (w * V @ a)[..., 0]
+    return [means_of(*own).turned(L[k]) for k, own in enumerate(zip(information, weighted, spread, strict=True))]
 
 
 def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, LotEffect]:
@@ -197,7 +190,7 @@ def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[
     }  # fmt: skip
 
 
-def _symmetric(matrices: list[Array]) -> Array:
+def _symmetric(matrices: Sequence[Array]) -> Array:
     """Return matrices (d, q, q) without what rounding made of their symmetry."""
     stacked = np.stack(matrices)
     return (stacked + stacked.transpose(0, 2, 1)) / 2
@@ -404,16 +397,14 @@ def marginalised(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Ar
     J, h = soaked.on(wide)
     if wide == knots:
         return J, h
-    part = knots.within(wide)
-    outside = np.ones(wide.q, dtype=bool)
-    outside[part] = False
-    keep = np.flatnonzero(~outside)
-    beyond = np.flatnonzero(outside & np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0))
-    Jk, hk = J[:, keep][:, :, keep], h[:, keep]
+    keep, seen = knots.within(wide), np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0)
+    seen[keep] = False
+    beyond = np.flatnonzero(seen)
+    Jk, hk = J[:, keep, keep], h[:, keep]
     if len(beyond) == 0:
         return Jk, hk
     across, inner = J[:, keep][:, :, beyond], J[:, beyond][:, :, beyond]
     inner = inner + 1e-9 * np.max(np.diagonal(inner, axis1=1, axis2=2), axis=1)[:, None, None] * np.eye(len(beyond))
     taken = across @ np.linalg.inv(inner)
     rest = Jk - taken @ across.transpose(0, 2, 1)
-    return (rest + rest.transpose(0, 2, 1)) / 2, hk - np.einsum("dij,dj->di", taken, h[:, beyond])
+    return _symmetric(rest), hk - np.einsum("dij,dj->di", taken, h[:, beyond])

@@ -213,11 +213,12 @@ class RemlFit:
     moved: float
 
 
-def fit_axis(J: Array, h: Array, lot: Index, peaks: Array, start: VarianceComponents | None = None) -> RemlFit:
-    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC.
+def fit_axis(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | None]) -> RemlFit:
+    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered (n,), at `peaks` (q,) degC.
 
-    EM begins with the law `start`, or with a smooth prior's.
+    EM begins with the law `start`, the last of them, or where that is None with a smooth prior's.
     """
+    J, h, lot, peaks, start = of_axis
     w, lots = np.ones(len(J)), int(lot.max()) > 0
     spread = initial_scale(J, h)
     prior = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])  # rough: no curve goes on anywhere

@@ -37,6 +37,7 @@ from driftlab.spc.charts import (
     Trend,
     ewma,
     ewma_limit,
+    huber,
     in_control,
     indices,
     normality,
@@ -149,12 +150,8 @@ def _trend(x: Array, sigma: Array, level_steps: list[LevelStep], scale: ChartSca
     if not level_steps:
         return None
     n, u = len(x), np.linspace(-1.0, 1.0, len(x))
-    X, w = np.column_stack([np.ones(n), u]), 1 / sigma
-    line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
-    for _ in range(10):  # Huber's weights
-        off = np.abs(x - X @ line) / sigma
-        w = np.sqrt(np.minimum(1.345 / np.maximum(off, 1e-12), 1.0)) / sigma
-        line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
+    X = np.column_stack([np.ones(n), u])
+    line = huber(X, x, sigma, np.array([np.median(x), 0.0]))
     edges = [0, *(step.at for step in level_steps), n]
     steps_of = np.concatenate([np.full(j - i, np.median(x[i:j])) for i, j in pairwise(edges)])
     cost = [float(np.sum(np.minimum(((x - model) / sigma) ** 2, SIGMAS**2))) for model in (X @ line, steps_of)]
