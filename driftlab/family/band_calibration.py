@@ -21,6 +21,7 @@ from functools import partial
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
 from driftlab.family.mixed_model import Family, FamilyUnits, Posterior, fit_family
@@ -65,11 +66,12 @@ def measure_bands(family: Family, every: FamilyUnits, each: ParallelMap = serial
     """
     sample = sample_of(len(every))
     units = [pair for k, pair in enumerate(every) if k in sample]
-    whole = _domain(units)
-    long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
+    first, last = np.array([soaked.knots.domain for soaked, _ in units]).T
+    whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
+    long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
-    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
+    long = long[np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
     folds = list(each(partial(_measured, family, whole), _folds(units, long), at_once=1))
     parts, factors, far = [], [], []
     for k, part in enumerate(PARTS):
@@ -81,11 +83,11 @@ def measure_bands(family: Family, every: FamilyUnits, each: ParallelMap = serial
     return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
-def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
+def _folds(units: Pairs, long: NDArray[np.intp]) -> Iterator[tuple[Pairs, Pairs]]:
     """Yield the units that are left in each fold, without their rows, and those of `long` that are left out."""
     bare = [(replace(soaked, recordings=()), lot) for soaked, lot in units]
     for fold in range(FOLDS):
-        out = set(long[fold::FOLDS])
+        out = set(long[fold::FOLDS].tolist())
         yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
 
 
@@ -129,17 +131,6 @@ def _typical(units: Sequence[UnitInformation]) -> Typical:
         white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
         white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
     )  # fmt: skip
-
-
-def _domain(units: Pairs) -> tuple[float, float]:
-    """Return the range of most units: one that saw more is not to make all others short."""
-    ends = np.array([soaked.knots.domain for soaked, _ in units])
-    return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
-
-
-def _share(soaked: UnitInformation, whole: tuple[float, float]) -> float:
-    low, high = soaked.knots.domain
-    return (high - low) / (whole[1] - whole[0])
 
 
 def _scores(B: Array, less: Posterior, more: Posterior) -> Array:

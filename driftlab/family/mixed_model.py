@@ -407,4 +407,4 @@ def marginalised(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Ar
     inner = inner + 1e-9 * np.max(np.diagonal(inner, axis1=1, axis2=2), axis=1)[:, None, None] * np.eye(len(beyond))
     taken = across @ np.linalg.inv(inner)
     rest = Jk - taken @ across.transpose(0, 2, 1)
-    return _symmetric(rest), hk - np.einsum("dij,dj->di", taken, h[:, beyond])
+    return (rest + rest.transpose(0, 2, 1)) / 2, hk - np.einsum("dij,dj->di", taken, h[:, beyond])

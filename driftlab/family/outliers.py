@@ -441,4 +441,4 @@ def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tupl
         return cost, np.zeros(1), CurveDeviation(z, K, 0.0)
     pull = g.T @ z
     size = np.linalg.solve(g.T @ K @ g, pull)
-    return cost - float(pull @ size), size, CurveDeviation(z - K @ g @ size, K, 0.0)
+    return cost - float(pull @ size), np.asarray(size), CurveDeviation(z - K @ g @ size, K, 0.0)

@@ -260,8 +260,8 @@ def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:
     return outlier_weights(share, limit), limit
 
 
-def outlier_weights(share: Array, limit: float) -> Array:
-    """Return weights (n,) of distances `share` (n,) under a limit."""
+def outlier_weights(share: Array, limit: float | Array) -> Array:
+    """Return weights (n,) of distances `share` (n,) under a limit, or one each (n,)."""
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 

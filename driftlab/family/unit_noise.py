@@ -195,7 +195,7 @@ def _curves_of_sweeps(recordings: Sequence[SoakRows], step: float) -> list[Array
 
 
 def _gain(
-    recordings: Sequence[SoakRows], curves: Sequence[Array], axis: int, white: float, walk: float
+    recordings: Sequence[SoakRows], curves: Sequence[Array], axis: np.intp, white: float, walk: float
 ) -> tuple[float, int]:
     """Return G of an axis, and the number of coefficients that a curve for each sweep adds."""
     _, count, q = curves[0].shape

@@ -299,7 +299,7 @@ def huber(X: Array, x: Array, sigma: Array, start: Array) -> Array:
     found = start
     for _ in range(20):
         w = np.sqrt(np.minimum(1.345 / np.maximum(np.abs(x - X @ found) / sigma, 1e-12), 1.0)) / sigma
-        found = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0], dtype=np.float64)
     return found
 
 
