@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, FamilyUnits, Posterior, fit_family
+from driftlab.family.mixed_model import Family, Posterior, fit_family
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import common_walk
@@ -41,7 +41,7 @@ SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
 GRID = 2  # temperatures an interval
 ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk, that passes ask for
 GAINED = 0.05  # of a variance, that the whole soak must have taken away
-SAMPLE = 400  # units of a larger family that the folds are of
+SAMPLE = 400  # units of a larger family that the bands are to be measured on
 
 Pairs = Sequence[tuple[UnitInformation, str]]
 
@@ -51,7 +51,7 @@ def sample_of(count: int) -> set[int]:
     return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
 
 
-def measure_bands(family: Family, every: FamilyUnits, each: ParallelMap = serial) -> Bands | None:
+def measure_bands(family: Family, units: Pairs, each: ParallelMap = serial) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
     A part in which no unit has samples is left out: the nearest other part is taken for it.
@@ -59,13 +59,11 @@ def measure_bands(family: Family, every: FamilyUnits, each: ParallelMap = serial
     Parameters
     ----------
     family : Family
-    every : FamilyUnits
-        Its units; SAMPLE of them are taken where there are more.
+    units : sequence of (UnitInformation, str)
+        Its units and their lots, or a sample of them.
     each : ParallelMap, optional
         Goes through the folds.
     """
-    sample = sample_of(len(every))
-    units = [pair for k, pair in enumerate(every) if k in sample]
     first, last = np.array([soaked.knots.domain for soaked, _ in units]).T
     whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)

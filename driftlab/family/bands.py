@@ -16,12 +16,14 @@ LEVELS = (0.68, 0.95, 0.997)
 class Band:
     """Factors (3, d) of a posterior's deviation outside of low to high degC, one a level.
 
-    Between them, and of what was never measured, 1.
+    Between them, and of what was never measured, 1. `far` (d,) is the distance that one unit in a hundred exceeds, None
+    where it was not measured.
     """
 
     low: float
     high: float
     factors: Array
+    far: Array | None = None
 
     def factor(self, T: Array, step: float) -> Array:
         """Return the factor (N, d) at T (N,) with which 95 of 100 are within 1.96 sigma; it goes over within a step."""
@@ -73,16 +75,10 @@ class Bands(BaseModel):
 
     def band(self, domain: tuple[float, float], seen: tuple[float, float]) -> Band:
         """Return the band of a unit by the part that is most like the range it saw of the family's domain, degC."""
-        return Band(seen[0], seen[1], np.array(self.factors[self._nearest(domain, seen)]))
-
-    def far_of(self, domain: tuple[float, float], seen: tuple[float, float]) -> Array:
-        """Return the distance (d,) that one unit in a hundred exceeds, by the part most like the range seen, degC."""
-        return np.array(self.far[self._nearest(domain, seen)])
-
-    def _nearest(self, domain: tuple[float, float], seen: tuple[float, float]) -> int:
         low, high = domain
-        share = [(end - low) / (high - low) for end in seen]
-        return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
+        share = (np.array(seen) - low) / (high - low)
+        k = int(np.argmin(np.sum(np.abs(share - np.array(self.parts)), axis=1)))
+        return Band(*seen, np.array(self.factors[k]), np.array(self.far[k]))
 
 
 def deviation(B: Array, covariance: Array) -> Array:

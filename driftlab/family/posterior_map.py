@@ -85,18 +85,15 @@ class UnitPosterior:
     @property
     def inside(self) -> NDArray[np.bool_]:
         """True where T (N,) was soaked."""
-        temperature = self.T
-        return (temperature >= self.band.low) & (temperature <= self.band.high)
+        return (self.band.low <= self.T) & (self.band.high >= self.T)
 
     @cached_property
     def far(self) -> Array | None:
         """Distance (d,) of the unit from its family over that of one unit in a hundred; None where not measured."""
-        bands = self.family.bands
-        if bands is None:
+        if self.band.far is None:
             return None
-        limit = bands.far_of(self.family.knots.domain, (self.band.low, self.band.high))
         before = self.family.marginal(self.lot)
-        return np.asarray(before.distance(*self.family.information_of(self.soaked)) / limit)
+        return before.distance(*self.family.information_of(self.soaked)) / self.band.far
 
     def map(self, provenance: Mapping[str, str]) -> FittedMap:
         """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.

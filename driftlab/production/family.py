@@ -133,13 +133,12 @@ def _fitted(
     store: UnitStore, status: FleetStatus, progress: FleetProgress, each: ParallelMap, until_analysed: ExitStack
 ) -> tuple[Family | None, SharedEffects, UnitSpool | None, str]:
     """Return the family of units, their common effects and the units without them; or why there is none."""
-    fit = partial(fit_family, channel=status.channel, bias_unit=status.bias_unit)
     try:
         progress(Stage("effects that the units share"))
         common = find_common(store, bias_unit=status.bias_unit, each=each)
         units = until_analysed.enter_context(UnitSpool(store, common, each, sample_of(len(store))))
         progress(Stage("the family"))
-        family = fit(units, each=each)
+        family = fit_family(units, channel=status.channel, bias_unit=status.bias_unit, each=each)
     except ValueError as error:
         return None, NOTHING, None, str(error)
     progress(Stage("the family, units left out"))
