@@ -96,12 +96,7 @@ class FamilyMapResult(Result):
 
 
 def fit_family_map(
-    config: Config,
-    recordings: Sequence[str],
-    family: Path,
-    lot: str,
-    out: Path | None,
-    progress: Progress | None,
+    config: Config, recordings: Sequence[str], family: Path, lot: str, out: Path | None, progress: Progress | None
 ) -> FamilyMapResult:
     """Return the map that a unit's own soak and its family give; with `out`, write it there.
 
