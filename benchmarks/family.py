@@ -20,7 +20,7 @@ from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, s
 
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.posterior_map import sigma, unit_posterior
+from driftlab.family.posterior_map import unit_posterior
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.soak.blocks import SoakRows
@@ -40,7 +40,8 @@ def soaked(kind: Kind, unit: Made, program: str, seed: int) -> UnitInformation:
 
 def family_of(kind: Kind, seed: int) -> Family:
     units = [(soaked(kind, unit, "whole", seed), "") for unit in kind.units(UNITS, seed)]
-    return fit_family(units).model_copy(update={"bands": measure_bands(units, fit_family)})
+    family = fit_family(units)
+    return family.model_copy(update={"bands": measure_bands(family, units)})
 
 
 def own_maps(found: UnitInformation, T: np.ndarray) -> Maps:
@@ -91,7 +92,7 @@ def judged(name: str, kind: Kind, seed: int) -> list[bool]:
             found = soaked(kind, unit, program, seed + 50)
             known = unit_posterior(family, found)
             error.append(B @ known.posterior.c.T / DEG_H - truth[k])
-            said.append(sigma(family, known.posterior, known.band, T) / DEG_H)
+            said.append(known.sigma_at(T) / DEG_H)
             z.append(error[-1] / said[-1])
             for what, curve in own_maps(found, T).items():
                 own.setdefault(what, []).append(curve / DEG_H - truth[k])

@@ -242,9 +242,9 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 583,
-    "driftlab/commands": 2774,
+    "driftlab/commands": 2763,
     "driftlab/evaluation": 1289,
-    "driftlab/family": 2756,
+    "driftlab/family": 2732,
     "driftlab/filtering": 1198,
     "driftlab/identification": 2192,
     "driftlab/live": 774,
@@ -256,9 +256,9 @@ BUDGET = {
     "driftlab/recordings": 452,
     "driftlab/reports": 2735,
     "driftlab/soak": 660,
-    "driftlab/spc": 654,
+    "driftlab/spc": 596,
     "driftlab/starter": 569,
-    "driftlab/storage": 1102,
+    "driftlab/storage": 1072,
     "fusion_core": 1834,
     "fusion_core/contracts": 1676,
     "fusion_core/fast": 710,

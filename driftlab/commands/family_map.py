@@ -15,7 +15,6 @@ from driftlab.commands.inputs import Progress
 from driftlab.commands.result import Result
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
-from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import UnitPosterior, unit_posterior
 from driftlab.family.unit_noise import soaked_of
 from driftlab.maps.fit import USUAL, fit_gathered, gather, map_settings
@@ -50,7 +49,7 @@ class FamilyMapResult(Result):
         self,
         config: Config,
         recordings: Sequence[str],
-        family: tuple[Path, Family],
+        family: str,
         known: UnitPosterior,
         own: FittedMap | None,
         faults: Faults,
@@ -58,27 +57,22 @@ class FamilyMapResult(Result):
         self.config, self.known, self.own, self.faults = config, known, own, faults
         self.unit = tracked_unit(config.filter)
         self.written: tuple[Path, ...] = ()
-        path, law = family
+        units = known.family.units
         about = {
-            "family": path.name, "units": str(law.units), "recordings": ", ".join(Path(r).name for r in recordings),
+            "family": family, "units": str(units), "recordings": ", ".join(Path(r).name for r in recordings),
             "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"), "driftlab": __version__,
         }  # fmt: skip
         self.map = known.map(about)
         record, T = self.map.record, known.T
-        self.name = f"map of the {record.channel}, with the family of {law.units} units"
-        blank = np.full((len(T), record.d), np.nan)
+        self.name = f"map of the {record.channel}, with the family of {units} units"
+        of_own = np.full((2, len(T), record.d), np.nan)
+        if own is not None:
+            inside = (own.domain[0] <= T) & (own.domain[1] >= T)
+            of_own[:, inside] = own.bias(T[inside]), own.sigma(T[inside])
         self._columns = {
             "temperature": T, "bias": self.map.bias(T), "sigma": known.sigma, "family_sigma": known.before,
-            "own_bias": blank, "own_sigma": blank,
+            "own_bias": of_own[0], "own_sigma": of_own[1],
         }  # fmt: skip
-        if self.own is not None:
-            low, high = self.own.domain
-            at = np.clip(T, low, high)
-            inside = (at == T)[:, None]
-            self._columns |= {
-                "own_bias": np.where(inside, self.own.bias(at), np.nan),
-                "own_sigma": np.where(inside, self.own.sigma(at), np.nan),
-            }
         self.units = dict.fromkeys(self._columns, record.unit) | {"temperature": "degC"}
         self.labels = dict.fromkeys((name for name in self._columns if name != "temperature"), record.axes)
         self.summary = record.model_dump(mode="json") | {
@@ -102,12 +96,7 @@ class FamilyMapResult(Result):
 
 
 def fit_family_map(
-    config: Config,
-    recordings: Sequence[str],
-    family: Path,
-    lot: str,
-    out: Path | None,
-    progress: Progress | None,
+    config: Config, recordings: Sequence[str], family: Path, lot: str, out: Path | None, progress: Progress | None
 ) -> FamilyMapResult:
     """Return the map that a unit's own soak and its family give; with `out`, write it there.
 
@@ -141,7 +130,7 @@ def fit_family_map(
         faults.note(f"no map of its own: {error}")
     information, _ = soaked_of("", tuple(tracked.axes), soak.rows(tracked.channel), law.knots.step)
     posterior = unit_posterior(law, information, lot)
-    result = FamilyMapResult(config, recordings, (family, law), posterior, own, faults)
+    result = FamilyMapResult(config, recordings, family.name, posterior, own, faults)
     if out is not None:
         result.save(out)
     return result

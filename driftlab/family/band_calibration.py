@@ -15,18 +15,19 @@ share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, FamilyUnits, Posterior
+from driftlab.family.mixed_model import Family, Posterior, fit_family
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
-from driftlab.family.unit_noise import common_walk, densities_of
+from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
 
 PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.4, 0.7) for at in (0.0, 0.5, 1.0))
@@ -40,7 +41,7 @@ SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
 GRID = 2  # temperatures an interval
 ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk, that passes ask for
 GAINED = 0.05  # of a variance, that the whole soak must have taken away
-SAMPLE = 400  # units of a larger family that the folds are of
+SAMPLE = 400  # units of a larger family that the bands are to be measured on
 
 Pairs = Sequence[tuple[UnitInformation, str]]
 
@@ -50,28 +51,26 @@ def sample_of(count: int) -> set[int]:
     return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
 
 
-def measure_bands(every: FamilyUnits, fit: Callable[[Pairs], Family], each: ParallelMap = serial) -> Bands | None:
+def measure_bands(family: Family, units: Pairs, each: ParallelMap = serial) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
     A part in which no unit has samples is left out: the nearest other part is taken for it.
 
     Parameters
     ----------
-    every : FamilyUnits
-        The family's; SAMPLE of them are taken where there are more.
-    fit : function of a list of pairs of UnitInformation and lot
-        Returns the family of these units, of which it is not given the rows.
+    family : Family
+    units : sequence of (UnitInformation, str)
+        Its units and their lots, or a sample of them.
     each : ParallelMap, optional
         Goes through the folds.
     """
-    sample = sample_of(len(every))
-    units = [pair for k, pair in enumerate(every) if k in sample]
-    whole = _domain(units)
-    long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
+    first, last = np.array([soaked.knots.domain for soaked, _ in units]).T
+    whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
+    long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
-    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
-    folds = list(each(partial(_measured, fit, whole), _folds(units, long), at_once=1))
+    long = long[np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
+    folds = list(each(partial(_measured, family, whole), _folds(units, long), at_once=1))
     parts, factors, far = [], [], []
     for k, part in enumerate(PARTS):
         if measured := [pair for fold in folds for pair in fold[k]]:
@@ -82,47 +81,32 @@ def measure_bands(every: FamilyUnits, fit: Callable[[Pairs], Family], each: Para
     return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
-def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
+def _folds(units: Pairs, long: NDArray[np.intp]) -> Iterator[tuple[Pairs, Pairs]]:
     """Yield the units that are left in each fold, without their rows, and those of `long` that are left out."""
     bare = [(replace(soaked, recordings=()), lot) for soaked, lot in units]
     for fold in range(FOLDS):
-        out = set(long[fold::FOLDS])
+        out = set(long[fold::FOLDS].tolist())
         yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
 
 
-def _measured(
-    fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]
-) -> list[list[tuple[Array, Array]]]:
+def _measured(of_all: Family, whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[list[tuple[Array, Array]]]:
     """Return, of each part, z and g of the units that were left out of their family in a fold, and their distances."""
-    family, measured = fit(fold[0]), [list[tuple[Array, Array]]() for _ in PARTS]
+    family, measured = fit_family(fold[0], start=of_all), [list[tuple[Array, Array]]() for _ in PARTS]
+    marginal = {lot: family.marginal(lot) for _, lot in fold[1]}
     for soaked, lot in fold[1]:
-        more = family.posterior(soaked, lot)
+        before = marginal[lot]
+        more = before.informed(*family.information_of(soaked))
+        (low, high), (first, last) = soaked.knots.domain, family.knots.domain
+        T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
+        B = family.knots.values(T)
         for part, pairs in zip(PARTS, measured, strict=True):
             low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
             short = soaked.between(low, high)
             if short is not None:
-                T, scores = _scores(family, soaked, family.posterior(short, lot), more)
-                pairs.append((scores[(low > T) | (high < T)], distance(family, short, lot)))
+                J, h = family.information_of(short)
+                beyond = B[(low > T) | (high < T)]
+                pairs.append((_scores(beyond, before.informed(J, h), more), before.distance(J, h)))
     return measured
-
-
-def distance(family: Family, soaked: UnitInformation, lot: str) -> Array:
-    """Return the distance (d,) of a unit from its family by its own soak, noise included.
-
-    The mean square of the coefficients in the directions on which the soak has more information than the family; 1 is
-    expected of a Gaussian family.
-    """
-    before, (J, h) = family.marginal(lot), family.information_of(soaked)
-    distances = np.ones(len(family.axes))
-    for axis, C in enumerate(before.covariance):
-        values, vectors = np.linalg.eigh(C)
-        L = vectors * np.sqrt(np.maximum(values, 0.0))
-        gain, U = np.linalg.eigh(L.T @ J[axis] @ L)
-        a = U.T @ L.T @ (h[axis] - J[axis] @ before.c[axis])
-        seen = gain > 1.0
-        if np.any(seen):
-            distances[axis] = np.mean(a[seen] ** 2 / (gain[seen] + gain[seen] ** 2))
-    return distances
 
 
 def _typical(units: Sequence[UnitInformation]) -> Typical:
@@ -137,39 +121,25 @@ def _typical(units: Sequence[UnitInformation]) -> Typical:
     with_rows = [soaked for soaked in units if soaked.recordings]
     if with_rows:
         some = [with_rows[k] for k in np.unique(np.linspace(0, len(with_rows) - 1, ALIKE).astype(int))]
-        alike = np.exp(middle["white"]) * common_walk([soaked.recordings for soaked in some], some[0].knots.step)
-        likely = np.median([densities_of(soaked.recordings, soaked.knots.step).likely for soaked in some], axis=0)
-        more = np.exp(middle["walk"]) / np.maximum(likely, tiny)
-        middle["walk"] = np.log(np.maximum(alike * np.where(more > PASSES, more, 1.0), tiny))
+        alike, likely = common_walk([soaked.recordings for soaked in some], some[0].knots.step)
+        more = np.exp(middle["walk"]) / np.maximum(np.median(likely, axis=0), tiny)
+        walk = np.exp(middle["white"]) * alike * np.where(more > PASSES, more, 1.0)
+        middle["walk"] = np.log(np.maximum(walk, tiny))
     return Typical(
         white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
         white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
     )  # fmt: skip
 
 
-def _domain(units: Pairs) -> tuple[float, float]:
-    """Return the range of most units: one that saw more is not to make all others short."""
-    ends = np.array([soaked.knots.domain for soaked, _ in units])
-    return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
-
-
-def _share(soaked: UnitInformation, whole: tuple[float, float]) -> float:
-    low, high = soaked.knots.domain
-    return (high - low) / (whole[1] - whole[0])
-
-
-def _scores(family: Family, soaked: UnitInformation, less: Posterior, more: Posterior) -> tuple[Array, Array]:
-    """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of a part of its soak.
+def _scores(B: Array, less: Posterior, more: Posterior) -> Array:
+    """Return z and g (N, d, 2) of a part of a soak, at temperatures with the splines B (N, q).
 
     z is not a number where the part knew nearly as much as the whole.
     """
-    (low, high), (first, last) = soaked.knots.domain, family.knots.domain
-    at = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
-    B = family.knots.values(at)
     own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
     gained = np.maximum(own - after, 0.0)
     known = np.where(gained > GAINED * own, gained, np.nan)
-    return at, np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
+    return np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:

@@ -16,12 +16,14 @@ LEVELS = (0.68, 0.95, 0.997)
 class Band:
     """Factors (3, d) of a posterior's deviation outside of low to high degC, one a level.
 
-    Between them, and of what was never measured, 1.
+    Between them, and of what was never measured, 1. `far` (d,) is the distance that one unit in a hundred exceeds, None
+    where it was not measured.
     """
 
     low: float
     high: float
     factors: Array
+    far: Array | None = None
 
     def factor(self, T: Array, step: float) -> Array:
         """Return the factor (N, d) at T (N,) with which 95 of 100 are within 1.96 sigma; it goes over within a step."""
@@ -73,29 +75,13 @@ class Bands(BaseModel):
 
     def band(self, domain: tuple[float, float], seen: tuple[float, float]) -> Band:
         """Return the band of a unit by the part that is most like the range it saw of the family's domain, degC."""
-        return Band(seen[0], seen[1], np.array(self.factors[self._nearest(domain, seen)]))
-
-    def far_of(self, domain: tuple[float, float], seen: tuple[float, float]) -> Array:
-        """Return the distance (d,) that one unit in a hundred exceeds, by the part most like the range seen, degC."""
-        return np.array(self.far[self._nearest(domain, seen)])
-
-    def _nearest(self, domain: tuple[float, float], seen: tuple[float, float]) -> int:
         low, high = domain
-        share = [(end - low) / (high - low) for end in seen]
-        return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
-
-
-def gaussian(seen: tuple[float, float], d: int) -> Band:
-    """Return the band of a family that nothing is measured on, where a unit saw from low to high degC: factors of 1."""
-    return Band(*seen, np.ones((len(LEVELS), d)))
+        share = (np.array(seen) - low) / (high - low)
+        k = int(np.argmin(np.sum(np.abs(share - np.array(self.parts)), axis=1)))
+        return Band(*seen, np.array(self.factors[k]), np.array(self.far[k]))
 
 
 def deviation(B: Array, covariance: Array) -> Array:
     """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
-    variance = np.einsum("nq,dqp,np->nd", B, covariance, B, optimize=True)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def variance_of_curve(B: Array, covariance: Array) -> Array:
-    """Return the variance (N,) of a curve B (N, q) c on one axis, c of the covariance (q, q)."""
-    return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))
+    variance = np.sum((B @ covariance) * B, axis=2)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0))).T

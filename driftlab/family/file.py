@@ -38,29 +38,6 @@ def save_family(
         ) from None
 
 
-def read_family(path: Path) -> Family:
-    """Return the family of a file.
-
-    Raises
-    ------
-    MapError
-        If it cannot be read, or is damaged.
-    """
-    try:
-        text = read_whole(path).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise MapError(f"family {path} cannot be read ({why}); name the family.json of a fleet") from None
-    try:
-        return Family.model_validate(parse_json(text), context=FROM_FILE)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        damage = f": {quote('.'.join(map(str, first['loc']))) or 'file'}: {quote(first['msg'])}"
-    except (ValueError, RecursionError) as error:
-        damage = f" ({quote(error, 120)})"
-    raise MapError(f"family {path} is damaged or no family's file{damage}; fit the family again with driftlab fleet")
-
-
 def load_family(
     path: Path, *, channel: str | None = None, bias_unit: str | None = None, axes: tuple[str, ...] | None = None
 ) -> Family:
@@ -71,7 +48,23 @@ def load_family(
     MapError
         If it cannot be read, is damaged, or is of another sensor.
     """
-    family = read_family(path)
+    try:
+        text = read_whole(path).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise MapError(f"family {path} cannot be read ({why}); name the family.json of a fleet") from None
+    damage = ""
+    try:
+        family = Family.model_validate(parse_json(text), context=FROM_FILE)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        damage = f": {quote('.'.join(map(str, first['loc']))) or 'file'}: {quote(first['msg'])}"
+    except (ValueError, RecursionError) as error:
+        damage = f" ({quote(error, 120)})"
+    if damage:
+        raise MapError(
+            f"family {path} is damaged or no family's file{damage}; fit the family again with driftlab fleet"
+        )
     for what, has, wanted in (
         ("channel", family.channel, channel), ("unit", family.bias_unit, bias_unit),
         ("axes", " ".join(family.axes), None if axes is None else " ".join(axes)),

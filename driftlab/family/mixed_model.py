@@ -7,8 +7,9 @@ information on the rest: its posterior there is that of a unit like it. d axes, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
@@ -28,7 +29,15 @@ from driftlab.family.bands import Bands
 from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
-from driftlab.family.reml import Index, Means, RemlFit, VarianceComponents, fit_axis, means_of, outlier_weights
+from driftlab.family.reml import (
+    Means,
+    RemlFit,
+    VarianceComponents,
+    fit_axis,
+    means_of,
+    outlier_weights,
+    root_of,
+)
 from driftlab.family.tail_law import TailLaws
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
@@ -47,8 +56,9 @@ MIN_SHARE = 0.02  # of all units, likewise
 
 
 def fit_family(
-    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, each: ParallelMap = serial
-) -> Family:
+    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0,
+    each: ParallelMap = serial, start: Family | None = None,
+) -> Family:  # fmt: skip
     """Return the family of units.
 
     Parameters
@@ -60,6 +70,8 @@ def fit_family(
         Of the sample of SAMPLE units that Sigma is of, where there are more.
     each : ParallelMap, optional
         Goes through the axes.
+    start : Family, optional
+        One of nearly these units: its domain is taken, and EM begins with its law.
 
     Raises
     ------
@@ -68,13 +80,16 @@ def fit_family(
         was seen by MIN_UNITS of them.
     """
     knots, axes, lots = _survey(units)
+    knots = knots if start is None else start.knots
     n, d, numbers = len(lots), len(axes), numbered(lots)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
     present, lot = np.unique([numbers[lots[k]] for k in chosen], return_inverse=True)
     J, h, names = _sample(units, knots, set(chosen.tolist()))
-    fits = list(each(_fit, ((J[:, axis], h[:, axis], lot, knots.peaks) for axis in range(d)), at_once=1))
+    laws = [None] * d if start is None else list(map(VarianceComponents, start.Sigma, start.Lambda))
+    of_axes = ((J[:, axis], h[:, axis], lot, knots.peaks, laws[axis]) for axis in range(d))
+    fits = list(each(fit_axis, of_axes, at_once=1))
     w = np.stack([fit.w for fit in fits], axis=1)
     if n > SAMPLE:
         del J, h
@@ -89,10 +104,6 @@ def fit_family(
         weights={name: w[k].tolist() for k, name in enumerate(names) if np.any(w[k] < 0.5)},
         steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
     )  # fmt: skip
-
-
-def _fit(of_axis: tuple[Array, Array, Index, Array]) -> RemlFit:
-    return fit_axis(*of_axis)
 
 
 def _survey(units: FamilyUnits) -> tuple[SplineBasis, tuple[str, ...], list[str]]:
@@ -147,25 +158,22 @@ def _means_of_all(
     units: FamilyUnits, knots: SplineBasis, fits: list[RemlFit], present: Array, lot: list[int]
 ) -> list[Means]:
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
-    d, q, G = len(fits), knots.q, max(lot) + 1
-    roots = [fit.law.root() for fit in fits]
-    centres = np.zeros((d, G, q))
-    for axis, fit in enumerate(fits):
-        centres[axis] = fit.expected.means.mu
-        centres[axis, present] += fit.expected.means.shifts
+    d, q, G, one = len(fits), knots.q, max(lot) + 1, np.eye(knots.q)
+    L, inverse, spread = (np.stack(part) for part in zip(*(fit.law.root() for fit in fits), strict=True))
+    limits, back = np.array([fit.limit for fit in fits]), L.transpose(0, 2, 1)
+    centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[:, None], G, axis=1)
+    centres[:, present] += np.stack([fit.expected.means.shifts for fit in fits])
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
     for g, (soaked, _) in zip(lot, units, strict=True):
         J, h = marginalised(soaked, knots)
-        for axis, (L, inverse, _) in enumerate(roots):
-            A, a = L.T @ J[axis] @ L, L.T @ h[axis]
-            K = np.eye(q) - np.linalg.inv(A + np.eye(q))
-            own = a - K @ a
-            z = own - K @ (inverse @ centres[axis, g])
-            w = float(outlier_weights(z @ z / np.trace(K), fits[axis].limit))
-            V = np.linalg.inv(A + w * np.eye(q)) if w < 1 else np.eye(q) - K
-            information[axis, g] += w * (np.eye(q) - w * V)
-            weighted[axis, g] += w * V @ a
-    return [means_of(information[k], weighted[k], lots).turned(L) for k, (L, _, lots) in enumerate(roots)]
+        A, a = back @ J @ L, back @ h[..., None]
+        K = one - np.linalg.inv(A + one)
+        z = (a - K @ (a + inverse @ centres[:, g, :, None]))[..., 0]
+        w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
+        V = np.linalg.inv(A + w * one)
+        information[:, g] += w * (one - w * V)
+        weighted[:, g] += (w * V @ a)[..., 0]
+    return [means_of(*own).turned(L[k]) for k, own in enumerate(zip(information, weighted, spread, strict=True))]
 
 
 def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, LotEffect]:
@@ -182,7 +190,7 @@ def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[
     }  # fmt: skip
 
 
-def _symmetric(matrices: list[Array]) -> Array:
+def _symmetric(matrices: Sequence[Array]) -> Array:
     """Return matrices (d, q, q) without what rounding made of their symmetry."""
     stacked = np.stack(matrices)
     return (stacked + stacked.transpose(0, 2, 1)) / 2
@@ -202,6 +210,36 @@ class Posterior:
 
     c: Array
     covariance: Array
+
+    @cached_property
+    def root(self) -> tuple[Array, Array]:
+        """L (d, q, q) with the covariance L L', and its inverse."""
+        return root_of(self.covariance)
+
+    def informed(self, J: Array, h: Array) -> Posterior:
+        """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
+        L, _ = self.root
+        back = L.transpose(0, 2, 1)
+        V = np.linalg.inv(np.eye(L.shape[2]) + back @ J @ L)
+        a = back @ (h[..., None] - J @ self.c[..., None])
+        return Posterior(self.c + (L @ (V @ a))[..., 0], L @ V @ back)
+
+    def distance(self, J: Array, h: Array) -> Array:
+        """Return the distance (d,) from this law of a unit whose soak has J (d, q, q) and h (d, q), noise included.
+
+        The mean square of the coefficients in the directions on which the soak has more information than the law; 1 is
+        expected of a Gaussian one.
+        """
+        part = np.flatnonzero(np.any(J, axis=(0, 1)))
+        J, h = J[:, part][:, :, part], h[:, part]
+        L, _ = root_of(self.covariance[:, part][:, :, part])
+        back = L.transpose(0, 2, 1)
+        gain, U = np.linalg.eigh(back @ J @ L)
+        a = (U.transpose(0, 2, 1) @ (back @ (h[..., None] - J @ self.c[:, part, None])))[..., 0]
+        seen = gain > 1.0
+        squares = np.where(seen, a**2 / np.where(seen, gain + gain**2, 1.0), 0.0).sum(axis=1)
+        count = seen.sum(axis=1)
+        return np.where(count > 0, squares / np.maximum(count, 1), 1.0)
 
 
 class LotEffect(BaseModel):
@@ -335,14 +373,7 @@ class Family(BaseModel):
         before = self.marginal(lot)
         if soaked is None:
             return before
-        J, h = self.information_of(soaked)
-        c, covariance = np.empty_like(before.c), np.empty_like(before.covariance)
-        for k in range(len(self.axes)):
-            L, _, _ = VarianceComponents(before.covariance[k], before.covariance[k]).root()
-            V = np.linalg.inv(np.eye(L.shape[1]) + L.T @ J[k] @ L)
-            c[k] = before.c[k] + L @ (V @ (L.T @ (h[k] - J[k] @ before.c[k])))
-            covariance[k] = L @ V @ L.T
-        return Posterior(c, covariance)
+        return before.informed(*self.information_of(soaked))
 
     def information_of(self, soaked: UnitInformation) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) of a soak on the family's knots.
@@ -366,12 +397,10 @@ def marginalised(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Ar
     J, h = soaked.on(wide)
     if wide == knots:
         return J, h
-    part = knots.within(wide)
-    outside = np.ones(wide.q, dtype=bool)
-    outside[part] = False
-    keep = np.flatnonzero(~outside)
-    beyond = np.flatnonzero(outside & np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0))
-    Jk, hk = J[:, keep][:, :, keep], h[:, keep]
+    keep, seen = knots.within(wide), np.any(np.diagonal(J, axis1=1, axis2=2) > 0, axis=0)
+    seen[keep] = False
+    beyond = np.flatnonzero(seen)
+    Jk, hk = J[:, keep, keep], h[:, keep]
     if len(beyond) == 0:
         return Jk, hk
     across, inner = J[:, keep][:, :, beyond], J[:, beyond][:, :, beyond]

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.record import UnitRecord
-from driftlab.family.reml import WEIGHT, VarianceComponents
+from driftlab.family.reml import WEIGHT
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
@@ -121,17 +121,17 @@ class CurveStatistics:
 
     def seen(self, J: Array) -> npt.NDArray[np.bool_]:
         """Return the bumps (B,) on which a soak with J (q, q) has information: not those where it has no samples."""
-        information = np.einsum("ib,ij,jb->b", self._bumps, J, self._bumps, optimize=True)
+        information = np.sum((J @ self._bumps) * self._bumps, axis=0)
         return np.asarray((information > SEEN * np.max(information)) & (information > 0))
 
     def shapes(self, lot: str) -> list[DeviationShapes]:
         """Return the shapes of a lot, of each axis."""
         if lot not in self._shapes:
-            before, self._shapes[lot] = self.family.marginal(lot), []
-            for c, P in zip(before.c, before.covariance, strict=True):
-                L, inverse, _ = VarianceComponents(P, P).root()
-                level, scale, bumps = inverse @ np.ones(len(c)), inverse @ c, inverse @ self._bumps
-                self._shapes[lot].append(DeviationShapes(c, L, level, scale, bumps))
+            before = self.family.marginal(lot)
+            self._shapes[lot] = [
+                DeviationShapes(c, L, inverse.sum(axis=1), inverse @ c, inverse @ self._bumps)
+                for c, L, inverse in zip(before.c, *before.root, strict=True)
+            ]
         return self._shapes[lot]
 
 
@@ -145,7 +145,7 @@ def _bumps(family: Family) -> tuple[Array, Array]:
 
 def _along(own: CurveDeviation, g: Array) -> Array:
     """Return t of shapes g (q, G) in the coordinates of L."""
-    return np.asarray(g.T @ own.z / np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", g, own.K, g, optimize=True), 1e-300)))
+    return np.asarray(g.T @ own.z / np.sqrt(np.maximum(np.sum((own.K @ g) * g, axis=0), 1e-300)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +159,10 @@ class Tests:
     p, values : (n, m) arrays
         NaN where there is no test; values in SI, of the statistics of curves in deviations.
     laws : TailLaws
+    of_lots : list of str
+        The units' lots.
+    lots : list of (str, int, str, float)
+        Figures of lots that are off as a whole: figure, axis, lot, and how many times that of the others it is.
     """
 
     names: list[str]
@@ -166,6 +170,8 @@ class Tests:
     p: Array
     values: Array
     laws: TailLaws
+    of_lots: list[str]
+    lots: list[tuple[str, int, str, float]]
 
 
 def tests_of(
@@ -179,34 +185,33 @@ def tests_of(
         names.append(soaked.unit)
         lots.append(lot)
         curves.append(statistics.of(soaked, lot))
-        rows.append(row_of(of.get(soaked.unit), d))
-    figures = np.array(rows).reshape(-1, len(FIGURES), 2, d)
-    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, :, 0].swapaxes(0, 1)]
+        rows.append(of[soaked.unit].table(FIGURES, d) if soaked.unit in of else np.full((2, len(FIGURES), d), np.nan))
+    figures = np.array(rows).reshape(-1, 2, len(FIGURES), d)
+    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}
-    p = []
+    p, odd_lots = [], []
     for name, own in zip(CURVES, values, strict=False):
         law = TailLaw.of(own) if laws is None else laws.curves.get(name)
         of_curves |= {} if law is None else {name: law}
         p.append(_chance(law, own, name))
     for k, name in enumerate(FIGURES):
-        usual, off = figure_law(name, figures[:, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
-        of_figures |= {} if usual is None else {name: usual}
-        p.append(_of_figure(usual, name, figures[:, k], lots, off))
+        usual, off = figure_law(name, figures[:, :, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
+        if usual is not None:
+            of_figures[name] = usual
+            odd_lots += [(name, axis, *lot) for axis in range(d) for lot in _times(name, usual, axis, off[axis])]
+        p.append(_of_figure(usual, name, figures[:, :, k], lots, off))
     tests = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
     return Tests(
         names, tests, np.concatenate(p, axis=1), np.concatenate(values, axis=1),
-        TailLaws(curves=of_curves, figures=of_figures),
+        TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots,
     )  # fmt: skip
 
 
-def row_of(record: UnitRecord | None, d: int) -> Array:
-    """Return value and sigma (figures, 2, d) of a unit."""
-    row = np.full((len(FIGURES), 2, d), np.nan)
-    for k, name in enumerate(FIGURES):
-        if record is not None and name in record.figures and len(record.figures[name].value) == d:
-            row[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
-    return row
+def _times(name: str, law: FigureLaw, axis: int, off: dict[str, float]) -> list[tuple[str, float]]:
+    """Return lots that are `off` in a figure of an axis, and how many times that of the other lots it is."""
+    usual, *shifted = (unscaled(name, law.centre[axis] + by, law.usual[axis]) for by in (0.0, *off.values()))
+    return [(lot, size / usual) for lot, size in zip(off, shifted, strict=True)]
 
 
 def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLaw | None, list[dict[str, float]]]:

@@ -20,13 +20,13 @@ number of trials. A hypothesis holds if with it the curve is an ordinary one of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.bands import variance_of_curve
+from driftlab.family.bands import deviation
 from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.outlier_tests import (
     CURVES,
@@ -35,19 +35,17 @@ from driftlab.family.outlier_tests import (
     MIN_UNITS_OF_LOT,
     CurveDeviation,
     CurveStatistics,
+    DeviationShapes,
     Tests,
-    figure_law,
-    row_of,
     tests_of,
     unscaled,
 )
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import PER, UnitRecord
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
-PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
 FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")),
     "hysteresis": ("walk", "residual", "coast"),
@@ -88,9 +86,20 @@ class Outlier:
     as_family: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class LotOutlier:
+    """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
+
+    lot: str
+    what: str
+    axis: str
+    T: float | None
+    sentence: str
+
+
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """The odd units, by their names, the least likely reason first; the laws that they were judged by, and remarks.
+    """The odd units, by their names, the least likely reason first; the laws that they were judged by, and odd lots.
 
     `remarks` say what was not judged, a sentence each.
     """
@@ -98,6 +107,7 @@ class Outliers:
     odd: dict[str, tuple[Outlier, ...]]
     laws: TailLaws | None = None
     remarks: list[str] = field(default_factory=list)
+    lots: tuple[LotOutlier, ...] = ()
 
 
 def find_outliers(
@@ -123,12 +133,14 @@ def find_outliers(
     if not tests.names:
         return Outliers({})
     reported = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
-    words = _Words(family, tests, CurveReasons(statistics, tests.laws), shown or default_unit(family.bias_unit))
+    unit = shown or default_unit(family.bias_unit)
+    words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
     odd = {
         soaked.unit: words.of(k, reported[k], *family.information_of(soaked), lot)
         for k, (soaked, lot) in enumerate(units) if np.any(reported[k])
     }  # fmt: skip
-    return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted))
+    lots = _odd_lots(family, tests, unit) if fitted else ()
+    return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted), lots)
 
 
 def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
@@ -267,92 +279,56 @@ MAD_WORTH = 0.37  # of the degrees of freedom of a variance: what one from the m
 MIN_LOTS = 3  # lots; of two none tells which is off
 
 
-@dataclass(frozen=True)
-class LotOutlier:
-    """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
-
-    lot: str
-    what: str
-    axis: str
-    T: float | None
-    sentence: str
-
-
-def find_odd_lots(
-    family: Family, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None
-) -> tuple[LotOutlier, ...]:
+def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier, ...]:
     """Return the lots whose mean curve, or whose figures, are off those of the others.
 
     By more than is as seldom as LOT_OFF deviations of the lots' spread and of the uncertainty of their means, and by
     more than MATTERS of the units' spread; of lots of at least MIN_UNITS_OF_LOT units, and not more than half of all.
-    `shown` is the unit of sentences, of a rate deg/h where it is None.
     """
-    done = [record for record in records if record.state == "done"]
-    return (
-        *_odd_curves(family, shown or default_unit(family.bias_unit)),
-        *(_odd_figures(family, done) if done else ()),
-    )
-
-
-def _odd_curves(family: Family, unit: BiasUnit) -> list[LotOutlier]:
-    odd: list[LotOutlier] = []
-    B = family.knots.values(family.knots.peaks[1:-1])
-    if len(family.lots) < MIN_LOTS:
-        return odd
-    for name, lot in family.lots.items():
+    odd, lots, peaks = [], family.lots, family.knots.peaks[1:-1]
+    B = family.knots.values(peaks)
+    spread = deviation(B, family.Sigma)
+    for name, lot in lots.items() if len(lots) >= MIN_LOTS else ():
         if not MIN_UNITS_OF_LOT <= lot.units <= family.units / 2:
             continue
-        for axis, called in enumerate(family.axes):
-            off, sure = _off(family, name, axis, B)
-            spread = np.sqrt(variance_of_curve(B, family.Sigma[axis]))
-            k = int(np.argmax(np.abs(off) / spread))
-            if abs(off[k]) > max(sure[k], MATTERS * spread[k]):
-                T = float(family.knots.peaks[1 + k])
+        off, sure = _off(family, name, B)
+        for axis, k in enumerate(np.argmax(np.abs(off) / spread, axis=0)):
+            if abs(off[k, axis]) > max(sure[k, axis], MATTERS * spread[k, axis]):
+                called, T = family.axes[axis], float(peaks[k])
                 sentence = (
-                    f"lot {name}: {called} is off the other lots by {off[k] * unit.factor:.3g} {unit.shown} at {T:.0f} "
-                    f"°C (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
-                    "one another"
+                    f"lot {name}: {called} is off the other lots by {off[k, axis] * unit.factor:.3g} {unit.shown} at "
+                    f"{T:.0f} °C (its units spread by {spread[k, axis] * unit.factor:.2g}); its {lot.units} units are "
+                    "held against one another"
                 )
                 odd.append(LotOutlier(name, SHAPE, called, T, sentence))
-    return odd
+    for name, axis, lot_name, times in tests.lots:
+        sentence = (
+            f"lot {lot_name}: {name} of {family.axes[axis]} is {times:.2g} times that of the other lots; its "
+            f"{tests.of_lots.count(lot_name)} units are held against one another"
+        )
+        odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))
+    return tuple(odd)
 
 
-def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
-    """Return the deviation of the curve of a lot from the other lots' (G,), and the limit of chance (G,).
+def _off(family: Family, name: str, B: Array) -> tuple[Array, Array]:
+    """Return the deviation of the curves of a lot from the other lots' (G, d), and the limit of chance (G, d).
 
     The spread of the lots is that of the others, robustly: one that is off must not widen what it is judged by. Its
     degrees of freedom are few where there are few lots (Satterthwaite).
     """
-    from scipy.stats import norm, t
+    from scipy.special import ndtr, stdtrit
 
-    lots = family.lots
-    others = np.array([B @ lot.shift[axis] for other, lot in lots.items() if other != name])
-    own = variance_of_curve(B, lots[name].mean_covariance[axis])
-    rest = [variance_of_curve(B, lot.mean_covariance[axis]) for other, lot in lots.items() if other != name]
-    theirs = np.median(rest, axis=0)
-    middle = np.median(others, axis=0)
+    curves = {lot: B @ one.shift.T for lot, one in family.lots.items()}
+    variances = {lot: deviation(B, one.mean_covariance) ** 2 for lot, one in family.lots.items()}
+    mine, own = curves.pop(name), variances.pop(name)
+    others, n = np.array(list(curves.values())), len(curves)
+    theirs, middle = np.median(list(variances.values()), axis=0), np.median(others, axis=0)
     wide = (1.4826 * np.median(np.abs(others - middle), axis=0)) ** 2
-    between, n = max(float(np.median(wide / theirs)) - 1, 0.0) * theirs, len(others)  # in all, not where it is least
+    between = np.maximum(np.median(wide / theirs, axis=0) - 1, 0.0) * theirs  # in all, not where it is least
     variance = between + own + (between + theirs) * np.pi / (2 * n)
-    dof = variance**2 / (between**2 / (MAD_WORTH * max(n - 1, 1)) + own**2 / max(family.units - len(lots), 1))
-    return B @ lots[name].shift[axis] - middle, t.isf(norm.sf(LOT_OFF), np.maximum(dof, 0.5)) * np.sqrt(variance)
-
-
-def _odd_figures(family: Family, records: list[UnitRecord]) -> list[LotOutlier]:
-    odd = []
-    table, lots = np.array([row_of(record, len(family.axes)) for record in records]), [r.lot for r in records]
-    for k, name in enumerate(FIGURES):
-        law, off = figure_law(name, table[:, k], lots)
-        for axis, (called, shifts) in enumerate(zip(family.axes, off if law else (), strict=False)):
-            for lot, by in shifts.items():
-                assert law is not None
-                usual, shifted = [unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by)]
-                sentence = (
-                    f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
-                    f"{lots.count(lot)} units are held against one another"
-                )
-                odd.append(LotOutlier(lot, name, called, None, sentence))
-    return odd
+    units = max(family.units - len(family.lots), 1)
+    dof = variance**2 / (between**2 / (MAD_WORTH * max(n - 1, 1)) + own**2 / units)
+    return mine - middle, -stdtrit(np.maximum(dof, 0.5), ndtr(-LOT_OFF)) * np.sqrt(variance)
 
 
 PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
@@ -384,88 +360,85 @@ class CurveReasons:
 
     def of(self, J: Array, h: Array, lot: str, axes: Sequence[int]) -> list[Reason]:
         """Return the reasons of the axes whose curves are odd, of a soak with J (d, q, q) and h (d, q)."""
-        reasons, rest = [], list(axes)
-        every = [self._hypotheses(J[axis], h[axis], lot, axis) for axis in range(len(J))]
+        reasons, rest, shapes = [], list(axes), self.statistics.shapes(lot)
+        every = [self._hypotheses(J[axis], h[axis], shapes[axis], axis) for axis in range(len(J))]
         least = [own[0 if axis in axes else -1][0] for axis, own in enumerate(every)]
         for a, b in combinations(range(len(J)), 2):
             if not {a, b} & set(rest):
                 continue
-            crossed = [self._prior(J[i], h[i], lot, k, 1.0, i) for i, k in ((a, b), (b, a))]
+            crossed = [
+                self._hypothesis(J[i], h[i], shapes[i], shapes[k].c, shapes[k].L, i) for i, k in ((a, b), (b, a))
+            ]
             cost = sum(own[0] for own in crossed) + PRICES["swap"]
-            if cost < least[a] + least[b] and all(own[1] for own in crossed):
+            if cost < least[a] + least[b] and all(own[2] for own in crossed):
                 rest = [axis for axis in rest if axis not in (a, b)]
-                reasons.append(self._where("swap", (a, b), J[a], h[a], lot))
+                reasons.append(self._where("swap", (a, b), J[a], h[a], shapes[a]))
         for axis in rest:
             ordinary = [reason for _, reason, good in every[axis] if good]
             reasons.append(ordinary[0] if ordinary else every[axis][-1][1])
         return reasons
 
-    def _hypotheses(self, J: Array, h: Array, lot: str, axis: int) -> list[tuple[float, Reason, bool]]:
+    def _hypotheses(self, J: Array, h: Array, shapes: DeviationShapes, axis: int) -> list[tuple[float, Reason, bool]]:
         """Return cost, reason, and whether it makes the curve ordinary, the likeliest first; at the end `curve`."""
-        shapes = self.statistics.shapes(lot)[axis]
-        reasons = []
-        cost, good = self._prior(J, h, lot, axis, -1.0, axis)
-        reasons.append((cost + PRICES["sign"], self._where("sign", (axis,), J, h, lot), good))
-        cost, own = _cost(J, h, shapes.c, shapes.L)
-        where = self._where("curve", (axis,), J, h, lot)
-        gain, size, left = _less(own, shapes.level[:, None])
-        spread = float(1 / np.sqrt(shapes.level @ own.K @ shapes.level))
-        reason = Reason("level", (axis,), float(size[0]), spread, where.T)
-        reasons.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
-        times = 1 + float(_less(own, np.column_stack([shapes.scale, shapes.level]))[1][0])
+        cost, _, own = _fit(J, h, shapes.c, shapes.L)
+        where, reasons = self._where("curve", (axis,), J, h, shapes), []
+
+        def add(what: str, times: float, g: Array | None, T: float = where.T) -> None:
+            priced, size, good = self._hypothesis(J, h, shapes, times * shapes.c, abs(times) * shapes.L, axis, g)
+            reason = replace(where, what=what, times=times)
+            if g is not None and what != "scale":
+                reason = Reason(what, (axis,), size, float(1 / np.sqrt(g @ own.K @ g)), T)
+            reasons.append((priced + PRICES[what], reason, good))
+
+        add("sign", -1.0, None)
+        add("level", 1.0, shapes.level)
+        times = 1 + float(_fit(J, h, shapes.c, shapes.L, np.column_stack([shapes.scale, shapes.level]))[1][0])
         if SCALES[0] < abs(times) < SCALES[1]:
-            scaled, wide = _cost(J, h, times * shapes.c, times * shapes.L)
-            gain, _, left = _less(wide, shapes.level[:, None] / times)
-            reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)
-            reasons.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
+            add("scale", times, shapes.level / times)
         seen = np.flatnonzero(self.statistics.seen(J))
         bumps = shapes.bumps[:, seen]
-        t = (bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", bumps, own.K, bumps, optimize=True)
+        t = (bumps.T @ own.z) ** 2 / np.sum((own.K @ bumps) * bumps, axis=0)
         k = int(seen[np.argmax(t)]) if len(seen) else 0
-        g = shapes.bumps[:, k]
-        gain, size, left = _less(own, g[:, None])
-        bump = Reason("bump", (axis,), float(size[0]), float(1 / np.sqrt(g @ own.K @ g)), float(self.statistics.at[k]))
-        reasons.append((cost - gain + PRICES["bump"], bump, self._ordinary(left, axis, own)))
+        add("bump", 1.0, shapes.bumps[:, k], float(self.statistics.at[k]))
         return [*sorted(reasons, key=lambda one: one[0]), (cost, where, True)]
 
-    def _prior(self, J: Array, h: Array, lot: str, axis: int, times: float, own: int) -> tuple[float, bool]:
-        """Return the cost of a curve that is so many times one of an axis, and whether it is ordinary then."""
-        mine, shapes = self.statistics.shapes(lot)[own], self.statistics.shapes(lot)[axis]
-        cost, left = _cost(J, h, times * shapes.c, shapes.L)
-        return cost, self._ordinary(left, own, _cost(J, h, mine.c, mine.L)[1])
+    def _hypothesis(
+        self, J: Array, h: Array, mine: DeviationShapes, c: Array, L: Array, axis: int, g: Array | None = None
+    ) -> tuple[float, float, bool]:
+        """Return the cost of a curve about c with L, the size of a shape g of it, and whether it is ordinary then.
 
-    def _ordinary(self, left: CurveDeviation, axis: int, before: CurveDeviation) -> bool:
-        """Return True if what is left of a curve is ordinary, or next to nothing of what it was."""
-        law, square = self.laws.curves.get("curve"), left.squared()
+        Ordinary is what is left as far from its family as its units are, or next to nothing of what it was.
+        """
+        cost, size, left = _fit(J, h, c, L, None if g is None else g[:, None])
+        law, square, before = self.laws.curves.get("curve"), left.squared(), _fit(J, h, mine.c, mine.L)[2]
         if law is None or np.isnan(square):
-            return False
-        values = np.full((1, len(law.centre)), square)
-        little = left.z @ left.z < LITTLE * (before.z @ before.z)
-        return bool(law.p(values, upper=True)[0, axis] > ORDINARY or little)
+            return cost, float(size[0]), False
+        p = law.p(np.full((1, len(law.centre)), square), upper=True)[0, axis]
+        return cost, float(size[0]), bool(p > ORDINARY or left.z @ left.z < LITTLE * (before.z @ before.z))
 
-    def _where(self, what: str, axes: tuple[int, ...], J: Array, h: Array, lot: str, times: float = 1.0) -> Reason:
+    def _where(self, what: str, axes: tuple[int, ...], J: Array, h: Array, shapes: DeviationShapes) -> Reason:
         """Return a reason with where the curve of the first of the axes is off its lot's mean most."""
-        statistics, axis = self.statistics, axes[0]
-        shapes, knots = statistics.shapes(lot)[axis], statistics.family.knots
-        B = knots.values(knots.peaks[1:-1])
-        spread = np.sqrt(variance_of_curve(B, statistics.family.Sigma[axis]))
-        off = B @ (shapes.L @ _cost(J, h, shapes.c, shapes.L)[1].z)
+        family, axis = self.statistics.family, axes[0]
+        peaks = family.knots.peaks[1:-1]
+        B = family.knots.values(peaks)
+        spread = deviation(B, family.Sigma[axis : axis + 1])[:, 0]
+        off = B @ (shapes.L @ _fit(J, h, shapes.c, shapes.L)[2].z)
         k = int(np.argmax(np.abs(off) / spread))
-        return Reason(what, axes, float(off[k]), float(spread[k]), float(knots.peaks[1 + k]), times)
+        return Reason(what, axes, float(off[k]), float(spread[k]), float(peaks[k]))
 
 
-def _less(own: CurveDeviation, g: Array) -> tuple[float, Array, CurveDeviation]:
-    """Return the gain of shapes g (q, G) of the likeliest sizes, these sizes (G,), and the deviation that is left."""
-    pull, square = g.T @ own.z, g.T @ own.K @ g
-    size = np.linalg.solve(square, pull)
-    return float(pull @ size), np.asarray(size), CurveDeviation(own.z - own.K @ g @ size, own.K, 0.0)
+def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tuple[float, Array, CurveDeviation]:
+    """Return - 2 log p of the module's text, without the price, with shapes g (q, G) of the likeliest sizes.
 
-
-def _cost(J: Array, h: Array, c: Array, L: Array) -> tuple[float, CurveDeviation]:
-    """Return - 2 log p of the module's text, without the price, and the deviation of the coefficients."""
+    Beside it these sizes (G,), and the deviation of the coefficients that is left.
+    """
     M = np.eye(L.shape[1]) + L.T @ J @ L
     V = np.linalg.inv(M)
     a = L.T @ (h - J @ c)
-    z = V @ a
+    z, K = V @ a, np.eye(len(a)) - V
     cost = float(c @ J @ c - 2 * h @ c - a @ z + np.linalg.slogdet(M)[1])
-    return cost, CurveDeviation(z, np.eye(len(z)) - V, 0.0)
+    if g is None:
+        return cost, np.zeros(1), CurveDeviation(z, K, 0.0)
+    pull = g.T @ z
+    size = np.linalg.solve(g.T @ K @ g, pull)
+    return cost - float(pull @ size), np.asarray(size), CurveDeviation(z - K @ g @ size, K, 0.0)

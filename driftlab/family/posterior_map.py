@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.band_calibration import PASSES, distance
-from driftlab.family.bands import Band, deviation, gaussian
+from driftlab.family.band_calibration import PASSES
+from driftlab.family.bands import LEVELS, Band, deviation
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import Densities, densities_of
@@ -38,20 +38,6 @@ ROUNDING = 1e-5  # of the largest deviation, or of a variance
 LOST = 0.05  # of the variance at any temperature, with the modes that are left out
 
 
-def band_of(family: Family, soaked: UnitInformation | None) -> Band:
-    """Return the bands of a unit with the range of `soaked`."""
-    domain, d = family.knots.domain, len(family.axes)
-    middle = (domain[0] + domain[1]) / 2
-    seen = (middle, middle) if soaked is None else seen_by(soaked)
-    return gaussian(seen, d) if family.bands is None else family.bands.band(domain, seen)
-
-
-def seen_by(soaked: UnitInformation) -> tuple[float, float]:
-    """Return the lowest and highest temperature of a unit's rows, degC."""
-    T = np.concatenate([rows.T for rows in soaked.recordings])
-    return float(T.min()), float(T.max())
-
-
 @dataclass(frozen=True, eq=False)
 class UnitPosterior:
     """Posterior of a unit by its own soak and its family.
@@ -60,7 +46,6 @@ class UnitPosterior:
     ----------
     family : Family
     soaked : UnitInformation
-        With a noise that is pooled with the family's.
     lot : str
     posterior : Posterior
     band : Band
@@ -80,7 +65,12 @@ class UnitPosterior:
     @cached_property
     def sigma(self) -> Array:
         """Deviation (N, d) of the posterior map."""
-        return sigma(self.family, self.posterior, self.band, self.T)
+        return self.sigma_at(self.T)
+
+    def sigma_at(self, T: Array) -> Array:
+        """Return the deviation (N, d) of the posterior map at T (N,): within 1.96 of it lie 95 of 100 units."""
+        knots = self.family.knots
+        return deviation(knots.values(T), self.posterior.covariance) * self.band.factor(T, knots.step)
 
     @cached_property
     def before(self) -> Array:
@@ -95,27 +85,60 @@ class UnitPosterior:
     @property
     def inside(self) -> NDArray[np.bool_]:
         """True where T (N,) was soaked."""
-        temperature = self.T
-        return (temperature >= self.band.low) & (temperature <= self.band.high)
+        return (self.band.low <= self.T) & (self.band.high >= self.T)
 
     @cached_property
     def far(self) -> Array | None:
         """Distance (d,) of the unit from its family over that of one unit in a hundred; None where not measured."""
-        bands = self.family.bands
-        if bands is None:
+        if self.band.far is None:
             return None
-        limit = bands.far_of(self.family.knots.domain, (self.band.low, self.band.high))
-        return np.asarray(distance(self.family, self.soaked, self.lot) / limit)
+        before = self.family.marginal(self.lot)
+        return before.distance(*self.family.information_of(self.soaked)) / self.band.far
 
     def map(self, provenance: Mapping[str, str]) -> FittedMap:
-        """Return its posterior map."""
-        return family_map(self.family, self.posterior, self.band, soaked=self.soaked, provenance=provenance)
+        """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.
+
+        `provenance` says of its making, for the record.
+        """
+        family, knots = self.family, self.family.knots
+        record = MapRecord(
+            kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
+            residual=self._residual(), samples=self.soaked.count, error=self._error(), provenance=recorded(provenance),
+        )  # fmt: skip
+        return _settings(knots.step).from_curve(self.T, knots.values(self.T) @ self.posterior.c.T, record)
+
+    def _residual(self) -> tuple[float, ...]:
+        """Return the rms (d,) of the residual of the map on the unit's own rows."""
+        values, c = self.family.knots.values, self.posterior.c
+        left = [rows.bias - values(rows.T) @ c.T for rows in self.soaked.recordings]
+        return tuple(np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)).tolist())
+
+    def _error(self) -> CurveError:
+        knots = self.family.knots
+        T = np.linspace(*knots.domain, GRID * knots.intervals + 1)
+        B, factor = knots.values(T), self.band.factor(T, knots.step)
+        per_axis = [_modes(B, C) * own for C, own in zip(self.posterior.covariance, factor.T, strict=True)]
+        modes = np.zeros((max(map(len, per_axis)), len(T), len(per_axis)))
+        for axis, own in enumerate(per_axis):
+            modes[: len(own), :, axis] = own
+        curve = B @ self.posterior.c.T
+        second = np.diff(curve, n=2, axis=0) / (T[1] - T[0]) ** 2
+        bend = np.maximum(np.sqrt(np.mean(second**2, axis=0)), 8 * np.ptp(curve, axis=0) / (T[-1] - T[0]) ** 2)
+        return CurveError(T=tuple(T.tolist()), modes=_rounded(modes), bend=tuple(bend.tolist()))
+
+
+def posterior_of(family: Family, soaked: UnitInformation, lot: str = "") -> UnitPosterior:
+    """Return the posterior of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
+    T = np.concatenate([rows.T for rows in soaked.recordings])
+    low, high, bands = float(T.min()), float(T.max()), family.bands
+    ones = np.ones((len(LEVELS), len(family.axes)))  # of a family that nothing is measured on
+    band = Band(low, high, ones) if bands is None else bands.band(family.knots.domain, (low, high))
+    return UnitPosterior(family, soaked, lot, family.posterior(soaked, lot), band)
 
 
 def unit_posterior(family: Family, soaked: UnitInformation, lot: str = "") -> UnitPosterior:
-    """Return the posterior of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
-    own = with_pooled_noise(soaked, family)
-    return UnitPosterior(family, own, lot, family.posterior(own, lot), band_of(family, own))
+    """Return the posterior of a unit, its noise pooled with the family's."""
+    return posterior_of(family, with_pooled_noise(soaked, family), lot)
 
 
 def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | None = None) -> UnitInformation:
@@ -131,7 +154,7 @@ def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | 
     own = densities_of(soaked.recordings, soaked.knots.step) if own is None else own
     white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
     walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
-    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+    return soaked.with_noise(white, walk)
 
 
 def informed_where_unknown(soaked: UnitInformation, family: Family, record: UnitRecord) -> UnitInformation:
@@ -139,16 +162,14 @@ def informed_where_unknown(soaked: UnitInformation, family: Family, record: Unit
 
     Where it does, or repeated sweeps need a larger one, it stays as it is.
     """
-    if family.bands is None or not {"noise", "walk"} <= set(record.figures):
+    if family.bands is None:
         return soaked
-    noise, walk = (record.figures[name] for name in ("noise", "walk"))
-    own = [np.array(part, dtype=float) for part in (noise.value, noise.sigma, walk.value, walk.sigma)]
-    hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
+    (white, walk), (white_sigma, walk_sigma) = own = record.table(("noise", "walk"), len(family.axes))
+    hidden = (walk <= 0) & (soaked.walk < PASSES * walk_sigma)
     if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
         return soaked
-    pooled = with_pooled_noise(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
-    walks = np.where(hidden, pooled.walk, soaked.walk)
-    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
+    pooled = with_pooled_noise(soaked, family, Densities(white, white_sigma, walk, walk_sigma, soaked.walk))
+    return soaked.with_noise(soaked.white, np.where(hidden, pooled.walk, soaked.walk))
 
 
 def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:
@@ -161,65 +182,12 @@ def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequen
     return np.asarray(np.exp(weight * np.log(own) + (1 - weight) * np.log(family)))
 
 
-def sigma(family: Family, posterior: Posterior, band: Band, T: Array) -> Array:
-    """Return the deviation (N, d) of the posterior map at T (N,): within 1.96 of it lie 95 of 100 units."""
-    return deviation(family.knots.values(T), posterior.covariance) * band.factor(T, family.knots.step)
-
-
-def family_map(
-    family: Family, posterior: Posterior, band: Band | None = None, *, soaked: UnitInformation | None = None,
-    provenance: Mapping[str, str] | None = None,
-) -> FittedMap:  # fmt: skip
-    """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.
-
-    Parameters
-    ----------
-    band : Band, optional
-        As `band_of` has it, which is used where it is left out.
-    soaked : UnitInformation, optional
-        Of the unit's own soaks: the record has the residual of the map on their rows.
-    provenance : mapping of str to str, optional
-        Of its making, for the record.
-    """
-    knots = family.knots
-    band = band_of(family, soaked) if band is None else band
-    T = np.linspace(*knots.domain, CURVE * knots.intervals + 1)
-    bias = knots.values(T) @ posterior.c.T
-    record = MapRecord(
-        kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
-        residual=None if soaked is None else _residual(family, posterior, soaked),
-        samples=0 if soaked is None else soaked.count,
-        error=_error(family, posterior, band), provenance=recorded(provenance or {}),
-    )  # fmt: skip
-    return _settings(knots.step).from_curve(T, bias, record)
-
-
 @lru_cache(maxsize=4)
 def _settings(step: float) -> ThermalMap:
     """Return the kind of map, once a process: reading units takes longer than the map."""
     settings = registry().classes(ThermalMap)[KIND].model_validate({"kind": KIND, "interval": f"{step} K"})
     assert isinstance(settings, ThermalMap)
     return settings
-
-
-def _residual(family: Family, posterior: Posterior, soaked: UnitInformation) -> tuple[float, ...]:
-    """Return the rms (d,) of the residual of the map on the unit's own rows."""
-    left = [rows.bias - family.knots.values(rows.T) @ posterior.c.T for rows in soaked.recordings]
-    return tuple(np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)).tolist())
-
-
-def _error(family: Family, posterior: Posterior, band: Band) -> CurveError:
-    knots = family.knots
-    T = np.linspace(*knots.domain, GRID * knots.intervals + 1)
-    B, factor = knots.values(T), band.factor(T, knots.step)
-    per_axis = [_modes(B, C) * own for C, own in zip(posterior.covariance, factor.T, strict=True)]
-    modes = np.zeros((max(map(len, per_axis)), len(T), len(per_axis)))
-    for axis, own in enumerate(per_axis):
-        modes[: len(own), :, axis] = own
-    curve = B @ posterior.c.T
-    second = np.diff(curve, n=2, axis=0) / (T[1] - T[0]) ** 2
-    bend = np.maximum(np.sqrt(np.mean(second**2, axis=0)), 8 * np.ptp(curve, axis=0) / (T[-1] - T[0]) ** 2)
-    return CurveError(T=tuple(T.tolist()), modes=_rounded(modes), bend=tuple(bend.tolist()))
 
 
 def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:

@@ -5,6 +5,7 @@ d axes; all values in SI, temperatures in degC.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isqrt
 from typing import Annotated, Any, Literal
 
@@ -54,6 +55,7 @@ RoundedCovariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_
 FIGURES = ("residual", "noise", "walk", "swing", "coast")
 """Figures of each axis on the charts of a line: rms of 30 s averages about the own map, densities of white noise and of
 the walk, largest less smallest bias of the map, rms of the error of 10 min without a measurement."""
+PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}  # of the unit of a figure, beside that of the bias
 
 
 class Figure(BaseModel):
@@ -154,3 +156,11 @@ class UnitRecord(BaseModel):
     driftlab: str = ""
     plugins: list[dict[str, Any]] = []
     written: dict[str, str] = {}
+
+    def table(self, names: Sequence[str], d: int) -> Array:
+        """Return values and deviations (2, figures, d) of figures by their names, NaN where they are not known."""
+        rows = np.full((2, len(names), d), np.nan)
+        for k, name in enumerate(names):
+            if name in self.figures and len(self.figures[name].value) == d:
+                rows[:, k] = np.array([self.figures[name].value, self.figures[name].sigma], dtype=np.float64)
+        return np.where(np.isfinite(rows), rows, np.nan)

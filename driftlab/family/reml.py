@@ -84,10 +84,15 @@ class VarianceComponents:
 
     def root(self) -> tuple[Array, Array, Array]:
         """Return L (q, q), its inverse, and the variances (q,) of the lots' shifts in L's coordinates."""
-        values, vectors = np.linalg.eigh(self.Sigma)
-        size = np.sqrt(np.maximum(values, 1e-14 * values[-1]))
-        L, inverse = vectors * size, (vectors / size).T
+        L, inverse = root_of(self.Sigma)
         return L, inverse, np.maximum(np.diag(inverse @ self.Lambda @ inverse.T), 0.0)
+
+
+def root_of(Sigma: Array) -> tuple[Array, Array]:
+    """Return L (..., q, q) with Sigma = L L', and its inverse."""
+    values, vectors = np.linalg.eigh(Sigma)
+    size = np.sqrt(np.maximum(values, 1e-14 * values[..., -1:]))[..., None, :]
+    return vectors * size, (vectors / size).swapaxes(-1, -2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +161,13 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
 def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) -> EStep:
     """Return the expectations of units with J (n, q, q), h (n, q), of the lots `lot` (n,), with the weights w (n,)."""
     L, _, lots = law.root()
-    G, q, one, weigh = int(lot.max()) + 1, len(L), np.eye(len(L)), w[:, None, None]
+    (n, q), G, one, weigh = h.shape, int(lot.max()) + 1, np.eye(len(L)), w[:, None, None]
     A, a = inside(J, L), h @ L
     V = np.linalg.inv(A + weigh * one)  # covariance of z
     K = one - weigh * V  # V A: what a unit follows of an error of its mean
     own = np.einsum("nij,nj->ni", V, a)
-    information, weighted = np.zeros((G, q, q)), np.zeros((G, q))
-    np.add.at(information, lot, weigh * K)
-    np.add.at(weighted, lot, w[:, None] * own)
-    means = means_of(information, weighted, lots)
+    of_lot = w * (lot == np.arange(G)[:, None])
+    means = means_of((of_lot @ K.reshape(n, q * q)).reshape(G, q, q), of_lot @ own, lots)
     centre = means.mu + means.shifts[lot]
     z = own - np.einsum("nij,nj->ni", K, centre)
     scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, V)
@@ -174,16 +177,16 @@ def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) ->
     low = w < 1  # their distance is that of a unit like any other, or none would ever be weighted up again
     K[low] = one - np.linalg.inv(A[low] + one)
     z[low] = np.einsum("nij,nj->ni", one - K[low], a[low]) - np.einsum("nij,nj->ni", K[low], centre[low])
-    spread = np.stack([np.trace(K, axis1=1, axis2=2), np.sum(K * K.transpose(0, 2, 1), axis=(1, 2))], axis=1)
+    spread = np.stack([np.trace(K, axis1=1, axis2=2), np.einsum("nij,nij->n", K, K)], axis=1)
     between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
     return EStep(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
 
 
-def m_step(expected: EStep, w: Array, prior: SmoothPrior | None, *, lots: bool) -> VarianceComponents:
-    """Return the law that maximises the expected likelihood."""
+def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> VarianceComponents:
+    """Return the law that maximises the expected likelihood, with the prior of Sigma about Psi where there is one."""
     scatter, count = expected.scatter, float(w.sum())
-    if prior is not None:
-        scatter, count = scatter + prior.scatter, count + WEIGHT
+    if Psi is not None:
+        scatter, count = scatter + WEIGHT * Psi, count + WEIGHT
     Sigma = scatter / count
     return VarianceComponents((Sigma + Sigma.T) / 2, expected.between if lots else np.zeros_like(Sigma))
 
@@ -210,23 +213,33 @@ class RemlFit:
     moved: float
 
 
-def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> RemlFit:
-    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC."""
-    q, lots = J.shape[1], int(lot.max()) > 0
-    prior = initial_prior(peaks, initial_scale(J, h))
-    law = VarianceComponents(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
-    for _ in range(SMOOTH):
-        w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
-        expected = e_step(law, J, h, lot, w)
-        prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
-        law = VarianceComponents(prior.mean, expected.between if lots else law.Lambda)
+def fit_axis(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | None]) -> RemlFit:
+    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered (n,), at `peaks` (q,) degC.
+
+    EM begins with the law `start`, the last of them, or where that is None with a smooth prior's.
+    """
+    J, h, lot, peaks, start = of_axis
+    w, lots = np.ones(len(J)), int(lot.max()) > 0
+    spread = initial_scale(J, h)
+    prior = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])  # rough: no curve goes on anywhere
+    if start is not None:
+        law = start
+        w, _ = weights(e_step(law, J, h, lot, w), w, len(w) + WEIGHT)
+    else:
+        Psi = smooth(peaks, prior)[0]
+        law = VarianceComponents(Psi, 0.1 * Psi if lots else np.zeros_like(Psi))
+        for _ in range(SMOOTH):
+            w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
+            expected = e_step(law, J, h, lot, w)
+            prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
+            law = VarianceComponents(smooth(peaks, prior)[0], expected.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MAX_STEPS + 1):
         expected, older_w = e_step(law, J, h, lot, w), w
         if not settled and steps % HYPER == 1:
             older, prior = prior, likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
-            settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
-        later = m_step(expected, w, prior, lots=lots)
+            settled = steps > 1 and bool(np.max(np.abs(older - prior)) < 0.1)
+        later = m_step(expected, w, smooth(peaks, prior)[0], lots=lots)
         law, moved = later, change(law, later)
         if HYPER <= steps <= FROZEN:
             w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
@@ -247,8 +260,8 @@ def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:
     return outlier_weights(share, limit), limit
 
 
-def outlier_weights(share: Array, limit: float) -> Array:
-    """Return weights (n,) of distances `share` (n,) under a limit."""
+def outlier_weights(share: Array, limit: float | Array) -> Array:
+    """Return weights (n,) of distances `share` (n,) under a limit, or one each (n,)."""
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 
@@ -272,58 +285,42 @@ def _nearest(expected: EStep) -> Array:
     return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothPrior:
-    """An inverse Wishart law: `mean` (q, q) is its expectation, of the logarithms `numbers` of a0, a1, s, l, r."""
-
-    mean: Array
-    numbers: Array
-
-    @property
-    def scatter(self) -> Array:
-        """Contribution to a scatter matrix (q, q)."""
-        return WEIGHT * self.mean
-
-
-def smooth(peaks: Array, numbers: Array) -> Array:
-    """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r."""
+def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
+    """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
     a0, a1, s, length, r = np.exp(numbers)
     distance = np.abs(peaks[:, None] - peaks)
     u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
     k = np.sqrt(3.0) * distance / (3 * max(peaks[1] - peaks[0], 1e-9))
-    Psi = a0**2 + a1**2 * np.outer(u, u) + s**2 * np.exp(-0.5 * (distance / length) ** 2)
-    return np.asarray(Psi + r**2 * (1 + k) * np.exp(-k) + 1e-9 * (a0**2 + a1**2 + s**2) * np.eye(len(peaks)))
+    curve, tiny = s**2 * np.exp(-0.5 * (distance / length) ** 2), 1e-9 * np.eye(len(peaks))
+    parts = [a0**2 * (1 + tiny), a1**2 * (np.outer(u, u) + tiny), curve + s**2 * tiny, r**2 * (1 + k) * np.exp(-k)]
+    by_length = curve * (distance / length) ** 2
+    return np.sum(parts, axis=0), np.stack([2 * parts[0], 2 * parts[1], 2 * parts[2], by_length, 2 * parts[3]])
 
 
-def initial_prior(peaks: Array, spread: float) -> SmoothPrior:
-    """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
-    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
-    return SmoothPrior(smooth(peaks, numbers), numbers)
-
-
-def likeliest_prior(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> SmoothPrior:
-    """Return the prior under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
+def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) -> Array:
+    """Return the numbers of Psi under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
     from scipy.optimize import Bounds, minimize
 
     scale = np.log(np.sqrt(np.trace(scatter) / (len(peaks) * count)))
     low = np.array([scale - 9] * 3 + [np.log(2 * (peaks[1] - peaks[0])), scale - 9])
     high = np.array([scale + 4] * 3 + [np.log(3 * np.ptp(peaks)), scale + 1])
-    begin: npt.NDArray[np.float64] = np.clip(start.numbers, low + 1e-6, high - 1e-6)
 
-    def cost(numbers: npt.NDArray[np.float64]) -> float:
-        return -_log_likelihood(peaks, scatter, count, numbers) / count
+    def cost(numbers: Array) -> tuple[float, Array]:
+        """Return - log p of the module's text, a draw, and its derivatives."""
+        nu, (Psi, by_numbers) = len(peaks) + 6.0, smooth(peaks, numbers)
+        own, inverse = _log_det(nu * Psi)
+        with_units, inverse_with = _log_det(nu * Psi + scatter)
+        slope = nu / 2 * ((nu + count) * inverse_with - nu * inverse)
+        value = ((nu + count) * with_units - nu * own) / 2
+        return value / count, np.tensordot(by_numbers, slope, 2) / count
 
-    best = minimize(cost, begin, method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25}).x
-    return SmoothPrior(smooth(peaks, best), best)
+    begin, bounds = np.clip(start, low + 1e-6, high - 1e-6), Bounds(low, high)
+    best: Array = minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}).x
+    return best
 
 
-def _log_likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
-    """Return log p of the module's text."""
-    nu = len(peaks) + 6.0
-    own = nu * smooth(peaks, numbers)
-    return nu / 2 * _log_det(own) - (nu + count) / 2 * _log_det(own + scatter)
-
-
-def _log_det(matrix: Array) -> float:
+def _log_det(matrix: Array) -> tuple[float, Array]:
+    """Return the logarithm of the determinant of a covariance (q, q), and its inverse."""
     scale = np.sqrt(np.diag(matrix))
-    return float(np.linalg.slogdet(matrix / np.outer(scale, scale))[1] + 2 * np.log(scale).sum())
+    root = np.linalg.inv(np.linalg.cholesky(matrix / np.outer(scale, scale))) / scale
+    return -2 * float(np.log(np.diag(root)).sum()), root.T @ root

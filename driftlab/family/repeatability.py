@@ -49,7 +49,9 @@ def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, ste
     levels = np.eye(len(recordings))[which][:, 1:]
     H = np.linalg.pinv(np.hstack([half, levels, knots.values(T)]), rcond=CUT)[:SHAPES]
     size = np.sqrt(1 / (2 * np.arange(SHAPES) + 1))[:, None]  # rms of a Legendre polynomial
-    return _figure(size * H, recordings, white, walk)
+    value = np.sqrt(np.sum((size * H @ np.concatenate([rows.bias for rows in recordings])) ** 2, axis=0))
+    sigma = np.sqrt(_covariance(size * H, recordings, white, walk))
+    return Figure(value=tuple(value.tolist()), sigma=tuple(sigma.tolist()))
 
 
 def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
@@ -87,12 +89,6 @@ def _curve(rows: SoakRows, at: Array, step: float) -> Array:
 def _way(T: Array) -> Array:
     """Return the way (R,) that the temperature last went by more than PLAY: from -1 to 1, as a play operator has it."""
     return np.asarray((T - play(np.ascontiguousarray(T), PLAY, float(T[0]))) / (PLAY / 2))
-
-
-def _figure(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Figure:
-    value = np.sqrt(np.sum((H @ np.concatenate([rows.bias for rows in recordings])) ** 2, axis=0))
-    sigma = np.sqrt(_covariance(H, recordings, white, walk))
-    return Figure(value=tuple(value.tolist()), sigma=tuple(sigma.tolist()))
 
 
 def _covariance(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Array:

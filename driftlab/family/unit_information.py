@@ -79,8 +79,9 @@ class UnitInformation:
             for axis in range(d):
                 columns = np.column_stack([B, parts[-1].bias[:, axis]])
                 X = parts[-1].whitened(columns, white[axis], walk[axis], free=k > 0, start=rows.t[0])
-                J[axis] += X[:, :q].T @ X[:, :q]
-                h[axis] += X[:, :q].T @ X[:, q]
+                N = X.T @ X
+                J[axis] += N[:q, :q]
+                h[axis] += N[:q, q]
         return cls(unit, axes, knots, J, h, len(T), white, walk, tuple(parts))
 
     def between(self, low: float, high: float) -> UnitInformation | None:
@@ -92,6 +93,10 @@ class UnitInformation:
         if sum(int(np.sum(where)) for where in used) < 2:
             return None
         return self.of(self.unit, self.axes, self.recordings, self.white, self.walk, self.knots.step, used)
+
+    def with_noise(self, white: Array, walk: Array) -> UnitInformation:
+        """Return the information of the rows with noise of other densities (d,)."""
+        return self.of(self.unit, self.axes, self.recordings, white, walk, self.knots.step)
 
     def on(self, wider: SplineBasis) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) on the knots of a wider domain; zero where the unit saw nothing."""

@@ -84,15 +84,23 @@ def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
 
-def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> Array:
-    """Return the walk (d,) over white noise that units have alike, by the product of their likelihoods, 1/sqrt(s).
+def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> tuple[Array, Array]:
+    """Return the walk (d,) over white noise that units have alike, 1/sqrt(s), and the likely walk (n, d) of each.
 
-    A soak that hardly shows a walk does not exclude one that is many times larger; many such soaks together do.
+    By the product of their likelihoods: a soak that hardly shows a walk does not exclude one that is many times larger;
+    many such soaks together do.
     """
+    from scipy.interpolate import CubicSpline
+
     likelihoods, own = zip(*(_likelihood(recordings, step) for recordings in units), strict=True)
-    shift = float(np.median(np.log(own)))
-    costs = np.sum([likelihood.over(np.exp(GRID + shift))[0] for likelihood in likelihoods], axis=0)
-    return np.asarray(np.sqrt([_mean(*_fine(cost)) * np.exp(shift) for cost in costs.T]))
+    logs = np.log(own)
+    middle = float(np.median(logs))
+    curves = [one.over(np.exp(GRID) * unit) for one, unit in zip(likelihoods, own, strict=True)]
+    places = np.clip(GRID + middle - logs[:, None], GRID[0], GRID[-1])
+    total = np.sum([CubicSpline(GRID, costs)(at) for at, (costs, _) in zip(places, curves, strict=True)], axis=0)
+    common = np.sqrt([_mean(*_fine(cost)) for cost in total.T]) * np.exp(middle / 2)
+    likely = [[_likely(*axis) for axis in zip(costs.T, scales.T, strict=True)] for costs, scales in curves]
+    return common, np.array(likely) * np.exp(logs / 2)[:, None]
 
 
 def _fine(cost: Array) -> tuple[Array, Array]:
@@ -107,6 +115,14 @@ def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
     """Return the mean of the walk's variance under the likelihood, even in the walk; `scale` is that of white noise."""
     weight = np.exp(-(cost - cost.min()) / 2 + at / 2)
     return float(np.sum(weight * scale * np.exp(at)) / np.sum(weight))
+
+
+def _likely(cost: Array, s2: Array) -> float:
+    """Return the likely walk of an axis, in the unit of the grid."""
+    from scipy.interpolate import CubicSpline
+
+    at, curve = _fine(cost)
+    return float(np.sqrt(_mean(at, curve, np.exp(CubicSpline(GRID, np.log(s2))(at)))))
 
 
 def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
@@ -132,8 +148,7 @@ def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple
     """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
     from scipy.interpolate import CubicSpline
 
-    scale, (at, curve) = CubicSpline(GRID, np.log(s2)), _fine(cost)
-    likely = np.sqrt(_mean(at, curve, np.exp(scale(at))))
+    scale, (at, curve), likely = CubicSpline(GRID, np.log(s2)), _fine(cost), _likely(cost, s2)
     k = int(np.argmin(curve))
     if nu < MIN_FREEDOM:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
@@ -148,57 +163,51 @@ def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple
 
 def walk_from_repeated_sweeps(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Array:
     """Return the walk (d,) with which the sweeps of recordings agree: at least `walk` (d,), SI/sqrt(s)."""
-    sweeps = _Sweeps(recordings, step)
-    return np.array([sweeps.agreeing(axis, *noise) for axis, noise in enumerate(zip(white, walk, strict=True))])
+    from scipy.special import chdtri
 
-
-class _Sweeps:
-    """Recordings with a curve for each sweep: columns (R, sweeps x q) of each."""
-
-    def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
-        self.recordings = recordings
-        T = np.concatenate([rows.T for rows in recordings])
-        knots = SplineBasis.over(T, step)
-        turn = TURN * float(np.ptp(T))
-        number = [sweeps_of(rows.T, turn) for rows in recordings]
-        first = np.cumsum([0, *(int(own[-1]) + 1 for own in number)])
-        which = [own + start for own, start in zip(number, first[:-1], strict=True)]
-        if first[-1] > MAX_SWEEPS:
-            which = [(directions(rows.T, turn) < 0).astype(np.int64) for rows in recordings]
-        self.count, self.q = int(max(own.max() for own in which)) + 1, knots.q
-        self.columns = []
-        for rows, own in zip(recordings, which, strict=True):
-            B, places = knots.values(rows.T), np.eye(self.count)[own]
-            self.columns.append(np.einsum("Rp,Rq->Rpq", places, B).reshape(len(B), -1))
-
-    def agreeing(self, axis: int, white: float, walk: float) -> float:
-        """Return the walk of an axis with which its sweeps agree."""
-        from scipy.special import chdtri
-
-        if self.count < 2 or not (white > 0 and walk > 0):
-            return walk
-        gain, n = self._gain(axis, white, walk)
+    curves, larger = _curves_of_sweeps(recordings, step), walk.copy()
+    for axis in np.flatnonzero((white > 0) & (walk > 0)) if curves[0].shape[1] > 1 else ():
+        gain, n = _gain(recordings, curves, axis, white[axis], walk[axis])
         if n == 0 or gain <= float(chdtri(n, CHANCE)):
-            return walk
+            continue
         low, high = 0.0, np.log(LARGEST)
         while high - low > CLOSE:
             middle = (low + high) / 2
-            gain, n = self._gain(axis, white, walk * float(np.exp(middle)))
+            gain, n = _gain(recordings, curves, axis, white[axis], walk[axis] * float(np.exp(middle)))
             low, high = (middle, high) if gain > n else (low, middle)
-        return walk * float(np.exp(high))
+        larger[axis] *= float(np.exp(high))
+    return larger
 
-    def _gain(self, axis: int, white: float, walk: float) -> tuple[float, int]:
-        """Return G, and the number of coefficients that a curve for each sweep adds."""
-        size = self.count * self.q
-        N = np.zeros((size + 1, size + 1))
-        for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
-            X = rows.whitened(np.column_stack([columns, rows.bias[:, axis]]), white, walk, free=k > 0)
-            N += X.T @ X
-        A, b = N[:size, :size], N[:size, size]
-        each, rank = _explained(A, b)
-        summed = A.reshape(self.count, self.q, self.count, self.q).sum(axis=(0, 2))
-        common, rank_of_one = _explained(summed, b.reshape(self.count, self.q).sum(axis=0))
-        return each - common, rank - rank_of_one
+
+def _curves_of_sweeps(recordings: Sequence[SoakRows], step: float) -> list[Array]:
+    """Return the splines of each recording's rows, in the place of their sweep: (R, sweeps, q)."""
+    T = np.concatenate([rows.T for rows in recordings])
+    knots, turn = SplineBasis.over(T, step), TURN * float(np.ptp(T))
+    number = [sweeps_of(rows.T, turn) for rows in recordings]
+    first = np.cumsum([0, *(int(own[-1]) + 1 for own in number)])
+    which = [own + start for own, start in zip(number, first[:-1], strict=True)]
+    if first[-1] > MAX_SWEEPS:
+        which = [(directions(rows.T, turn) < 0).astype(np.int64) for rows in recordings]
+    places = np.eye(int(max(own.max() for own in which)) + 1)
+    return [
+        places[own][:, :, None] * knots.values(rows.T)[:, None] for rows, own in zip(recordings, which, strict=True)
+    ]
+
+
+def _gain(
+    recordings: Sequence[SoakRows], curves: Sequence[Array], axis: np.intp, white: float, walk: float
+) -> tuple[float, int]:
+    """Return G of an axis, and the number of coefficients that a curve for each sweep adds."""
+    _, count, q = curves[0].shape
+    N = np.zeros((count * q + 1, count * q + 1))
+    for k, (rows, own) in enumerate(zip(recordings, curves, strict=True)):
+        columns = np.column_stack([own.reshape(len(own), -1), rows.bias[:, axis]])
+        X = rows.whitened(columns, white, walk, free=k > 0)
+        N += X.T @ X
+    A, b = N[:-1, :-1], N[:-1, -1]
+    each, rank = _explained(A, b)
+    common, rank_of_one = _explained(A.reshape(count, q, count, q).sum(axis=(0, 2)), b.reshape(count, q).sum(axis=0))
+    return each - common, rank - rank_of_one
 
 
 def _explained(A: Array, b: Array) -> tuple[float, int]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.mixed_model import Family
-from driftlab.family.posterior_map import band_of, sigma
+from driftlab.family.posterior_map import posterior_of
 from driftlab.family.unit_information import UnitInformation
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.search import RatedProfile
@@ -108,11 +108,10 @@ def expected(
     t, T = profile.samples(chamber.lag, count)
     rows = SoakRows(t, T, np.zeros((count, len(noise))), np.full(count, profile.duration / count), {})
     soaked = UnitInformation.of("", family.axes, [rows], noise, walk, family.knots.step)
-    posterior, band = family.posterior(soaked), band_of(family, soaked)
     low, high = family.knots.domain
     grid = np.linspace(max(chamber.low, low), min(chamber.high, high), 2 * family.knots.intervals + 1)
     without = np.stack([_without(family, soaked, grid, axis) for axis in range(len(noise))], axis=1)
-    spread, covered = sigma(family, posterior, band, grid), (float(T.min()), float(T.max()))
+    spread, covered = posterior_of(family, soaked).sigma_at(grid), (float(T.min()), float(T.max()))
     return RatedProfile(profile, grid, spread, spread, covered, share, place, without)
 
 

@@ -18,9 +18,10 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
-from driftlab.family.file import read_family
+from driftlab.family.bands import deviation
+from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
-from driftlab.family.outliers import LotOutlier, Outlier, find_odd_lots, find_outliers
+from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
@@ -33,7 +34,7 @@ from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-from fusion_core.errors import ConfigError, MapError
+from fusion_core.errors import ConfigError
 
 NOTHING = SharedEffects("nothing_common", (), (), 0, 0, 0)
 
@@ -106,7 +107,7 @@ def analyse(
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
         family = family.model_copy(update={"laws": outliers.laws})
-        lots, line = reconcile(find_odd_lots(family, records, shown=unit), line)
+        lots, line = reconcile(outliers.lots, line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
@@ -132,30 +133,23 @@ def _fitted(
     store: UnitStore, status: FleetStatus, progress: FleetProgress, each: ParallelMap, until_analysed: ExitStack
 ) -> tuple[Family | None, SharedEffects, UnitSpool | None, str]:
     """Return the family of units, their common effects and the units without them; or why there is none."""
-    fit = partial(fit_family, channel=status.channel, bias_unit=status.bias_unit)
     try:
         progress(Stage("effects that the units share"))
         common = find_common(store, bias_unit=status.bias_unit, each=each)
         units = until_analysed.enter_context(UnitSpool(store, common, each, sample_of(len(store))))
         progress(Stage("the family"))
-        family = fit(units, each=each)
+        family = fit_family(units, channel=status.channel, bias_unit=status.bias_unit, each=each)
     except ValueError as error:
         return None, NOTHING, None, str(error)
     progress(Stage("the family, units left out"))
-    bands = measure_bands(units.with_rows(), fit, each)
+    bands = measure_bands(family, units.with_rows(), each)
     return family.model_copy(update={"bands": bands}), common, units, ""
 
 
 def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, SharedEffects]:
-    family = read_family(path)
-    units = ("channel", family.channel, status.channel), ("unit", family.bias_unit, status.bias_unit)
-    for what, has, wanted in units:
-        if has != wanted:
-            raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
+    family = load_family(path, channel=status.channel, bias_unit=status.bias_unit)
     try:
-        for soaked, _ in store:
-            family.information_of(soaked)
-            break
+        family.information_of(next(iter(store))[0])
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
     return family, NOTHING if family.common_effects is None else SharedEffects.from_json(family.common_effects)
@@ -185,10 +179,11 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     """Return the spread of the family, in a sentence."""
     low, high = family.knots.domain
     B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
-    mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
-    whole = [float(np.hypot(a, b)) for a, b in zip(about, between, strict=True)]
+    mean, whole = (
+        np.sqrt(np.mean(deviation(B, C) ** 2, axis=0)) for C in (family.mu_covariance, family.Sigma + family.Lambda)
+    )
 
-    def listed(values: Sequence[float]) -> str:
+    def listed(values: Array) -> str:
         texts = (f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
         return f"{', '.join(texts)} {unit.shown}"
 
@@ -197,11 +192,6 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
         f"{of}, {low:g} to {high:g} °C: they spread by {listed(whole)} about a mean map that is known to "
         f"{listed(mean)} (1 sigma, rms over the range)"
     )
-
-
-def _rms(B: Array, covariance: Array) -> list[float]:
-    """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
-    return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
 
 
 class UnitSpool:

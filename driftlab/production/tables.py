@@ -25,7 +25,7 @@ from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
+from driftlab.family.posterior_map import informed_where_unknown, posterior_of
 from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effect import SharedEffect, of_effect
 from driftlab.family.shared_effects import SharedEffects
@@ -113,11 +113,11 @@ def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffect
     soaked = common.apart(soaked, lot)
     if not common.effects:
         soaked = informed_where_unknown(soaked, family, record)
-    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
+    of_unit = posterior_of(family, soaked, lot)
+    posterior = of_unit.posterior
     path = place.folder / UNITS / place.unit / FAMILY_MAP
     new = path.with_name(f".{FAMILY_MAP}{NEW}")
-    provenance = {"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}
-    family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
+    of_unit.map({"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}).save(new)
     seal(new)
     if why_not_own(path, COMMAND):
         os.rename(path, free(path))
@@ -127,7 +127,7 @@ def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffect
     columns = {
         "coefficients": posterior.c,
         "coefficients_sigma": np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
-        "family_sigma": np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
+        "family_sigma": np.sqrt(np.mean(of_unit.sigma_at(T) ** 2, axis=0)),
         "shape_distance": np.sqrt(np.array(off) / family.knots.q),
     }
     for first in common.of_units.get(place.unit, ())[:1]:

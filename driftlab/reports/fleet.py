@@ -17,11 +17,11 @@ import numpy as np
 
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import Outlier, describe
-from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.reports.charts import Chart
 from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
 from driftlab.reports.pages import embedded, write_page
-from driftlab.spc.charts import PER, ControlChart, LineReport, StepChange, Trend
+from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
 from driftlab.spc.sentences import by_how_much, place
 from driftlab.units import BiasUnit, rounded
 from fusion_core.chunk import Array

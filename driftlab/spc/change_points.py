@@ -1,47 +1,37 @@
 """Change points of a line: steps in the mean of values in the order in which they were made.
 
-Every stretch of the line is tested for a step. Stretches are those of seeded binary segmentation
-(Kovacs, Buhlmann, Li and Munk, Biometrika 110 (2023) 249): of each length so many that any two neighbouring changes
-have one that holds one of them alone. In a stretch the values count by their normal scores (van der Waerden), so what
-is found does not hang on the law of the values, and no single unit moves it; with normal values nothing is lost. Of a
-step before value k of L, weights a and scores y, the share of the squares that it takes is::
+The line is cut where a part of it is least like the rest, and each piece again, until no part is (circular binary
+segmentation: Olshen, Venkatraman, Lucito and Wigler, Biostatistics 5 (2004) 557). Parts are all that begin with the
+piece, so one step is a cut in two; of each length so many that any two neighbouring changes have one between them
+(Kovacs, Buhlmann, Li and Munk, Biometrika 110 (2023) 249); and lots, which begin and end a level of their own. In a
+piece the values count by their normal scores (van der Waerden), so what is found does not hang on the law of the
+values, and no single unit moves it; with normal values nothing is lost. Of the values i to j of L, weights a and scores
+y, the share of the squares that a level of their own takes is::
 
-    r_k = (A_k - W_k / W_L A_L)^2 / ( W_k (1 - W_k / W_L) sum y^2 )
+    r = (A_j - A_i - s A_L)^2 / ( W_L s (1 - s) sum y^2 ),    s = (W_j - W_i) / W_L
     A_k = sum_{i<k} a_i y_i,    W_k = sum_{i<k} a_i^2
 
-The likelihood ratio is L log(1 / (1 - r_k)). Of stretches of any length the surest is that whose largest r_k is least
-likely at its place: T, the deviations of a normal value that is as unlikely as r by Student's t. The price of having
-looked everywhere is in p, the probability of as large a T anywhere in n exchangeable values (`probability`).
-n values in all, L in a stretch.
+with the likelihood ratio L log(1 / (1 - r)). Its probability by chance is that of Student's t, times the number of
+places looked at (Bonferroni): at the few parts in a thousand that a chart may err this is nearly exact, and the search
+is correlated enough that it is never too low. n values in all, L in a piece, P parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 
 SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
-OF_BUMPS = 0.2  # of the false discovery rate: for parts that are unlike all the rest
-DECAY = np.sqrt(0.5)  # of the length from one layer of stretches to the next
-TAILS = (0.1, 0.01, 0.001)
-PRICES = {
-    10: (1.63, 2.61, 2.93),
-    14: (2.15, 3.01, 3.53),
-    20: (2.73, 3.48, 3.77),
-    35: (3.09, 3.67, 4.10),
-    60: (3.29, 3.90, 4.39),
-    100: (3.48, 4.07, 4.50),
-    200: (3.72, 4.28, 4.76),
-    400: (3.93, 4.46, 4.94),
-    1000: (4.18, 4.68, 5.18),
-    2500: (4.37, 4.88, 5.36),
-}  # by n, the largest T, which is passed with the probabilities TAILS (`benchmarks/change_points.py`)
+DECAY = np.sqrt(0.5)  # of the length from one layer of parts to the next
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
+
+Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -55,7 +45,7 @@ class LevelStep:
     low, high : int
         First values of the 95 % interval of `at`.
     p : float
-        Probability of such a step, or a larger one, anywhere in so many values that are all alike.
+        Probability, at most, of such a step, or a larger one, anywhere in so many values that are all alike.
     """
 
     at: int
@@ -77,58 +67,61 @@ def steps(z: Array, a: Array, alpha: float, blocks: Iterable[tuple[int, int]] = 
     blocks : iterable of (start, stop)
         Values that may have a level of their own, as those of a lot.
     """
-    n = len(z)
-    places: list[int] = []
-    rest = sorted(strongest(z, a), reverse=True)
-    while rest and probability(rest[0][0], n) <= (1 - OF_BUMPS) * alpha:
-        at = rest[0][1]
-        places.append(at)
-        rest = [one for one in rest if not one[2] < at < one[3]]
-    for start, stop in pairwise([0, *sorted(places), n]):
-        inside = [(max(i, start), min(j, stop)) for i, j in blocks]
-        places += [at for at in _bump(z, a, start, stop, OF_BUMPS * alpha, inside) if start < at < stop]
-    return _settled(z, a, sorted(set(places)), alpha)
+    places, pieces, known = set[int](), [(0, len(z))], list(blocks)
+    while pieces:
+        start, stop = pieces.pop()
+        inside = [(max(i, start) - start, min(j, stop) - start) for i, j in known]
+        if stop - start < 2 * SHORTEST:
+            continue
+        i, j, p = least_alike(z[start:stop], a[start:stop], inside)
+        if p * len(z) / (stop - start) <= alpha:
+            cuts = {start + i, start + j} - {start, stop}
+            places |= cuts
+            pieces += pairwise([start, *sorted(cuts), stop])
+    return _settled(z, a, sorted(places), alpha)
 
 
-def _bump(z: Array, a: Array, start: int, stop: int, alpha: float, blocks: list[tuple[int, int]]) -> tuple[int, ...]:
-    """Return begin and end of the part of a stretch that is least like the rest of it; nothing if that is chance.
-
-    Two steps that take each other back show less in what lies about each of them than in all of the rest. The price is
-    Bonferroni's.
-    """
-    L = stop - start
-    parts = [(i, i + size) for size, starts in stretches(L) for i in starts.tolist()]
-    parts = [(i, j) for i, j in [*parts, *((i - start, j - start) for i, j in blocks)] if SHORTEST <= j - i <= L // 2]
-    if not parts:
-        return ()
-    y = scores(z[None, start:stop])[0]
-    A, W = (np.concatenate([[0.0], np.cumsum(v)]) for v in (a[start:stop] * y, a[start:stop] ** 2))
-    i, j = np.array(parts).T
-    share = (W[j] - W[i]) / W[-1]
-    gain = (A[j] - A[i] - share * A[-1]) ** 2 / (W[-1] * share * (1 - share))
-    r = np.minimum(gain / max(float(y @ y), 1e-300), 1 - 1e-9)
+def least_alike(z: Array, a: Array, blocks: Iterable[tuple[int, int]] = ()) -> tuple[int, int, float]:
+    """Return begin and end of the part of z (L,) that is least like the rest, and the probability of that by chance."""
+    of = parts(len(z), blocks)
+    r = shares(z, a, of)
     best = int(np.argmax(r))
-    chance = 2 * len(parts) * (len(z) / L) * _tail(r[best : best + 1], L)[0]
-    return (start + parts[best][0], start + parts[best][1]) if chance <= alpha else ()
+    return int(of[best, 0]), int(of[best, 1]), len(of) * _chance(r[best], len(z))
 
 
-def probability(T: float, n: int) -> float:
-    """Return the probability of a largest T of at least T in n exchangeable values.
+def parts(L: int, blocks: Iterable[tuple[int, int]] = ()) -> Index:
+    """Return begins and ends (P, 2) of the parts of a piece of L, at least 2 SHORTEST, that are looked at."""
+    found, length = [(0, k) for k in range(SHORTEST, L - SHORTEST + 1)], float(DECAY * L)
+    while length >= SHORTEST:
+        size = int(np.ceil(length - 1e-9))
+        starts = np.unique(np.round(np.linspace(0, L - size, 2 * int(np.ceil(L / length)) - 1)).astype(int))
+        found += [(start, start + size) for start in starts.tolist()]
+        length *= DECAY
+    return np.array([(i, j) for i, j in [*found, *blocks] if SHORTEST <= j - i <= L - SHORTEST], dtype=np.intp)
 
-    Its logarithm is drawn through the quantiles of PRICES over T^2, straight between and beyond them: the true tail
-    falls faster, so what is rarer than 0.1 % has a p that is too large rather than too small.
-    """
-    sizes = np.log(np.array(list(PRICES)))
-    places = np.array(
-        [np.interp(np.log(n), sizes, np.array(column) ** 2) for column in zip(*PRICES.values(), strict=True)]
-    )
-    if n > max(PRICES):  # the quantiles of T^2 grow with the logarithm of n
-        last, before = (np.array(PRICES[size]) ** 2 for size in sorted(PRICES)[:-3:-1])
-        places = last + (last - before) * (np.log(n) - sizes[-1]) / (sizes[-1] - sizes[-2])
-    logs = np.log(TAILS)
-    piece = int(np.clip(np.searchsorted(places, T**2) - 1, 0, len(TAILS) - 2))
-    slope = (logs[piece + 1] - logs[piece]) / (places[piece + 1] - places[piece])
-    return float(np.exp(min(logs[piece] + slope * (T**2 - places[piece]), 0.0)))
+
+def shares(z: Array, a: Array, of: Index) -> Array:
+    """Return r (P,) of the parts `of` (P, 2) of values z (L,)."""
+    y, (i, j) = scores(z), of.T
+    A, W = (np.concatenate([[0.0], np.cumsum(v)]) for v in (a * y, a**2))
+    s = (W[j] - W[i]) / W[-1]
+    gain = (A[j] - A[i] - s * A[-1]) ** 2 / (W[-1] * s * (1 - s))
+    return np.asarray(np.minimum(gain / max(float(y @ y), 1e-300), 1 - 1e-9))
+
+
+def scores(z: Array) -> Array:
+    """Return the normal scores of z (L,); what is equal shares its ranks."""
+    from scipy.special import ndtri
+    from scipy.stats import rankdata
+
+    return np.asarray(ndtri((rankdata(z) - 0.5) / len(z)))
+
+
+def _chance(r: float, L: int) -> float:
+    """Return the probability of a share r of L values at one place, of a step up or down."""
+    from scipy.special import stdtr
+
+    return 2 * float(stdtr(L - 2, -np.sqrt((L - 2) * r / (1 - r))))
 
 
 def _settled(z: Array, a: Array, places: list[int], alpha: float) -> list[LevelStep]:
@@ -152,67 +145,12 @@ def _settled(z: Array, a: Array, places: list[int], alpha: float) -> list[LevelS
 
 
 def _step(z: Array, a: Array, start: int, stop: int, at: int) -> LevelStep:
-    if stop - start < 2 * SHORTEST:
+    L = stop - start
+    if L < 2 * SHORTEST:
         return LevelStep(at, at, at, 1.0)
-    r = shares(z[None, start:stop], a[None, start:stop])[0]
-    best, L = int(np.argmax(r)), stop - start
-    place = start + SHORTEST + np.flatnonzero(L * np.log((1 - r) / (1 - r[best])) <= SET)
-    p = probability(float(_unlikely(r[best : best + 1], L)[0]), len(z))
-    return LevelStep(start + SHORTEST + best, int(place[0]), int(place[-1]), p)
-
-
-def strongest(z: Array, a: Array) -> Iterator[tuple[float, int, int, int]]:
-    """Yield of each stretch its T, the place of its step, and where the stretch starts and stops."""
-    for length, starts in stretches(len(z)):
-        places = starts[:, None] + np.arange(length)
-        r = shares(z[places], a[places])
-        best = np.argmax(r, axis=1)
-        T = _unlikely(r[np.arange(len(r)), best], length)
-        for row, start in enumerate(starts):
-            yield float(T[row]), int(start + SHORTEST + best[row]), int(start), int(start) + length
-
-
-def stretches(n: int) -> Iterator[tuple[int, Array]]:
-    """Yield lengths, and where stretches of each start, half a length apart."""
-    length = float(n)
-    while length >= 2 * SHORTEST:
-        size = int(np.ceil(length - 1e-9))
-        count = max(2 * int(np.ceil(n / length)) - 1, 1)
-        yield size, np.unique(np.round(np.linspace(0, n - size, count)).astype(int))
-        length *= DECAY
-
-
-def shares(z: Array, a: Array) -> Array:
-    """Return r_k of each row of z (S, L): steps before value SHORTEST to L - SHORTEST."""
-    y = scores(z)
-    A, W = np.cumsum(a * y, axis=1), np.cumsum(a**2, axis=1)
-    part = W / W[:, -1:]
-    inner = slice(SHORTEST - 1, y.shape[1] - SHORTEST)
-    gain = ((A - part * A[:, -1:]) ** 2)[:, inner] / (W * (1 - part))[:, inner]
-    squares = np.sum(y**2, axis=1, keepdims=True)
-    return np.asarray(np.minimum(gain / np.where(squares > 0, squares, 1.0), 1 - 1e-9))
-
-
-def _unlikely(r: Array, L: int) -> Array:
-    """Return T of shares r (S,) of stretches of L."""
-    from scipy.special import ndtri
-
-    return np.asarray(-ndtri(_tail(r, L)))
-
-
-def _tail(r: Array, L: int) -> Array:
-    from scipy.special import stdtr
-
-    return np.maximum(stdtr(L - 2, -np.sqrt((L - 2) * r / (1 - r))), 1e-300)
-
-
-def scores(z: Array) -> Array:
-    """Return the normal scores of each row of z (S, L); what is equal shares its ranks."""
-    from scipy.special import ndtri
-    from scipy.stats import rankdata
-
-    rank = np.argsort(np.argsort(z, axis=1), axis=1) + 1.0
-    tied = np.any(np.diff(np.sort(z, axis=1), axis=1) == 0, axis=1)
-    if np.any(tied):
-        rank[tied] = rankdata(z[tied], axis=1)
-    return np.asarray(ndtri((rank - 0.5) / z.shape[1]))
+    places = np.arange(SHORTEST, L - SHORTEST + 1)
+    r = shares(z[start:stop], a[start:stop], np.column_stack([np.zeros_like(places), places]))
+    best = int(np.argmax(r))
+    likely = start + places[L * np.log((1 - r) / (1 - r[best])) <= SET]
+    p = min(len(parts(len(z))) * _chance(r[best], L), 1.0)
+    return LevelStep(start + int(places[best]), int(likely[0]), int(likely[-1]), p)

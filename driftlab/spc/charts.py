@@ -32,12 +32,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.family.record import PER
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
 MIN_UNITS = 10  # for a chart, or an index
 LEVEL = "level"
-PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
 
 
 @dataclass(frozen=True)
@@ -291,11 +291,16 @@ def _short_term(x: Array) -> float:
 
 def _middle(x: Array, sigma: Array) -> float:
     """Return Huber's M-estimate of the mean of x (n,) with deviations (n,)."""
-    centre = float(np.median(x))
+    return float(huber(np.ones((len(x), 1)), x, sigma, np.array([np.median(x)]))[0])
+
+
+def huber(X: Array, x: Array, sigma: Array, start: Array) -> Array:
+    """Return Huber's M-estimate of the coefficients (p,) of columns X (n, p) in x (n,) with deviations (n,)."""
+    found = start
     for _ in range(20):
-        weight = np.minimum(1.345 / np.maximum(np.abs(x - centre) / sigma, 1e-12), 1.0) / sigma**2
-        centre = float(np.sum(weight * x) / np.sum(weight))
-    return centre
+        w = np.sqrt(np.minimum(1.345 / np.maximum(np.abs(x - X @ found) / sigma, 1e-12), 1.0)) / sigma
+        found = np.asarray(np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0], dtype=np.float64)
+    return found
 
 
 def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
@@ -404,8 +409,7 @@ def indices(x: Array, limit: float, short_term: float) -> tuple[float, float, fl
 
 def share_beyond(beyond: int, n: int) -> tuple[float, float]:
     """Return the 95 % interval of a share of which `beyond` of n were seen."""
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    low = 0.0 if beyond == 0 else float(beta.ppf(0.025, beyond, n - beyond + 1))
-    high = 1.0 if beyond == n else float(beta.ppf(0.975, beyond + 1, n - beyond))
-    return low, high
+    interval = binomtest(beyond, n).proportion_ci(method="exact")
+    return float(interval.low), float(interval.high)

@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 from driftlab.config import Limits
 from driftlab.family.outliers import SHAPE, LotOutlier
-from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
     MIN_UNITS,
-    PER,
     SIGMAS,
     Capability,
     ChartScale,
@@ -38,6 +37,7 @@ from driftlab.spc.charts import (
     Trend,
     ewma,
     ewma_limit,
+    huber,
     in_control,
     indices,
     normality,
@@ -150,12 +150,8 @@ def _trend(x: Array, sigma: Array, level_steps: list[LevelStep], scale: ChartSca
     if not level_steps:
         return None
     n, u = len(x), np.linspace(-1.0, 1.0, len(x))
-    X, w = np.column_stack([np.ones(n), u]), 1 / sigma
-    line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
-    for _ in range(10):  # Huber's weights
-        off = np.abs(x - X @ line) / sigma
-        w = np.sqrt(np.minimum(1.345 / np.maximum(off, 1e-12), 1.0)) / sigma
-        line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
+    X = np.column_stack([np.ones(n), u])
+    line = huber(X, x, sigma, np.array([np.median(x), 0.0]))
     edges = [0, *(step.at for step in level_steps), n]
     steps_of = np.concatenate([np.full(j - i, np.median(x[i:j])) for i, j in pairwise(edges)])
     cost = [float(np.sum(np.minimum(((x - model) / sigma) ** 2, SIGMAS**2))) for model in (X @ line, steps_of)]
@@ -239,7 +235,7 @@ def _ordered(
         if record.state == "done":
             axes, si = axes or record.axes, si or record.bias_unit
             names.append((record.unit, record.lot, record.date))
-            rows.append(_figures(record, len(axes)))
+            rows.append(record.table(FIGURES, len(axes)))
     place, order = _places([date for _, _, date in names])
     n, d = len(rows), len(axes)
     units, lots, dates = (tuple(names[j][k] for j in place) for k in range(3))
@@ -250,17 +246,6 @@ def _ordered(
     table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
     unit = default_unit(si) if unit is None else unit
     return LineReport(units=units, lots=lots, dates=dates, order=order, axes=axes, unit=unit), table
-
-
-def _figures(record: UnitRecord, d: int) -> Array:
-    """Return values and deviations (2, figures, d) of a record."""
-    table = np.full((2, len(FIGURES), d), np.nan)
-    for k, name in enumerate(FIGURES):
-        if (figure := record.figures.get(name)) is not None:
-            for part, numbers in zip(table, (figure.value, figure.sigma), strict=True):
-                own = np.array(numbers[:d], dtype=np.float64)
-                part[k, : len(own)] = np.where(np.isfinite(own), own, np.nan)
-    return table
 
 
 def _places(dates: list[str]) -> tuple[list[int], str]:

@@ -37,7 +37,7 @@ def line(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line")
     units = [(soaked(unit), unit.lot) for unit in example.deal(60, seed=11, lots=3)]
     family = fit_family(units)
-    save_family(folder / "family.json", family.model_copy(update={"bands": measure_bands(units, fit_family)}))
+    save_family(folder / "family.json", family.model_copy(update={"bands": measure_bands(family, units)}))
     unit = example.deal(1, seed=12)[0]
     example.write(folder / "short.h5", example.soak(unit, 0.5, part=0.4))
     example.write(folder / "whole.h5", example.soak(unit, 0.5, seed=1))

@@ -10,10 +10,10 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
-from driftlab.family.file import read_family, save_family
+from driftlab.family.file import load_family, save_family
 from driftlab.family.mixed_model import fit_family
 from driftlab.family.outlier_tests import CurveStatistics
-from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_odd_lots, find_outliers, simes
+from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_outliers, simes
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.tail_law import TailLaw, standardised
@@ -127,11 +127,10 @@ def test_a_shifted_lot_is_no_odd_units() -> None:
         if unit.lot == "L4":
             unit.curve = unit.curve + 3 * SIZE
             unit.noise = unit.noise * 1.8
-    odd = found(units, 23)
-    assert sum(units[int(name)].lot == "L4" for name in odd) <= 1
-    records = [unit.record(23, ("x",)) for unit in units]
-    family = fit_family([(unit.soaked(23, ("x",)), unit.lot) for unit in units])
-    told = find_odd_lots(family, records)
+    pairs = [(unit.soaked(23, ("x",)), unit.lot) for unit in units]
+    judged = find_outliers(fit_family(pairs), pairs, [unit.record(23, ("x",)) for unit in units])
+    told = judged.lots
+    assert sum(units[int(name)].lot == "L4" for name in judged.odd) <= 1
     assert {(one.lot, one.what) for one in told} == {("L4", "shape"), ("L4", "noise")}
     assert re.search(r"lot L4: noise of x is 1\.[6-9]\d* times", " ".join(one.sentence for one in told))
 
@@ -162,7 +161,7 @@ def test_new_units_are_held_against_a_family_that_has_not_seen_them(tmp_path) ->
     laws = find_outliers(family, pairs, [unit.record(25, ("x",)) for unit in old]).laws
     file = tmp_path / "family.json"
     save_family(file, family.model_copy(update={"laws": laws}))
-    family = read_family(file)
+    family = load_family(file)
     new = [(unit.soaked(25, ("x",)), "unheard of") for unit in units[100:]]
     records = [unit.record(25, ("x",)) for unit in units[100:]]
     odd = find_outliers(family, new, records, fitted=False).odd

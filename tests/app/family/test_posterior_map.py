@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from driftlab.family import band_calibration
 from driftlab.family.band_calibration import PARTS, measure_bands
 from driftlab.family.bands import LEVELS
 from driftlab.family.file import load_family, save_family
@@ -52,7 +53,8 @@ def _unit(seed: int, begin: float = 0.0, share: float = 1.0, hours: float = 1.5,
 @lru_cache(maxsize=1)
 def _family() -> Family:
     units = [(_unit(seed), "") for seed in range(90)]
-    return fit_family(units, bias_unit="rad/s").model_copy(update={"bands": measure_bands(units, fit_family)})
+    family = fit_family(units, bias_unit="rad/s")
+    return family.model_copy(update={"bands": measure_bands(family, units)})
 
 
 @lru_cache(maxsize=2)
@@ -138,10 +140,12 @@ def test_a_level_that_is_not_known_is_in_sigma_and_cancels_in_a_coast() -> None:
     np.testing.assert_allclose(other.sigma(at, 5.0), one.sigma(at, 5.0), rtol=0.05, atol=1e-2)
 
 
-def test_bands_measure_that_a_family_is_surer_than_it_may_be() -> None:
+def test_bands_measure_that_a_family_is_surer_than_it_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     units = [(_unit(seed), "") for seed in range(60)]
-    right = measure_bands(units, fit_family)
-    narrow = measure_bands(units, lambda own: _scaled(fit_family(own), 1 / 9))
+    family = fit_family(units)
+    right = measure_bands(family, units)
+    monkeypatch.setattr(band_calibration, "fit_family", lambda own, start: _scaled(fit_family(own, start=start), 1 / 9))
+    narrow = measure_bands(family, units)
     assert right is not None
     assert narrow is not None
     part = right.parts.index((0.0, 0.4))
@@ -153,7 +157,7 @@ def test_bands_measure_that_a_family_is_surer_than_it_may_be() -> None:
 def test_a_part_in_which_no_unit_has_samples_is_left_out() -> None:
     """Units that were soaked at both ends of the range alone, with a hole of two thirds of it between."""
     units = [(_hole(_unit(seed)), "") for seed in range(12)]
-    bands = measure_bands(units, fit_family)
+    bands = measure_bands(fit_family(units), units)
     assert bands is not None
     assert (0.4, 0.6) not in {(round(a, 6), round(b, 6)) for a, b in bands.parts}
     assert len(bands.parts) == len(bands.factors) == len(bands.far) < len(PARTS)
@@ -177,8 +181,9 @@ def _scaled(family: Family, by: float) -> Family:
 
 def test_too_few_units_measure_nothing() -> None:
     units = [(_unit(seed), "") for seed in range(6)]
-    assert measure_bands(units, fit_family) is None
-    known = unit_posterior(fit_family(units), _unit(500, 0.0, 0.4))
+    family = fit_family(units)
+    assert measure_bands(family, units) is None
+    known = unit_posterior(family, _unit(500, 0.0, 0.4))
     assert np.all(known.band.factor(T, STEP) == 1)
     assert known.far is None
 

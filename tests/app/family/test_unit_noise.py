@@ -166,7 +166,8 @@ def test_two_soaks_of_one_unit_differ_as_their_information_says(law: str) -> Non
 def test_units_together_say_what_walk_they_have_where_one_alone_cannot(walk):
     """White noise of 2: a walk of 0.005 hardly shows in one soak, and what is likely of none is far more than none."""
     units = [[rows(900 + k, walk=walk)] for k in range(16)]
-    together = 2.0 * common_walk(units, STEP)[0]
-    alone = np.median([densities_of(own, STEP).likely[0] for own in units])
+    common, likely = common_walk(units, STEP)
+    np.testing.assert_allclose(likely[3], densities_of(units[3], STEP).likely)
+    together, alone = 2.0 * common[0], np.median(likely)
     assert abs(together - walk) < max(0.3 * walk, 0.003)
     assert walk or together < 0.6 * alone
