@@ -1,27 +1,10 @@
 """The errors that driftlab raises for what a user can cause; `FusionError` is the base of them all.
 
 Messages and what to do are listed in docs/reference/errors.md.
-"""
+"""  # ruff: noqa: F403, F405 - what is not of `__all__` is not of it
 
-from fusion_core.errors import (
-    BadValue,
-    ConfigError,
-    DataError,
-    EmptyRecording,
-    FusionError,
-    MapError,
-    MissingChannel,
-    NotAtRest,
-    OutsideDomain,
-    PluginError,
-    SingularFit,
-    SwingTooSmall,
-    TimeBackwards,
-    UnitConflict,
-    UnitError,
-    UnreadableFile,
-    Unwritable,
-)
+from fusion_core.errors import *
+from fusion_core.errors import FusionError
 
 __all__ = [
     "BadValue",

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from driftlab.commands.console import print_json, say, terminal
+from driftlab.commands.console import print_json, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
 from driftlab.config import Config, maps_of
 from driftlab.filtering.setup import check_channels, loaded_map, prior
@@ -83,8 +83,7 @@ def show(result: CheckResult, given: Mapping[str, Any]) -> None:
     say(result.config.as_yaml())
     for at, quantity in result.quantities.items():
         say(f"# {at}: {quantity.text} = {float(quantity):.6g} {_unit(quantity)}\n")
-    for line in result.remarks:
-        say(f"# {line}\n")
+    say_lines(result.remarks, "# ")
 
 
 def _unit(quantity: Quantity) -> str:
@@ -154,7 +153,6 @@ def _print_laws(json: bool) -> None:
             none = "none: it gives no examples" if entry.plugin is not None else "none: it is a file"
             table.add_row(entry.family, entry.kind, f"{held} of {len(results)}" if results else none)
         terminal().print(table)
-        for kind, law, error in broken:
-            say(f"{kind}: {law}: {error}\n")
+        say_lines(map(": ".join, broken))
     if broken:
         raise typer.Exit(1)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from driftlab.commands.console import load, say, terminal
+from driftlab.commands.console import load, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with, named
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config
@@ -137,15 +137,12 @@ def show(result: CompareResult, given: Mapping[str, Any]) -> None:
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
     terminal().print(comparison.verdict(comparisons))
-    for line in comparison.limit_lines(comparisons):
-        terminal().print(line, soft_wrap=True)
-    terminal().print()
+    say_lines([*comparison.limit_lines(comparisons), ""])
     _side_by_side(comparisons, coasts)
     if given["paper"]:
         _side_by_side(comparisons, of_the_paper)
         _print_convergence(comparisons)
-    for line in comparison.notes(comparisons):
-        terminal().print(f"note: {line}", soft_wrap=True)
+    say_lines(comparison.notes(comparisons), "note: ")
     if given["out"] is not None:
         say(f"written to {given['out']}/: summary.json, report.html\n")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -93,6 +93,12 @@ def say(text: str) -> None:
     """Print text for people, a line or several; a name in it that is a stranger's acts on no terminal."""
     if not session().quiet:
         sys.stdout.write(lines(text))
+
+
+def say_lines(texts: Iterable[str], before: str = "") -> None:
+    """Print texts for people, each in a line of its own with `before` at its head."""
+    for text in texts:
+        say(f"{before}{text}\n")
 
 
 def print_json(content: Any, indent: int | None = 2) -> None:

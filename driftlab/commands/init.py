@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import say
+from driftlab.commands.console import say, say_lines
 from driftlab.commands.inputs import Place
 from driftlab.starter import config_text
 from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
@@ -142,6 +142,5 @@ def content_of(result: FirstConfig, given: Mapping[str, Any]) -> Any:
 def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
     """Print the config, and what is to be filled in."""
     say(result.text)
-    for sentence in result.asked:
-        say(f"fill in: {sentence}\n")
+    say_lines(result.asked, "fill in: ")
     say(f"written to {result.path}; look at what is guessed, then: driftlab check {result.path}\n")

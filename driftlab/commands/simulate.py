@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.commands.console import say
+from driftlab.commands.console import say, say_lines
 from driftlab.commands.inputs import ConfigLike, Place, Progress, config_of
 from driftlab.commands.result import Result
 from driftlab.config import Config
@@ -175,6 +175,5 @@ def show(result: SimulateResult, given: Mapping[str, Any]) -> None:
     """Print what was written."""
     first, last = result.span
     say(f"{result.name}: {result.rows:,} rows, t = {first:g} to {last:.10g} s\n")
-    for line in result.lines():
-        say(f"note: {line}\n")
+    say_lines(result.lines(), "note: ")
     say(f"written to {result.path}: {', '.join(result.channels)}\n")

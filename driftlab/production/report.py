@@ -19,7 +19,8 @@ from driftlab.production.store import FAMILY, NEW, REPORT, TABLE, UNITS, FleetFo
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.tables import Row, posteriors, rows_of, temperatures, write_table
 from driftlab.production.units_pass import FleetStatus
-from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
+from driftlab.reports.fleet import write_fleet_report
+from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 PLACES = 9  # temperatures of the table
 
@@ -129,11 +126,11 @@ def rows(facts: FamilyMapFacts) -> list[list[str]]:
     ]
 
 
-def table(facts: FamilyMapFacts) -> Table:
-    """Return it for a terminal."""
+def table(facts: FamilyMapFacts) -> TextTable:
+    """Return sigma over the range: the family's alone, the own map's, and that of both."""
     title = f"sigma over the range, worst axis [{facts.unit.shown}]"
     heads = ("°C", "family alone", "own map", "both")
-    return TextTable(heads, rows(facts), title, texts=False).rich(whole=False)
+    return TextTable(heads, rows(facts), title, texts=False, whole=False)
 
 
 def chart(facts: FamilyMapFacts) -> Chart:

@@ -8,104 +8,22 @@ U units with a map, d axes, G temperatures; values in SI.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from driftlab.evaluation.limits import verdict_of_units, worst
-from driftlab.family.outliers import Outlier, describe
+from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.reports.charts import Chart
-from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
+from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, map_charts
 from driftlab.reports.pages import embedded, write_page
-from driftlab.spc.charts import PER, ControlChart, LineReport, StepChange, Trend
+from driftlab.spc.charts import PER, LineReport
 from driftlab.spc.sentences import by_how_much, place
 from driftlab.units import BiasUnit, rounded
-from fusion_core.chunk import Array
 
 FIRST = 20  # of them that are to be seen without opening the list
 LISTED = 200  # odd or failed units in the lists of the page; all are in its table
-
-
-@dataclass(frozen=True)
-class SharedEffectRow:
-    """An effect that the units share.
-
-    Attributes
-    ----------
-    name : str
-    sentence : str
-        What it is, how large, and how sure.
-    unit : str
-        Of the sizes by lot, as they are shown.
-    lots : tuple of (lot, units, axis, size, sigma)
-        Its mean size in each lot, in `unit`.
-    """
-
-    name: str
-    sentence: str
-    unit: str = ""
-    lots: tuple[tuple[str, int, str, float, float], ...] = ()
-
-    @property
-    def axes(self) -> list[str]:
-        """The axes of `lots`, in their order."""
-        return list(dict.fromkeys(axis for _, _, axis, _, _ in self.lots))
-
-    @property
-    def rows(self) -> list[tuple[str, int, list[str]]]:
-        """Of each lot its name, its units, and a text an axis: the size, and by how much it may be off (1 sigma)."""
-        rows: dict[str, tuple[int, dict[str, str]]] = {}
-        for lot, n, axis, size, sigma in self.lots:
-            rows.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
-        return [(lot, n, [texts.get(axis, "–") for axis in self.axes]) for lot, (n, texts) in rows.items()]
-
-
-@dataclass(frozen=True, eq=False)
-class FleetOverview:
-    """The content of the page.
-
-    Attributes
-    ----------
-    title : str
-        Of the fleet.
-    records : iterable of UnitRecord
-        In the order of the manifest; gone through once.
-    unit : BiasUnit
-        In which biases are shown.
-    line : LineReport
-    T : (G,) array
-        degC.
-    curves : (U, d, G) array
-        Maps of the units over T, single precision will do.
-    drawn : sequence of str
-        Whose they are.
-    mean : (d, G) array or None
-        The family's curve.
-    odd : mapping of str to sequence of Outlier
-        By unit.
-    effects : sequence of SharedEffectRow
-    links : mapping of str to str
-        Units' pages, relative to this one.
-    remarks : sequence of str
-        What else should be known.
-    """
-
-    title: str
-    records: Iterable[UnitRecord]
-    unit: BiasUnit
-    line: LineReport
-    T: Array
-    curves: Any
-    drawn: Sequence[str]
-    mean: Array | None = None
-    odd: Mapping[str, Sequence[Outlier]] = field(default_factory=dict)
-    effects: Sequence[SharedEffectRow] = ()
-    links: Mapping[str, str] = field(default_factory=dict)
-    remarks: Sequence[str] = ()
 
 
 def write_fleet_report(path: Path, overview: FleetOverview) -> None:
@@ -129,7 +47,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         verdict=line.sentences[0],
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=rows.numbers(),
-        maps=_maps(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
+        maps=map_charts(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
         charts=control_charts(line),
         line=line,
@@ -144,14 +62,6 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         names=embedded(list(line.units)),
         table=embedded(table),
     )
-
-
-def _maps(overview: FleetOverview, ranges: Array) -> list[Chart]:
-    if not len(overview.drawn):
-        return []
-    curves, axes = overview.curves, overview.line.axes
-    maps = MapFan(overview.T, curves, overview.drawn, axes, overview.unit, overview.mean, overview.odd)
-    return [maps.fan(ranges), *([maps.spread()] if len(overview.drawn) > 1 else [])]
 
 
 ROWS = 5000
@@ -254,28 +164,26 @@ def _row(record: UnitRecord, unit: BiasUnit, why: str, link: str) -> dict[str, A
     }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class LineChange:
-    """A step or a trend of one chart, from which unit on, and between which units it lies."""
-
-    chart: ControlChart
-    change: StepChange | Trend
-    text: str
-    where: str
-    ends: tuple[str, str]
-    p: str
-
-
-def changes(line: LineReport) -> list[LineChange]:
-    """Return the changes of a line in their order, then its trends."""
+def changes(line: LineReport) -> list[dict[str, Any]]:
+    """Return the changes of a line in their order, then its trends: each from which unit on, and between which."""
     steps = [(chart, change) for chart in line.controls for change in chart.changes]
     result = []
     for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
-        text, ends = by_how_much(line, chart, change), (line.units[change.low], line.units[change.high])
-        p = "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}"
-        result.append(LineChange(chart, change, text, place(line, change.at), ends, p))
+        result.append({
+            "chart": chart, "change": change, "text": by_how_much(line, chart, change), "where": place(line, change.at),
+            "ends": (line.units[change.low], line.units[change.high]),
+            "p": "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
+        })  # fmt: skip
     for chart in line.controls:
         if (trend := chart.trend) is not None:
             text, ends = by_how_much(line, chart, trend), (line.units[int(chart.at[0])], line.units[int(chart.at[-1])])
-            result.append(LineChange(chart, trend, f"{text}, a trend", ends[0], ends, "–"))
+            row = {
+                "chart": chart,
+                "change": trend,
+                "text": f"{text}, a trend",
+                "where": ends[0],
+                "ends": ends,
+                "p": "–",
+            }
+            result.append(row)
     return result

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from driftlab.evaluation.overview import thin
 from driftlab.reports.charts import Chart, Clock, Line, Panel, series
-
-if TYPE_CHECKING:
-    from fusion_core.chunk import Array
+from fusion_core.chunk import Array
 
 
 def chart(columns: Mapping[str, Array], labels: Mapping[str, tuple[str, ...]], units: Mapping[str, str]) -> Chart:

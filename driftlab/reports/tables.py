@@ -37,36 +37,37 @@ class TextTable:
         On a terminal; a page has a heading.
     texts : bool
         Whether the first column is one of texts, at the left; numbers are at the right.
+    rigid : bool
+        Whether that column is never folded, as
+    whole : bool
+        Whether numbers are.
+    framed : bool
+        Whether columns are divided by lines.
+    width : int, optional
+        Of the first column at least, which is then folded last.
     """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     title: str = ""
     texts: bool = True
+    rigid: bool = False
+    whole: bool = True
+    framed: bool = True
+    width: int | None = None
 
-    def rich(self, *, whole: bool = True, framed: bool = True, width: int | None = None) -> Table:
-        """Return the table for a terminal.
-
-        Parameters
-        ----------
-        whole : bool
-            Whether numbers are never folded.
-        framed : bool
-            Whether columns are divided by lines.
-        width : int, optional
-            Of the first column at least, which is then folded last.
-        """
+    def __rich__(self) -> Table:
+        """Return the table for a terminal."""
         from rich import box
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(title=self.title, title_justify="left", box=box.HEAVY_HEAD if framed else box.SIMPLE_HEAD)
+        table = Table(title=self.title, title_justify="left", box=box.HEAVY_HEAD if self.framed else box.SIMPLE_HEAD)
         for k, head in enumerate(self.heads):
             first = k == 0 and self.texts
-            least = width if first else None
-            table.add_column(
-                Text(head), justify="left" if first else "right", no_wrap=whole and not first, min_width=least
-            )
+            least = self.width if first else None
+            whole = self.rigid if first else self.whole
+            table.add_column(Text(head), justify="left" if first else "right", no_wrap=whole, min_width=least)
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table
