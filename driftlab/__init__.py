@@ -11,7 +11,8 @@ in `driftlab.errors`.
 The application is the only place where angular rate omega, specific force f and temperature T have a meaning
 together. Conventions: SI, temperatures in degC; body axes x, y, z as in the recording, right-handed where a heading
 is used; the local level frame is east, north, up.
-"""  # ruff: noqa: F403, F405 - the names are those of `__all__`
+"""
+# ruff: noqa: F403, F405
 
 from __future__ import annotations
 

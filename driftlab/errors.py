@@ -1,7 +1,8 @@
 """The errors that driftlab raises for what a user can cause; `FusionError` is the base of them all.
 
 Messages and what to do are listed in docs/reference/errors.md.
-"""  # ruff: noqa: F403, F405 - what is not of `__all__` is not of it
+"""
+# ruff: noqa: F403, F405
 
 from fusion_core.errors import *
 from fusion_core.errors import FusionError

@@ -12,7 +12,7 @@ from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config
-from driftlab.evaluation.limits import LimitResult, check_limits, verdict
+from driftlab.evaluation.limits import check_limits, verdict
 from driftlab.evaluation.measurements import of_allan
 from driftlab.noise.recording import Analysis, analyse
 from driftlab.reports.allan import config_lines, document, page_of, table, units_of, used, whole_chart
@@ -35,7 +35,10 @@ class AllanResult(Result):
 
     def __init__(self, config: Config, analysis: Analysis) -> None:
         self.config, self.found, self.name, self._read = config, analysis, analysis.name, config.files()
-        self.judged = _limit_results(config, analysis)
+        channel = config.filter.tracked.channel if config.filter else "gyro"
+        items = analysis.coefficients.get(channel)
+        measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
+        self.judged = check_limits(config.limits, measured)
         self.limits_verdict = self.verdict = verdict(self.judged)
         limits = [row.as_json(tracked_unit(config.filter)) for row in self.judged]
         self.summary = {**document(analysis, curves=False), "serial": config.serial, "limits": limits}
@@ -105,14 +108,6 @@ def allan(
         return AllanResult(understood, analysis)
 
     return in_folder(out, "allan", understood.files(), analysed)
-
-
-def _limit_results(config: Config, analysis: Analysis) -> list[LimitResult]:
-    """Hold noise and bias instability of the tracked sensor against the limits of the config."""
-    channel = config.filter.tracked.channel if config.filter else "gyro"
-    items = analysis.coefficients.get(channel)
-    measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
-    return check_limits(config.limits, measured)
 
 
 def content_of(result: AllanResult, given: Mapping[str, Any]) -> Any:

@@ -53,19 +53,15 @@ class Session:
     begun: float = field(default_factory=time.monotonic)
 
     def lines(self) -> list[str]:
-        """Return the report of `-v`."""
+        """Return the report of `-v`: how long each stage took, and the plugins that the configs name."""
+        from fusion_core.host.provenance import participants
+
         took = [*self.stages, ("in all", time.monotonic() - self.begun)]
         width = max(len(what) for what, _ in took)
         lines = [f"{what:<{width}}  {seconds:8.2f} s" for what, seconds in took]
-        return lines + [f"plugin: {plugin}" for plugin in self._plugins()]
-
-    def _plugins(self) -> list[str]:
-        """Return family, kind and distribution of every plugin that the configs name."""
-        from fusion_core.host.provenance import participants
-
-        values = [item for config in self.configs for item in participants(config)]
-        lines = (f"{p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in values)
-        return list(dict.fromkeys(lines))
+        named = [item for config in self.configs for item in participants(config)]
+        plugins = (f"plugin: {p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in named)
+        return lines + list(dict.fromkeys(plugins))
 
 
 CURRENT: ContextVar[Session] = ContextVar("session")

@@ -196,8 +196,9 @@ def fit_map(
     _check_family(known, lot, bool(kind or neurons or compare or report))
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
-    if compare:
-        _check_comparison(kind, neurons)
+    for option, value in (("--kind", kind), ("--select", neurons)):
+        if compare and value is not None:
+            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
     if place is not None:
         read = [*understood.files_to_fit(), *paths_of(recordings)]
         _check(place, folder, read, selected=neurons is not None)
@@ -233,13 +234,6 @@ def _fitted(
     fitted = fit_gathered(config, settings, soak, more)
     verdict = judge(fitted, settings, soak.brief(), axes_of(fitted), soak.placements, soak.used)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
-
-
-def _check_comparison(kind: str | None, neurons: range | None) -> None:
-    """Raise ConfigError where one kind, or the size of one, is asked for beside a comparison of all."""
-    for option, value in (("--kind", kind), ("--select", neurons)):
-        if value is not None:
-            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
 
 
 def _compared(config: Config, soak: GatheredSoak, progress: Progress | None) -> tuple[ThermalMap, KindComparison, str]:

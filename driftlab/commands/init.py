@@ -67,18 +67,14 @@ def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | No
         if field not in FIELDS:
             raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
         Channel(path="?", unit=unit).check(field)
-    starter = _starter(path, os.path.relpath(path, Path() if place is None else place.parent), known)
+    with of_all(path, "finding out what it holds"):
+        starter = _guess(path, os.path.relpath(path, Path() if place is None else place.parent), known)
     if place is not None:
         try:
             write_whole(place, starter.text.encode())
         except OSError as error:
             raise Unwritable(f"--out {place}: cannot be written ({error.strerror}); name another place") from None
     return FirstConfig(starter.text, starter.asked, place)
-
-
-def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    with of_all(file, "finding out what it holds"):
-        return _guess(file, path, units)
 
 
 def _guess(file: Path, path: str, units: Mapping[str, str]) -> Starter:

@@ -124,10 +124,13 @@ class Result(Mapping[str, NDArray[Any]]):
         return pl.DataFrame({name: np.ascontiguousarray(values) for name, values in columns.items()})
 
     def _repr_html_(self) -> str:
+        drawing = io.BytesIO()
+        self.plot().savefig(drawing, format="png", dpi=80)
+        picture = f'<img src="data:image/png;base64,{base64.b64encode(drawing.getvalue()).decode()}"/>'
         notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
         arrays = "".join(f"<li>{html.escape(line)}</li>" for line in self._arrays())
         return (
-            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{_picture(self.plot())}"
+            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{picture}"
             f"<details><summary>{len(self)} arrays</summary><ul>{arrays}</ul></details>"
         )
 
@@ -157,10 +160,3 @@ def in_folder(out: str | PathLike[str] | None, command: str, read: Collection[Pa
         result = make()
         result._write(folder)
     return result
-
-
-def _picture(figure: Figure) -> str:
-    """Return a figure as an element of a page."""
-    drawing = io.BytesIO()
-    figure.savefig(drawing, format="png", dpi=80)
-    return f'<img src="data:image/png;base64,{base64.b64encode(drawing.getvalue()).decode()}"/>'

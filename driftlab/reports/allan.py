@@ -248,24 +248,22 @@ class DeviationUnits:
         return dict(reversed(self.human))[key]
 
 
-def _units(deviation: str, si: str, terms_si: tuple[str, ...], human: tuple[str, ...]) -> DeviationUnits:
-    """Return the units of a sensor whose white noise people know in two; `terms_si` are in the order of KEYS."""
-    quantisation, *others = KEYS
-    keys = (quantisation, others[0], *others)
-    return DeviationUnits(deviation, si, dict(zip(KEYS, terms_si, strict=True)), list(zip(keys, human, strict=True)))
+PER = ("/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient but the quantisation, after the unit of the sensor
+
+
+def _units(shown: str, si: str, quantisation: tuple[str, str], white: tuple[str, ...] = ()) -> DeviationUnits:
+    """Return the units of a sensor: that of the quantisation is given for people and in SI, `white` beside the usual."""
+    first, *others = KEYS
+    known = [(key, shown + per) for key, per in zip(others, PER, strict=True)]
+    human = [(first, quantisation[0]), known[0], *((others[0], unit) for unit in white), *known[1:]]
+    in_si = {first: quantisation[1]} | {key: si + per for key, per in zip(others, PER, strict=True)}
+    return DeviationUnits(shown, si, in_si, human)
 
 
 UNITS = {
-    "gyro": _units(
-        "deg/h", "rad/s", ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"),
-        ("arcsec", "deg/h/sqrt(Hz)", "deg/sqrt(h)", "deg/h", "deg/h/sqrt(s)", "deg/h/s"),
-    ),
-    "accel": _units(
-        "ug", "m/s^2", ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"),
-        ("mm/s", "ug/sqrt(Hz)", "m/s/sqrt(h)", "ug", "ug/sqrt(s)", "ug/s"),
-    ),
-}  # fmt: skip
-PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
+    "gyro": _units("deg/h", "rad/s", ("arcsec", "rad"), ("deg/sqrt(h)",)),
+    "accel": _units("ug", "m/s^2", ("mm/s", "m/s"), ("m/s/sqrt(h)",)),
+}
 
 
 def units_of(analysis: Analysis, channel: str) -> DeviationUnits:
@@ -274,10 +272,5 @@ def units_of(analysis: Analysis, channel: str) -> DeviationUnits:
     if known is not None and (sensor is None or sensor.unit == known.deviation_si):
         return known
     assert sensor is not None, "what is no triad is a sensor of the config"
-    si = {
-        key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
-        for key, per in zip(KEYS, PER, strict=True)
-    }
-    return DeviationUnits(
-        sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)]
-    )
+    integral = "s" if sensor.unit == "1" else f"{sensor.unit}*s"
+    return _units(sensor.shown, sensor.unit, (f"{sensor.shown}*s", integral))

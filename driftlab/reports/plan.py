@@ -248,19 +248,19 @@ def _size(value: float, unit: BiasUnit) -> str:
 
 
 def _profiles(plan: SearchResult) -> TextTable:
-    shown, low, high = plan.subject.unit.shown, plan.chamber.low, plan.chamber.high
-    heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]", "covers\n[°C]"]
+    unit, low, high = plan.subject.unit, plan.chamber.low, plan.chamber.high
+
+    def row(rated: RatedProfile) -> list[str]:
+        value, at, _ = rated.worst
+        sizes = [number(v * unit.factor, zeros=True) for v in (rated.score, value)]
+        covered = f"{rated.covered[0]:.1f} to {rated.covered[1]:.1f}"
+        short = "" if rated.share >= MIN_COVERAGE else " (!)"
+        chosen = " (chosen)" if rated is plan.chosen else ""
+        return [rated.profile.name + chosen, *sizes, f"{at:.1f}", covered + short]
+
+    heads = ["profile", f"rms\n[{unit.shown}]", f"largest\n[{unit.shown}]", "at\n[°C]", "covers\n[°C]"]
     title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({plan.hours:g} h each)"
-    return TextTable(heads, [_row(plan, profile) for profile in plan.judged], title)
-
-
-def _row(plan: SearchResult, rated: RatedProfile) -> list[str]:
-    value, at, _ = rated.worst
-    sizes = [number(v * plan.subject.unit.factor, zeros=True) for v in (rated.score, value)]
-    short = "" if rated.share >= MIN_COVERAGE else " (!)"
-    low, high = rated.covered
-    name = rated.profile.name + (" (chosen)" if rated is plan.chosen else "")
-    return [name, *sizes, f"{at:.1f}", f"{low:.1f} to {high:.1f}{short}"]
+    return TextTable(heads, list(map(row, plan.judged)), title)
 
 
 def _sigma_chart(plan: SearchResult) -> Chart:
