@@ -252,7 +252,7 @@ PER = ("/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient but the quantisati
 
 
 def _units(shown: str, si: str, quantisation: tuple[str, str], white: tuple[str, ...] = ()) -> DeviationUnits:
-    """Return the units of a sensor: that of the quantisation is given for people and in SI, `white` beside the usual."""
+    """Return the units of a sensor: `quantisation` for people and in SI, `white` for people beside the usual."""
     first, *others = KEYS
     known = [(key, shown + per) for key, per in zip(others, PER, strict=True)]
     human = [(first, quantisation[0]), known[0], *((others[0], unit) for unit in white), *known[1:]]

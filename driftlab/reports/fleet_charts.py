@@ -6,7 +6,7 @@ the units lie, and those that are odd. m values, U units, d axes, G temperatures
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -219,8 +219,8 @@ class FleetOverview:
     ----------
     title : str
         Of the fleet.
-    records : iterable of UnitRecord
-        In the order of the manifest; gone through once.
+    records : sequence of UnitRecord
+        In the order of the manifest.
     unit : BiasUnit
         In which biases are shown.
     line : LineReport
@@ -242,7 +242,7 @@ class FleetOverview:
     """
 
     title: str
-    records: Iterable[UnitRecord]
+    records: Sequence[UnitRecord]
     unit: BiasUnit
     line: LineReport
     T: Array
