@@ -15,7 +15,7 @@ from driftlab.evaluation.comparison import Comparison
 from driftlab.reports.charts import Chart
 from driftlab.reports.compare import bias_chart, write_comparison
 from driftlab.reports.provenance import sheet_of
-from driftlab.reports.tables import error_table, yardstick_table
+from driftlab.reports.tables import TextTable, error_table, yardstick_table
 from driftlab.storage.json import write_json
 from fusion_core.errors import ConfigError
 
@@ -141,7 +141,10 @@ def show(result: CompareResult, given: Mapping[str, Any]) -> None:
     _side_by_side(comparisons, coasts)
     if given["paper"]:
         _side_by_side(comparisons, of_the_paper)
-        _print_convergence(comparisons)
+        size, near = first.initial.texts
+        rows = [[n, *("-" if v != v else f"{v:.1f}" for v in c.offset.convergence)] for n, c in comparisons.items()]
+        title = f"Time to within {near}, {size} at the start (table 12)"
+        terminal().print(TextTable(["config", *(f"{axis} [s]" for axis in sensor.axes)], rows, title))
     say_lines(comparison.notes(comparisons), "note: ")
     if given["out"] is not None:
         say(f"written to {given['out']}/: summary.json, report.html\n")
@@ -160,17 +163,3 @@ def _side_by_side(comparisons: dict[str, Comparison], tables: Callable[[dict[str
     console = terminal(width=max(width, needed))  # not even where a single config is too wide is a number cut off
     for same in zip(*made, strict=True):
         console.print(*same, sep="\n")
-
-
-def _print_convergence(comparisons: dict[str, Comparison]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    first = next(iter(comparisons.values()))
-    size, near = first.initial.texts
-    table = Table("config", title=f"Time to within {near}, {size} at the start (table 12)", title_justify="left")
-    for axis in first.sensor.axes:
-        table.add_column(Text(f"{axis} [s]"), justify="right", no_wrap=True)
-    for name, one in comparisons.items():
-        table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in one.offset.convergence))
-    terminal().print(table)
