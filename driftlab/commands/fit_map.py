@@ -111,18 +111,19 @@ class FitMapResult(Result):
 
         Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
         """
-        path, folder = Path(out), None if report is None else Path(report)
-        _check(path, folder, [], selected=self.selection is not None)
+        path, folder, selection = Path(out), None if report is None else Path(report), self.selection
+        _check(path, folder, [], selected=selection is not None)
         save(self.map, path, COMMAND)
-        page = _page(path, folder)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        write_text(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison), COMMAND)
-        more = [] if self.selection is None else _selected(path, folder)
-        if self.selection is not None:
-            write_text(more[0], text_of(map_selection.selection_document(self.selection, self.unit)), COMMAND)
-            write_text(more[1], svg(figure_of(map_selection.chart(self.selection, self.unit))), COMMAND)
-        self.written = (path, page, *more)
+        texts = [page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison)]
+        if selection is not None:
+            drawn = figure_of(map_selection.chart(selection, self.unit))
+            texts += [text_of(map_selection.selection_document(selection, self.unit)), svg(drawn)]
+        beside = _beside(path, folder, selected=selection is not None)
+        for place, text in zip(beside, texts, strict=True):
+            write_text(place, text, COMMAND)
+        self.written = (path, *beside)
 
 
 def fit_map(
@@ -275,19 +276,14 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
 
 def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
     check_place(path, read, COMMAND)
-    for name in (_page(path, report), *(_selected(path, report) if selected else ())):
+    for name in _beside(path, report, selected=selected):
         check_file(name, COMMAND, str(name), "name another folder with --report")
 
 
-def _page(path: Path, report: Path | None) -> Path:
-    """Return the place of the page: in the folder, or beside the map under its name."""
-    return path.with_name(f"{path.stem}.report.html") if report is None else report / "report.html"
-
-
-def _selected(path: Path, report: Path | None) -> list[Path]:
-    """Return the places of the selection's files: in the folder, or beside the map under its name."""
-    stem = path.with_name(f"{path.stem}.select") if report is None else report / "select"
-    return [stem.with_name(stem.name + end) for end in (".json", ".svg")]
+def _beside(path: Path, report: Path | None, *, selected: bool) -> list[Path]:
+    """Return the places of the page, and of the selection's files: in the folder, or beside the map under its name."""
+    names = ("report.html", "select.json", "select.svg")[: 3 if selected else 1]
+    return [path.with_name(f"{path.stem}.{name}") if report is None else report / name for name in names]
 
 
 def _check_family(family: Place | None, lot: str | None, more: bool) -> None:

@@ -109,7 +109,7 @@ class Live:
             recording=self.record,
             durable=True,
         )
-        with held as folder, self._ticking(), ExitStack() as open:
+        with held as folder, self.doing(self.status.phase), ExitStack() as open:
             if self.record is not None:
                 self.recorder = Recorder(self.record, self.config.as_yaml(), resume=self.resume, force=self.force)
                 open.callback(self.recorder.close)
@@ -156,8 +156,9 @@ class Live:
         return finish(estimates, run.model, out, self.record)
 
     @contextmanager
-    def _ticking(self) -> Iterator[None]:
-        """Report at once, then every second, also while the filter is compiled or a source keeps the run waiting."""
+    def doing(self, phase: Phase) -> Iterator[None]:
+        """Report a phase at once, then every second until it is done, also where a source keeps the run waiting."""
+        self.status.phase = phase
         done = threading.Event()
 
         def tick() -> None:
@@ -173,13 +174,6 @@ class Live:
         finally:
             done.set()
             thread.join()
-
-    @contextmanager
-    def doing(self, phase: Phase) -> Iterator[None]:
-        """Report a phase after the run, until it is done."""
-        self.status.phase = phase
-        with self._ticking():
-            yield
 
     def _known(self, status: GrowingMapStatus) -> None:
         """Take the status of the map."""

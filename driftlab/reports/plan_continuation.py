@@ -111,7 +111,7 @@ def lines(plan: Continuation) -> list[str]:
 
 
 def profiles(plan: Continuation) -> TextTable:
-    """Return what is known so far, then the best profiles."""
+    """Return the state of knowledge so far, then the best profiles."""
     before, unit = plan.recorded, plan.recorded.subject.unit
 
     def row(name: str, score: float, largest: float, at: float) -> list[str]:
