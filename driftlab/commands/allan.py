@@ -34,7 +34,7 @@ class AllanResult(Result):
     command = "allan"
 
     def __init__(self, config: Config, analysis: Analysis) -> None:
-        self.config, self.found, self.name, self._read = config, analysis, analysis.name, config.files()
+        self.config, self.found, self.name = config, analysis, analysis.name
         channel = config.filter.tracked.channel if config.filter else "gyro"
         items = analysis.coefficients.get(channel)
         measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}

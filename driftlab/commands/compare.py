@@ -33,7 +33,6 @@ class CompareResult(Result):
 
     def __init__(self, configs: Mapping[str, Config], comparisons: dict[str, Comparison], recording: str) -> None:
         self.configs, self.found, self.name, self._columns = dict(configs), comparisons, recording, comparisons
-        self._read = _files(configs)
         self.summary = comparison.as_json(comparisons, recording)
 
     def __getitem__(self, name: str) -> Comparison:  # type: ignore[override]
@@ -109,11 +108,7 @@ def compare(
     def compared() -> CompareResult:
         return CompareResult(loaded, comparison.compare(dict(loaded), progress), recordings.pop())
 
-    return in_folder(out, "compare", _files(loaded), compared)
-
-
-def _files(configs: Mapping[str, Config]) -> list[Path]:
-    return [path for config in configs.values() for path in config.files()]
+    return in_folder(out, "compare", [path for config in loaded.values() for path in config.files()], compared)
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -66,13 +66,11 @@ class PlanResult(Result):
         sigmas: Mapping[str, Array],
         axes: Sequence[str],
         si: str,
-        read: Collection[Path],
         outlook: DetectabilityReport | None = None,
         seen: tuple[EffectEstimate, ...] = (),
     ) -> None:
         self.name, self.found, self.outlook, self.seen = name, rated, outlook, seen
-        self._page, self._read = page, read
-        self.headline = page.headline
+        self._page, self.headline = page, page.headline
         profile: Profile = rated.chosen.profile
         self._columns = {
             "time": profile.time, "set_point": profile.temperature, "temperature": rated.chosen.temperature, **sigmas,
@@ -181,15 +179,13 @@ def plan(
         if after is not None or effects:
             raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
         law = inquiry.family(Path(family))
-        read = [Path(family), *understood.files()]
-        return in_folder(out, "plan", read, partial(inquiry.short, law, read))
+        return in_folder(out, "plan", [Path(family), *understood.files()], partial(inquiry.short, law))
     check_kinds(effects, "--effects")
     if after is not None:
         recordings = recordings_of(after, None, "after")
         read = [*understood.files(), *paths_of(recordings)]
-        return in_folder(out, "plan", read, partial(inquiry.after, recordings, read))
-    request, read = inquiry.request(range), understood.files()
-    return in_folder(out, "plan", read, partial(inquiry.first, request, read))
+        return in_folder(out, "plan", read, partial(inquiry.after, recordings))
+    return in_folder(out, "plan", understood.files(), partial(inquiry.first, inquiry.request(range)))
 
 
 @dataclass(frozen=True)
@@ -214,7 +210,7 @@ class _Inquiry:
         tracked = self.config.filter.tracked
         return load_family(path, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
 
-    def first(self, request: PlanRequest, read: Collection[Path]) -> PlanResult:
+    def first(self, request: PlanRequest) -> PlanResult:
         """Plan what is recorded first."""
         chamber = request.chamber
         rated = search(request.subject, chamber, self.hours, request.target, self.report)
@@ -224,9 +220,9 @@ class _Inquiry:
         outlook, subject = self._outlook(unit, rated.chosen.profile, chamber.lag), rated.subject
         page = page_of_search(rated, request.lag_of, outlook)
         name, sigmas = f"plan of {rated.hours:g} h for the {subject.channel}", {"sigma": rated.chosen.sigma}
-        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, read, outlook)
+        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, outlook)
 
-    def after(self, recordings: Sequence[str], read: Collection[Path]) -> PlanResult:
+    def after(self, recordings: Sequence[str]) -> PlanResult:
         """Plan what is still missing after recordings."""
         self.report("reading what was recorded")
         parts, dt = read_parts(self.config, recordings, Faults())
@@ -240,9 +236,9 @@ class _Inquiry:
         page = plan_continuation.page_of(rated, outlook, seen)
         name = f"plan after {before.hours:.3g} h of the {subject.channel}"
         sigmas = {"sigma": before.sigma, "sigma_after": rated.chosen.sigma}
-        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, read, outlook, seen)
+        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, outlook, seen)
 
-    def short(self, law: Family, read: Collection[Path]) -> PlanResult:
+    def short(self, law: Family) -> PlanResult:
         """Plan a short soak of a unit whose family is known."""
         request, unit = self.request(self.range or law.knots.domain), tracked_unit(self.config.filter)
         noise, walk = np.asarray(request.subject.noise), np.asarray(request.subject.walk)
@@ -256,7 +252,7 @@ class _Inquiry:
         page = plan_short_soak.page_of(rated, unit, noise_of)
         name = f"plan of a short soak for the {law.channel}"
         sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.without_family}
-        return PlanResult(name, rated, page, sigmas, law.axes, unit.si, read)
+        return PlanResult(name, rated, page, sigmas, law.axes, unit.si)
 
     def _outlook(self, unit: UnitModel, profile: Profile, lag: float) -> DetectabilityReport:
         self.report("effects")

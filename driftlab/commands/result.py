@@ -6,6 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -154,9 +155,9 @@ class Result(Mapping[str, NDArray[Any]]):
 
 def in_folder(out: str | PathLike[str] | None, command: str, read: Collection[Path], make: Callable[[], R]) -> R:
     """Make a result; with `out`, write its files into that folder, which is looked at before anything is computed."""
-    if out is None:
-        return make()
-    with output_folder(Path(out), command, read) as folder:
+    with nullcontext() if out is None else output_folder(Path(out), command, read) as folder:
         result = make()
-        result._write(folder)
+        result._read = read
+        if folder is not None:
+            result._write(folder)
     return result

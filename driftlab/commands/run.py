@@ -98,12 +98,9 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            estimates = EstimatesWriter(folder, self.config, self.journal)
-            estimates.open(self.model)
-            try:
+            with closing(EstimatesWriter(folder, self.config, self.journal)) as estimates:
+                estimates.open(self.model)
                 estimates.add(dict(self))
-            finally:
-                estimates.close()
             note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
             self._write(folder)
 

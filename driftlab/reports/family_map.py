@@ -116,21 +116,16 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
-def rows(facts: FamilyMapFacts) -> list[list[str]]:
-    """Return the table's rows: temperature, and of the worst axis sigma of the family, the own map, and both."""
+def table(facts: FamilyMapFacts) -> TextTable:
+    """Return sigma of the worst axis over the temperature: of the family, of the own map, and of both."""
     known, factor = facts.known, facts.unit.factor
     sigmas = [np.max(sigma, axis=1) for sigma in (known.before, facts["own_sigma"], known.sigma)]
-    places = np.linspace(0, len(known.T) - 1, PLACES).astype(int)
-    return [
-        [f"{known.T[k]:.1f}", *("" if np.isnan(v[k]) else text(float(v[k]) * factor) for v in sigmas)] for k in places
+    rows = [
+        [f"{known.T[k]:.1f}", *("" if np.isnan(v[k]) else text(float(v[k]) * factor) for v in sigmas)]
+        for k in np.linspace(0, len(known.T) - 1, PLACES).astype(int)
     ]
-
-
-def table(facts: FamilyMapFacts) -> TextTable:
-    """Return sigma over the range: the family's alone, the own map's, and that of both."""
     title = f"sigma over the range, worst axis [{facts.unit.shown}]"
-    heads = ("°C", "family alone", "own map", "both")
-    return TextTable(heads, rows(facts), title, texts=False, whole=False)
+    return TextTable(("°C", "family alone", "own map", "both"), rows, title, texts=False, whole=False)
 
 
 def chart(facts: FamilyMapFacts) -> Chart:

@@ -10,18 +10,10 @@ from driftlab import __version__
 from driftlab.maps.assessment import text
 from driftlab.planning.search import RatedProfile
 from driftlab.planning.short_soak import SHARES, ShortSoakPlan
+from driftlab.reports import plan as plan_page
 from driftlab.reports.charts import Chart, Line
 from driftlab.reports.family_map import GAUSSIAN, measured_on
-from driftlab.reports.plan import (
-    NOTES,
-    PlanPage,
-    by_axis,
-    chosen_profile,
-    expected_sigma,
-    hours_chart,
-    knots,
-    sigma_panels,
-)
+from driftlab.reports.plan import NOTES, PlanPage, chosen_profile, hours_chart, sigma_panels
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit
 
@@ -142,10 +134,10 @@ def _document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str
         "unit": unit.si,
         "channel": plan.family.channel,
         "units": plan.family.units,
-        "noise": by_axis(axes, plan.noise),
-        "walk": by_axis(axes, plan.walk),
-        "profile": content(best) | knots(best.profile),
-        "expected_sigma": expected_sigma(axes, unit, best),
+        "noise": plan_page.by_axis(axes, plan.noise),
+        "walk": plan_page.by_axis(axes, plan.walk),
+        "profile": content(best) | plan_page.knots(best.profile),
+        "expected_sigma": plan_page.expected_sigma(axes, unit, best),
         "tried": list(map(content, plan.tried)),
         "target": None if plan.target is None else target,
         "notes": notes,
