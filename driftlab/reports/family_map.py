@@ -125,7 +125,7 @@ def table(facts: FamilyMapFacts) -> TextTable:
         for k in np.linspace(0, len(known.T) - 1, PLACES).astype(int)
     ]
     title = f"sigma over the range, worst axis [{facts.unit.shown}]"
-    return TextTable(("°C", "family alone", "own map", "both"), rows, title, texts=False, whole=False)
+    return TextTable(("°C", "family alone", "own map", "both"), rows, title, texts=0, whole=False)
 
 
 def chart(facts: FamilyMapFacts) -> Chart:

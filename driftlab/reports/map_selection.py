@@ -236,7 +236,7 @@ def selection_table(selection: Selection, unit: BiasUnit) -> TextTable:
             row += [train, f"{validation}{'*' if n == target.chosen else ' '}", test]
         cells.append(row)
     title = "Sr, eq. (12); * is chosen"
-    return TextTable(["n", *heads], cells, title, texts=False, whole=False, framed=False)
+    return TextTable(["n", *heads], cells, title, texts=0, whole=False, framed=False)
 
 
 def comparison(selection: Selection, unit: BiasUnit) -> list[str]:

@@ -63,7 +63,7 @@ class PlanPage:
     def write(self, path: Path, title: str, profile: Profile) -> None:
         """Write the page; the set points of the profile stand at its end."""
         rows = [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
-        setpoints = TextTable(["time [h]", "temperature [°C]"], rows, texts=False)
+        setpoints = TextTable(["time [h]", "temperature [°C]"], rows, texts=0)
         write_page(
             path, "plan", title=title, lead=self.headline, outcome=self.outcome, parts=self.parts, setpoints=setpoints
         )

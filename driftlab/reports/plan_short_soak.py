@@ -85,7 +85,7 @@ def _sigmas(plan: ShortSoakPlan, unit: BiasUnit) -> TextTable:
 
     rows = [[f"{100 * share:.0f} %", *(cell(plan.best(share, hours)) for hours in plan.hours)] for share in SHARES]
     title = f"expected sigma over the range with the family (without) [{unit.shown}]"
-    return TextTable(["range", *(f"{hours:.3g} h" for hours in plan.hours)], rows, title, texts=False)
+    return TextTable(["range", *(f"{hours:.3g} h" for hours in plan.hours)], rows, title, texts=0)
 
 
 def _hours(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:

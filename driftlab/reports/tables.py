@@ -35,12 +35,10 @@ class TextTable:
     rows : sequence of sequences of str
     title : str
         On a terminal; a page has a heading.
-    texts : bool
-        Whether the first column is one of texts, at the left; numbers are at the right.
-    rigid : bool
-        Whether that column is never folded, as
-    whole : bool
-        Whether numbers are.
+    texts : int
+        How many of the first columns are of texts, at the left; numbers are at the right.
+    rigid, whole : bool
+        Whether texts, and numbers, are never folded.
     framed : bool
         Whether columns are divided by lines.
     width : int, optional
@@ -50,7 +48,7 @@ class TextTable:
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     title: str = ""
-    texts: bool = True
+    texts: int = 1
     rigid: bool = False
     whole: bool = True
     framed: bool = True
@@ -64,10 +62,9 @@ class TextTable:
 
         table = Table(title=self.title, title_justify="left", box=box.HEAVY_HEAD if self.framed else box.SIMPLE_HEAD)
         for k, head in enumerate(self.heads):
-            first = k == 0 and self.texts
-            least = self.width if first else None
-            whole = self.rigid if first else self.whole
-            table.add_column(Text(head), justify="left" if first else "right", no_wrap=whole, min_width=least)
+            text = k < self.texts
+            whole, least = (self.rigid, self.width) if text else (self.whole, None)
+            table.add_column(Text(head), justify="left" if text else "right", no_wrap=whole, min_width=least)
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table
