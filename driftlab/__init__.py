@@ -12,6 +12,7 @@ The application is the only place where angular rate omega, specific force f and
 together. Conventions: SI, temperatures in degC; body axes x, y, z as in the recording, right-handed where a heading
 is used; the local level frame is east, north, up.
 """
+# ruff: noqa: F403, F405
 
 from __future__ import annotations
 
@@ -21,20 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from driftlab import errors
-    from driftlab.api import (
-        allan,
-        check,
-        compare,
-        explain,
-        export,
-        fit_map,
-        fleet,
-        import_map,
-        init,
-        plan,
-        run,
-        simulate,
-    )  # fmt: skip
+    from driftlab.api import *
 
 __version__ = version("driftlab")
 __all__ = [

@@ -2,26 +2,10 @@
 
 Messages and what to do are listed in docs/reference/errors.md.
 """
+# ruff: noqa: F403, F405
 
-from fusion_core.errors import (
-    BadValue,
-    ConfigError,
-    DataError,
-    EmptyRecording,
-    FusionError,
-    MapError,
-    MissingChannel,
-    NotAtRest,
-    OutsideDomain,
-    PluginError,
-    SingularFit,
-    SwingTooSmall,
-    TimeBackwards,
-    UnitConflict,
-    UnitError,
-    UnreadableFile,
-    Unwritable,
-)
+from fusion_core.errors import *
+from fusion_core.errors import FusionError
 
 __all__ = [
     "BadValue",

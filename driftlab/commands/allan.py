@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from driftlab.commands.console import print_verdict, say, terminal
+from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config
-from driftlab.evaluation.limits import LimitResult, check_limits, verdict
+from driftlab.evaluation.limits import check_limits, verdict
 from driftlab.evaluation.measurements import of_allan
 from driftlab.noise.recording import Analysis, analyse
-from driftlab.reports.allan import config_lines, document, figure, table, units_of, used, write_results
+from driftlab.reports.allan import config_lines, document, page_of, table, units_of, used, whole_chart
+from driftlab.reports.charts import Chart
+from driftlab.reports.figures import svg
 from driftlab.reports.provenance import sheet_of
 from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
 from fusion_core.faults import Faults
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class AllanResult(Result):
@@ -35,8 +34,11 @@ class AllanResult(Result):
     command = "allan"
 
     def __init__(self, config: Config, analysis: Analysis) -> None:
-        self.config, self.found, self.name, self._read = config, analysis, analysis.name, config.files()
-        self.judged = _limit_results(config, analysis)
+        self.config, self.found, self.name = config, analysis, analysis.name
+        channel = config.filter.tracked.channel if config.filter else "gyro"
+        items = analysis.coefficients.get(channel)
+        measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
+        self.judged = check_limits(config.limits, measured)
         self.limits_verdict = self.verdict = verdict(self.judged)
         limits = [row.as_json(tracked_unit(config.filter)) for row in self.judged]
         self.summary = {**document(analysis, curves=False), "serial": config.serial, "limits": limits}
@@ -56,13 +58,16 @@ class AllanResult(Result):
         """Return the notes on the analysis, a sentence each."""
         return self.found.notes
 
-    def plot(self) -> Figure:
-        """Draw the deviations of every axis, with the terms that were fitted."""
-        return figure(self.found)
+    def _chart(self) -> Chart:
+        """Return the deviations of every axis, with the terms that were fitted."""
+        return whole_chart(self.found)
 
     def _write(self, folder: Path) -> None:
         sheet = sheet_of(self.config, judged=self.judged, plugins=self.found.plugins)
-        write_results(folder, self.found, sheet, self.summary["limits"], write_json)
+        write_json(folder / "allan.json", content_of(self, {}))
+        write_json(folder / "summary.json", self.summary)
+        (folder / "allan.svg").write_text(svg(self.plot()) + "\n", encoding="utf-8")
+        (folder / "report.html").write_text(page_of(self.found, sheet), encoding="utf-8")
 
 
 def allan(
@@ -105,14 +110,6 @@ def allan(
     return in_folder(out, "allan", understood.files(), analysed)
 
 
-def _limit_results(config: Config, analysis: Analysis) -> list[LimitResult]:
-    """Hold noise and bias instability of the tracked sensor against the limits of the config."""
-    channel = config.filter.tracked.channel if config.filter else "gyro"
-    items = analysis.coefficients.get(channel)
-    measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
-    return check_limits(config.limits, measured)
-
-
 def content_of(result: AllanResult, given: Mapping[str, Any]) -> Any:
     """Return the coefficients with the curves that they were fitted to."""
     return document(result.found) | {name: result.summary[name] for name in ("serial", "limits")}
@@ -121,12 +118,11 @@ def content_of(result: AllanResult, given: Mapping[str, Any]) -> Any:
 def show(result: AllanResult, given: Mapping[str, Any]) -> None:
     """Print the coefficients of each sensor, and the lines for a config."""
     analysis, console = result.found, terminal()
-    console.print(f"{analysis.name}: {used(analysis)}", soft_wrap=True)
+    say(f"{analysis.name}: {used(analysis)}\n")
     print_verdict(result.verdict, "limits: ")
     for channel in analysis.curves:
         console.print(table(analysis, channel))
-    for line in result.lines():
-        console.print(f"note: {line}", soft_wrap=True)
+    say_lines(result.lines(), "note: ")
     say(f"\n{result.config_lines}")
     if given["out"] is not None:
         say(f"\nwritten to {given['out']}/: allan.json, allan.svg, report.html, summary.json\n")

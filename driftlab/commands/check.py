@@ -8,12 +8,13 @@ from typing import Any
 
 import typer
 
-from driftlab.commands.console import print_json, say, terminal
+from driftlab.commands.console import print_json, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
 from driftlab.config import Config, maps_of
 from driftlab.filtering.setup import check_channels, loaded_map, prior
 from driftlab.maps.fit import map_lines
 from driftlab.recordings.screening import head
+from driftlab.reports.tables import TextTable
 from fusion_core.host.config import quantities
 from fusion_core.host.registry import Entry, registry
 from fusion_core.host.schema import config_schema
@@ -83,8 +84,7 @@ def show(result: CheckResult, given: Mapping[str, Any]) -> None:
     say(result.config.as_yaml())
     for at, quantity in result.quantities.items():
         say(f"# {at}: {quantity.text} = {float(quantity):.6g} {_unit(quantity)}\n")
-    for line in result.remarks:
-        say(f"# {line}\n")
+    say_lines(result.remarks, "# ")
 
 
 def _unit(quantity: Quantity) -> str:
@@ -101,8 +101,6 @@ def plugins(*, json: bool = False, check: bool = False) -> None:
     check : bool
         Hold each to the laws of its family.
     """
-    from rich.table import Table
-
     if check:
         _print_laws(json)
         return
@@ -111,10 +109,9 @@ def plugins(*, json: bool = False, check: bool = False) -> None:
         fields = ("family", "kind", "distribution", "version", "module", "error")
         print_json([{name: getattr(e, name) for name in fields} for e in entries])
         return
-    table = Table("family", "kind", "distribution", "version", "state")
-    for e in entries:
-        table.add_row(e.family, e.kind, e.distribution, e.version, "ok" if e.error is None else f"broken: {e.error}")
-    terminal().print(table)
+    states = ("ok" if e.error is None else f"broken: {e.error}" for e in entries)
+    rows = [[e.family, e.kind, e.distribution, e.version, state] for e, state in zip(entries, states, strict=True)]
+    terminal().print(TextTable(["family", "kind", "distribution", "version", "state"], rows, texts=5))
 
 
 def schema() -> None:
@@ -139,8 +136,6 @@ def law_checks(entry: Entry) -> list[tuple[str, str | None]]:
 
 def _print_laws(json: bool) -> None:
     """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
-    from rich.table import Table
-
     entries = sorted(registry().entries, key=lambda e: (e.family, e.kind))
     checks = [(entry, law_checks(entry)) for entry in entries]
     broken = [(entry.kind, law, error) for entry, results in checks for law, error in results if error is not None]
@@ -148,13 +143,12 @@ def _print_laws(json: bool) -> None:
         keys = ("family", "kind", "law", "error")
         print_json([dict(zip(keys, (e.family, e.kind, *one), strict=True)) for e, results in checks for one in results])
     else:
-        table = Table("family", "kind", "laws kept")
+        rows = []
         for entry, results in checks:
             held = sum(error is None for _, error in results)
             none = "none: it gives no examples" if entry.plugin is not None else "none: it is a file"
-            table.add_row(entry.family, entry.kind, f"{held} of {len(results)}" if results else none)
-        terminal().print(table)
-        for kind, law, error in broken:
-            say(f"{kind}: {law}: {error}\n")
+            rows.append([entry.family, entry.kind, f"{held} of {len(results)}" if results else none])
+        terminal().print(TextTable(["family", "kind", "laws kept"], rows, texts=3))
+        say_lines(map(": ".join, broken))
     if broken:
         raise typer.Exit(1)

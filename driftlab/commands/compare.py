@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from driftlab.commands.console import load, say, terminal
+from driftlab.commands.console import load, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with, named
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config
@@ -15,7 +15,7 @@ from driftlab.evaluation.comparison import Comparison
 from driftlab.reports.charts import Chart
 from driftlab.reports.compare import bias_chart, write_comparison
 from driftlab.reports.provenance import sheet_of
-from driftlab.reports.tables import error_table, yardstick_table
+from driftlab.reports.tables import TextTable, error_table, yardstick_table
 from driftlab.storage.json import write_json
 from fusion_core.errors import ConfigError
 
@@ -33,7 +33,6 @@ class CompareResult(Result):
 
     def __init__(self, configs: Mapping[str, Config], comparisons: dict[str, Comparison], recording: str) -> None:
         self.configs, self.found, self.name, self._columns = dict(configs), comparisons, recording, comparisons
-        self._read = _files(configs)
         self.summary = comparison.as_json(comparisons, recording)
 
     def __getitem__(self, name: str) -> Comparison:  # type: ignore[override]
@@ -109,11 +108,7 @@ def compare(
     def compared() -> CompareResult:
         return CompareResult(loaded, comparison.compare(dict(loaded), progress), recordings.pop())
 
-    return in_folder(out, "compare", _files(loaded), compared)
-
-
-def _files(configs: Mapping[str, Config]) -> list[Path]:
-    return [path for config in configs.values() for path in config.files()]
+    return in_folder(out, "compare", [path for config in loaded.values() for path in config.files()], compared)
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
@@ -137,15 +132,15 @@ def show(result: CompareResult, given: Mapping[str, Any]) -> None:
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
     terminal().print(comparison.verdict(comparisons))
-    for line in comparison.limit_lines(comparisons):
-        terminal().print(line, soft_wrap=True)
-    terminal().print()
+    say_lines([*comparison.limit_lines(comparisons), ""])
     _side_by_side(comparisons, coasts)
     if given["paper"]:
         _side_by_side(comparisons, of_the_paper)
-        _print_convergence(comparisons)
-    for line in comparison.notes(comparisons):
-        terminal().print(f"note: {line}", soft_wrap=True)
+        size, near = first.initial.texts
+        rows = [[n, *("-" if v != v else f"{v:.1f}" for v in c.offset.convergence)] for n, c in comparisons.items()]
+        title = f"Time to within {near}, {size} at the start (table 12)"
+        terminal().print(TextTable(["config", *(f"{axis} [s]" for axis in sensor.axes)], rows, title))
+    say_lines(comparison.notes(comparisons), "note: ")
     if given["out"] is not None:
         say(f"written to {given['out']}/: summary.json, report.html\n")
 
@@ -163,17 +158,3 @@ def _side_by_side(comparisons: dict[str, Comparison], tables: Callable[[dict[str
     console = terminal(width=max(width, needed))  # not even where a single config is too wide is a number cut off
     for same in zip(*made, strict=True):
         console.print(*same, sep="\n")
-
-
-def _print_convergence(comparisons: dict[str, Comparison]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    first = next(iter(comparisons.values()))
-    size, near = first.initial.texts
-    table = Table("config", title=f"Time to within {near}, {size} at the start (table 12)", title_justify="left")
-    for axis in first.sensor.axes:
-        table.add_column(Text(f"{axis} [s]"), justify="right", no_wrap=True)
-    for name, one in comparisons.items():
-        table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in one.offset.convergence))
-    terminal().print(table)

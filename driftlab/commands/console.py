@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -53,19 +53,15 @@ class Session:
     begun: float = field(default_factory=time.monotonic)
 
     def lines(self) -> list[str]:
-        """Return the report of `-v`."""
+        """Return the report of `-v`: how long each stage took, and the plugins that the configs name."""
+        from fusion_core.host.provenance import participants
+
         took = [*self.stages, ("in all", time.monotonic() - self.begun)]
         width = max(len(what) for what, _ in took)
         lines = [f"{what:<{width}}  {seconds:8.2f} s" for what, seconds in took]
-        return lines + [f"plugin: {plugin}" for plugin in self._plugins()]
-
-    def _plugins(self) -> list[str]:
-        """Return family, kind and distribution of every plugin that the configs name."""
-        from fusion_core.host.provenance import participants
-
-        values = [item for config in self.configs for item in participants(config)]
-        lines = (f"{p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in values)
-        return list(dict.fromkeys(lines))
+        named = [item for config in self.configs for item in participants(config)]
+        plugins = (f"plugin: {p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in named)
+        return lines + list(dict.fromkeys(plugins))
 
 
 CURRENT: ContextVar[Session] = ContextVar("session")
@@ -93,6 +89,12 @@ def say(text: str) -> None:
     """Print text for people, a line or several; a name in it that is a stranger's acts on no terminal."""
     if not session().quiet:
         sys.stdout.write(lines(text))
+
+
+def say_lines(texts: Iterable[str], before: str = "") -> None:
+    """Print texts for people, each in a line of its own with `before` at its head."""
+    for text in texts:
+        say(f"{before}{text}\n")
 
 
 def print_json(content: Any, indent: int | None = 2) -> None:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.commands.console import say
+from driftlab.commands.console import say_lines
 from driftlab.commands.fit_map import FitMapResult
 from driftlab.commands.inputs import ConfigLike, Place, config_of, is_file
-from driftlab.config import Config, load_config, understood
+from driftlab.config import Config, understood
 from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import axes_of
 from driftlab.noise.innovations import SensorReadings, inflation
@@ -116,7 +116,12 @@ def export(
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
     exporter = exporter_of(kind, {name: str(value) for name, value in (settings or {}).items()})
     file = Path(what) if is_file(what) else None  # type: ignore[arg-type]
-    calibration = _export_of(what) if file is None else read_export(file)
+    if isinstance(what, FitMapResult):
+        calibration = of_map(what.map)
+    elif file is not None and file.suffix not in CONFIGS:
+        calibration = of_map(read_map(file))
+    else:
+        calibration = of_config(config_of(what))
     if run is not None:
         calibration = with_inflation(calibration, Path(run))
     return _write(exporter, calibration, Path(out), force, [] if file is None else [file])
@@ -135,21 +140,6 @@ def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
     """Return the exporter of a kind with settings as a user writes them; raises ConfigError."""
     document = Document(Path("--set"), {"kind": kind, **settings})
     return validate(installed(Exporter, kind, "export"), document)  # type: ignore[no-any-return]
-
-
-def read_export(path: Path) -> Export:
-    """Return the calibration of a unit that a map's file or a config has.
-
-    Raises
-    ------
-    MapError, ConfigError
-        If no kind of map can read it, or the config has no filter.
-    """
-    return of_config(load_config(path)) if path.suffix in CONFIGS else of_map(read_map(path))
-
-
-def _export_of(what: ConfigLike | FitMapResult) -> Export:
-    return of_map(what.map) if isinstance(what, FitMapResult) else of_config(config_of(what))
 
 
 def of_map(fitted: FittedMap) -> Export:
@@ -228,7 +218,14 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
             before = _check(exporter, path, folder, [file.name for file in files], force, read)
-            write_json(files[0].parent / LOSS, _content(exporter, loss, path, before.get("exports", {})))
+            entry = {
+                "driftlab": __version__,
+                "plugins": participants(exporter),
+                "kind": exporter.kind,
+                **plain(loss.as_json()),
+            }
+            exports = {**before.get("exports", {}), key_of(path): entry}
+            write_json(files[0].parent / LOSS, {"schema": SCHEMA, "exports": exports})
             sign(files[0].parent, LOSS, [file.name for file in files], before.get("written"))
             for file in files:  # gone before `loss.json` knows the new ones: whatever is there is known at any moment
                 (folder / file.name).unlink(missing_ok=True)
@@ -270,12 +267,6 @@ def _check(
     return before
 
 
-def _content(exporter: Exporter, loss: Loss, path: Path, known: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of `loss.json`: the other exports that it has, and this one."""
-    entry = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
-    return {"schema": SCHEMA, "exports": {**known, key_of(path): entry}}
-
-
 def inflations(folder: Path) -> dict[str, dict[str, Inflation]]:
     """Return by channel the inflation of noise that the innovations of a run's folder show, where walk is declared.
 
@@ -301,17 +292,17 @@ def inflations(folder: Path) -> dict[str, dict[str, Inflation]]:
     document.data.pop("source", None)  # which may have been in memory
     model = understood(document).filter
     assert model is not None, "a run has a filter"
-    fresh = _fresh(folder, columns["t"])
+    still, fresh = columns["still"].astype(bool), _fresh(folder, columns["t"])
     ratios: dict[str, dict[str, Inflation]] = {}
     for sensor in model.sensors:
         walk = getattr(sensor.bias, "walk", None)
         if walk is None:
             continue
-        series = _series(model, sensor, columns)
-        noise, density = sensor.noise, along_axes(walk, len(sensor.axes))
-        ratios[sensor.channel] = {
-            name: _inflation(columns, values, fresh, noise, density) for name, values in series.items()
-        }
+        density = along_axes(walk, len(sensor.axes))
+        ratios[sensor.channel] = {}
+        for name, d in _series(model, sensor, columns).items():
+            readings = SensorReadings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
+            ratios[sensor.channel][name] = inflation(readings, sensor.noise, density)
     return ratios
 
 
@@ -330,12 +321,6 @@ def _fresh(folder: Path, t: Array) -> Flags:
         again = np.searchsorted(t, moments.ravel(), side="right")
         fresh[again[again < len(t)]] = True
     return fresh
-
-
-def _inflation(columns: dict[str, Array], d: Array, fresh: Flags, noise: Array, walk: Array) -> Inflation:
-    still = columns["still"].astype(bool)
-    readings = SensorReadings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
-    return inflation(readings, noise, walk)
 
 
 def _series(model: MeasurementModel, sensor: Sensor, columns: dict[str, Array]) -> dict[str, Array]:
@@ -372,9 +357,7 @@ def content_of(result: Loss, given: Mapping[str, Any]) -> Any:
 
 def show(result: Loss, given: Mapping[str, Any]) -> None:
     """Print what is lost."""
-    for line in result.lines():
-        say(f"{line}\n")
-    say(f"written to {given['out']}, {_beside(given)}\n")
+    say_lines([*result.lines(), f"written to {given['out']}, {_beside(given)}"])
 
 
 def _beside(given: Mapping[str, Any]) -> Path:

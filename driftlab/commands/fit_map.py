@@ -8,11 +8,11 @@ from dataclasses import replace
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar
+from typing import Any
 
 import numpy as np
 
-from driftlab.commands.console import print_verdict, say, terminal
+from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.family_map import FamilyMapResult, fit_family_map, show_family_map
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_of, recordings_of
 from driftlab.commands.result import Result
@@ -27,13 +27,13 @@ from driftlab.maps.kind_selection import compare as compare_kinds
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.reports import map_selection
 from driftlab.reports.charts import Chart
-from driftlab.reports.figures import svg
+from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.map import chart, page_of
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_file, check_place, save, write_text
-from driftlab.units import BiasUnit, tracked_unit
+from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError
@@ -41,7 +41,6 @@ from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 
-F = TypeVar("F")
 COMMAND = "fit-map"  # by which its files are known
 MAX_BLOCKS = 4096  # of all recordings, where kinds are compared
 
@@ -112,22 +111,19 @@ class FitMapResult(Result):
 
         Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
         """
-        path, folder = Path(out), None if report is None else Path(report)
-        _check(path, folder, [], selected=self.selection is not None)
-        self.write(path, folder)
-
-    def write(self, path: Path, report: Path | None) -> None:
-        """Write the files where nothing is in the way."""
+        path, folder, selection = Path(out), None if report is None else Path(report), self.selection
+        _check(path, folder, [], selected=selection is not None)
         save(self.map, path, COMMAND)
-        page = _page(path, report)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        write_text(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison), COMMAND)
-        more = [] if self.selection is None else _selected(path, report)
-        if self.selection is not None:
-            write_text(more[0], text_of(map_selection.selection_document(self.selection, self.unit)), COMMAND)
-            write_text(more[1], svg(map_selection.figure(self.selection, self.unit)), COMMAND)
-        self.written = (path, page, *more)
+        texts = [page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison)]
+        if selection is not None:
+            drawn = figure_of(map_selection.chart(selection, self.unit))
+            texts += [text_of(map_selection.selection_document(selection, self.unit)), svg(drawn)]
+        beside = _beside(path, folder, selected=selection is not None)
+        for place, text in zip(beside, texts, strict=True):
+            write_text(place, text, COMMAND)
+        self.written = (path, *beside)
 
 
 def fit_map(
@@ -198,16 +194,18 @@ def fit_map(
     understood = config_of(config).tracking(channel)
     recordings = [] if data is None else recordings_of(data, units, "data")
     place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
-    if with_family(known, lot, more=bool(kind or neurons or compare or report)):
+    _check_family(known, lot, bool(kind or neurons or compare or report))
+    if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
-    if compare:
-        _check_comparison(kind, neurons)
+    for option, value in (("--kind", kind), ("--select", neurons)):
+        if compare and value is not None:
+            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
     if place is not None:
         read = [*understood.files_to_fit(), *paths_of(recordings)]
         _check(place, folder, read, selected=neurons is not None)
     result = _fitted(understood, recordings, kind, neurons, compare, progress)
     if place is not None:
-        result.write(place, folder)
+        result.save(place, report=folder)
     return result
 
 
@@ -237,13 +235,6 @@ def _fitted(
     fitted = fit_gathered(config, settings, soak, more)
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
-
-
-def _check_comparison(kind: str | None, neurons: range | None) -> None:
-    """Raise ConfigError where one kind, or the size of one, is asked for beside a comparison of all."""
-    for option, value in (("--kind", kind), ("--select", neurons)):
-        if value is not None:
-            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
 
 
 def _compared(config: Config, soak: GatheredSoak, progress: Progress | None) -> tuple[ThermalMap, KindComparison, str]:
@@ -285,23 +276,18 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
 
 def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
     check_place(path, read, COMMAND)
-    for name in (_page(path, report), *(_selected(path, report) if selected else ())):
+    for name in _beside(path, report, selected=selected):
         check_file(name, COMMAND, str(name), "name another folder with --report")
 
 
-def _page(path: Path, report: Path | None) -> Path:
-    """Return the place of the page: in the folder, or beside the map under its name."""
-    return path.with_name(f"{path.stem}.report.html") if report is None else report / "report.html"
+def _beside(path: Path, report: Path | None, *, selected: bool) -> list[Path]:
+    """Return the places of the page, and of the selection's files: in the folder, or beside the map under its name."""
+    names = ("report.html", "select.json", "select.svg")[: 3 if selected else 1]
+    return [path.with_name(f"{path.stem}.{name}") if report is None else report / name for name in names]
 
 
-def _selected(path: Path, report: Path | None) -> list[Path]:
-    """Return the places of the selection's files: in the folder, or beside the map under its name."""
-    stem = path.with_name(f"{path.stem}.select") if report is None else report / "select"
-    return [stem.with_name(stem.name + end) for end in (".json", ".svg")]
-
-
-def with_family(family: F | None, lot: str | None, *, more: bool) -> TypeGuard[F]:
-    """Tell whether a family is asked for; raises ConfigError where something else is that it does not give."""
+def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
+    """Raise ConfigError where something is asked for that a family does not give, or a lot of none."""
     if family is None and lot is not None:
         raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     if family is not None and more:
@@ -309,7 +295,6 @@ def with_family(family: F | None, lot: str | None, *, more: bool) -> TypeGuard[F
             "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
             "--report out"
         )
-    return family is not None
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
@@ -317,11 +302,10 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
     config, kind, compare = arguments["config"], arguments.get("kind"), arguments["compare"]
     more = any((kind, arguments.get("report"), compare, options["select"], options["enforce_limits"]))
     out = arguments.get("out")
-    if not with_family(arguments.get("family"), arguments.get("lot"), more=more):
+    _check_family(arguments.get("family"), arguments.get("lot"), more)
+    if arguments.get("family") is None:
         if options["select"]:
             arguments["neurons"] = range(1, options["neurons_max"] + 1)
-        if compare:
-            _check_comparison(kind, arguments.get("neurons"))
         named = config.tracked_maps() if compare or kind is None else [map_settings(config, kind)]
         out = out or next((settings.path for settings in named), None)
         if out is None and _names_a_path(config):
@@ -341,31 +325,20 @@ def show(result: FitMapResult | FamilyMapResult, given: Mapping[str, Any]) -> No
     if isinstance(result, FamilyMapResult):
         show_family_map(result)
         return
-    if result.selection is not None:
-        _print_selection(result.selection, result.unit)
-    if result.comparison is not None:
-        _print_comparison(result.comparison, result)
+    unit, axes = result.unit, result.verdict.axes
+    if (selection := result.selection) is not None:
+        terminal().print(map_selection.selection_table(selection, unit))
+        say_lines(map_selection.comparison(selection, unit))
+    if (choice := result.comparison) is not None:
+        terminal().print(map_selection.comparison_table(choice, unit, axes))
+        say_lines([*map_selection.verdict(choice, unit, axes), *map_selection.failures(choice)])
+        say(f"in the config: {map_selection.config_line(choice, result.written[0])}\n\n")
     _print_map(result)
     say(f"written to {', '.join(map(str, result.written))}\n")
     if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
         path = os.path.relpath(result.written[0], given["config"].file.parent)
         line = f"{{kind: {result.map.record.kind}, path: {path}}}"
         say(f"in the config: {result.sensor.section}.calibration: {line}\n")
-
-
-def _print_selection(choice: Selection, unit: BiasUnit) -> None:
-    console = terminal()
-    console.print(map_selection.selection_table(choice, unit))
-    for line in map_selection.comparison(choice, unit):
-        console.print(line, soft_wrap=True)
-
-
-def _print_comparison(choice: KindComparison, fitted: FitMapResult) -> None:
-    axes, console = fitted.verdict.axes, terminal()
-    console.print(map_selection.comparison_table(choice, fitted.unit, axes))
-    for line in (*map_selection.verdict(choice, fitted.unit, axes), *map_selection.failures(choice)):
-        console.print(line, soft_wrap=True)
-    say(f"in the config: {map_selection.config_line(choice, fitted.written[0])}\n\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:
@@ -378,10 +351,7 @@ def _print_map(fitted: FitMapResult) -> None:
         widths = zip(fitted.unit.columns, ("10", ""), strict=False)
         texts = [f"{residual * factor:{width}{spec}} {unit}" for (unit, factor, spec), width in widths]
         say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
-    for line in fitted.verdict.sentences(fitted.unit):
-        say(f"{line}\n")
+    say_lines(fitted.verdict.sentences(fitted.unit))
     print_verdict(fitted.limits_verdict, "limits: ")
-    for row in fitted.limits:
-        say(f"  {row.line(fitted.unit)}\n")
-    for line in fitted.faults.lines():
-        say(f"note: {line}\n")
+    say_lines((row.line(fitted.unit) for row in fitted.limits), "  ")
+    say_lines(fitted.faults.lines(), "note: ")

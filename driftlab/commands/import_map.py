@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab import __version__
-from driftlab.commands.console import say
+from driftlab.commands.console import say_lines
 from driftlab.commands.export import SHOWN, exporter_of, installed
 from driftlab.commands.inputs import Place
 from driftlab.storage.map_file import check_place, save
@@ -127,15 +127,15 @@ def show(result: Imported, given: Mapping[str, Any]) -> None:
     record, read = result.map.record, result.read
     unit = Calibrated(read.channel, read.unit, SHOWN.get(read.unit, read.unit), read.axes)
     swing = unit.said(np.ptp(read.bias(np.linspace(*record.domain, PLACES)), axis=0))
-    lines = [
-        *read.notes,
-        f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
-        f"°C; the map is within {unit.said(np.array(result.apart))} {unit.shown} of it",
-        "in a config, as the vehicle uses it:",
-        "filter:",
-        f"  {record.channel}:",
-        f"    calibration: {{kind: {record.kind}, path: {given['out']}, outside: clamp}}",
-        f"written to {given['out']}",
-    ]
-    for line in lines:
-        say(f"{line}\n")
+    say_lines(
+        [
+            *read.notes,
+            f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
+            f"°C; the map is within {unit.said(np.array(result.apart))} {unit.shown} of it",
+            "in a config, as the vehicle uses it:",
+            "filter:",
+            f"  {record.channel}:",
+            f"    calibration: {{kind: {record.kind}, path: {given['out']}, outside: clamp}}",
+            f"written to {given['out']}",
+        ]
+    )

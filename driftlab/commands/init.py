@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import say
+from driftlab.commands.console import say, say_lines
 from driftlab.commands.inputs import Place
 from driftlab.starter import config_text
 from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
@@ -67,18 +67,14 @@ def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | No
         if field not in FIELDS:
             raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
         Channel(path="?", unit=unit).check(field)
-    starter = _starter(path, os.path.relpath(path, Path() if place is None else place.parent), known)
+    with of_all(path, "finding out what it holds"):
+        starter = _guess(path, os.path.relpath(path, Path() if place is None else place.parent), known)
     if place is not None:
         try:
             write_whole(place, starter.text.encode())
         except OSError as error:
             raise Unwritable(f"--out {place}: cannot be written ({error.strerror}); name another place") from None
     return FirstConfig(starter.text, starter.asked, place)
-
-
-def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    with of_all(file, "finding out what it holds"):
-        return _guess(file, path, units)
 
 
 def _guess(file: Path, path: str, units: Mapping[str, str]) -> Starter:
@@ -142,6 +138,5 @@ def content_of(result: FirstConfig, given: Mapping[str, Any]) -> Any:
 def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
     """Print the config, and what is to be filled in."""
     say(result.text)
-    for sentence in result.asked:
-        say(f"fill in: {sentence}\n")
+    say_lines(result.asked, "fill in: ")
     say(f"written to {result.path}; look at what is guessed, then: driftlab check {result.path}\n")

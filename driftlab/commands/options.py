@@ -9,14 +9,14 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand
@@ -160,11 +160,13 @@ class Command:
         for name, form in PAIRS.items():
             if isinstance(arguments.get(name), list):
                 arguments[name] = pairs(arguments[name], *form)
-        if (arguments_of := _defined(module, "arguments_of")) is not None:
-            arguments = arguments_of(arguments, options)
+        # what the module defines of these, and does not merely import
+        own = {name: item for name, item in vars(module).items() if getattr(item, "__module__", "") == module.__name__}
+        if "arguments_of" in own:
+            arguments = module.arguments_of(arguments, options)
         reporting = progress(self.doing) if self.doing else nullcontext()
-        if (progress_of := _defined(module, "progress_of")) is not None:
-            reporting = progress_of(arguments)
+        if "progress_of" in own:
+            reporting = module.progress_of(arguments)
         with reporting as report:
             if report is not None and "progress" in known:
                 arguments["progress"] = report
@@ -173,8 +175,7 @@ class Command:
             return
         given |= arguments
         if options.get("json"):
-            content_of = _defined(module, "content_of")
-            content = result.summary if content_of is None else content_of(result, given)
+            content = module.content_of(result, given) if "content_of" in own else result.summary
             print_json(plain(content), self.indent)
         else:
             module.show(result, given)
@@ -182,8 +183,7 @@ class Command:
             raise typer.Exit(result.exit_status)
 
 
-@dataclass(frozen=True)
-class Declaration:
+class Declaration(NamedTuple):
     """A function as its source text declares it: each parameter's annotation and default, and the texts on them."""
 
     parameters: dict[str, tuple[str, Any]]
@@ -219,9 +219,3 @@ def declaration(module: str, name: str) -> Declaration:
         for name in names.split(", ")
     }
     return Declaration(parameters, summary, texts)
-
-
-def _defined(module: Any, name: str) -> Callable[..., Any] | None:
-    """Return the function of that name that a command's module defines, and does not merely import."""
-    function = vars(module).get(name)
-    return function if function is not None and function.__module__ == module.__name__ else None

@@ -2,53 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from driftlab.commands.console import say, terminal
+from driftlab.commands.console import say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
+from driftlab.family.mixed_model import Family
 from driftlab.identification.candidates import check_kinds
 from driftlab.planning.chamber import Profile
 from driftlab.planning.continuation import Continuation, continuation_of, of_samples, read_parts
 from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
 from driftlab.planning.discrimination import DiscriminationCriterion, preferred
-from driftlab.planning.request import parse_request
+from driftlab.planning.request import PlanRequest, parse_request
 from driftlab.planning.search import SearchResult, search
 from driftlab.planning.short_soak import ShortSoakPlan, shortened
 from driftlab.planning.simulated_search import still_channels
 from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
-from driftlab.reports import plan as plan_profile
 from driftlab.reports import plan_continuation, plan_effects, plan_short_soak
 from driftlab.reports.charts import Chart
+from driftlab.reports.plan import PlanPage, page_of_search, write_profile
+from driftlab.reports.tables import TextTable
 from driftlab.storage.folders import FILES
 from driftlab.storage.json import plain, write_json
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-
-@dataclass(frozen=True)
-class _Presentation:
-    """A plan in words, as a table, a chart and a page."""
-
-    headline: str
-    lines: list[str]
-    document: dict[str, Any]
-    table: Callable[[], Table]
-    chart: Callable[[], Chart]
-    write_page: Callable[[Path, str], None]
 
 
 class PlanResult(Result):
@@ -75,41 +62,40 @@ class PlanResult(Result):
         self,
         name: str,
         rated: SearchResult | Continuation | ShortSoakPlan,
+        page: PlanPage,
         sigmas: Mapping[str, Array],
         axes: Sequence[str],
         si: str,
-        presentation: _Presentation,
-        read: Collection[Path],
         outlook: DetectabilityReport | None = None,
         seen: tuple[EffectEstimate, ...] = (),
     ) -> None:
         self.name, self.found, self.outlook, self.seen = name, rated, outlook, seen
-        self._presentation, self._read = presentation, read
-        self.headline = presentation.headline
+        self._page, self.headline = page, page.headline
         profile: Profile = rated.chosen.profile
         self._columns = {
             "time": profile.time, "set_point": profile.temperature, "temperature": rated.chosen.temperature, **sigmas,
         }  # fmt: skip
         self.units = {"time": "s", "set_point": "degC", "temperature": "degC", **dict.fromkeys(sigmas, si)}
         self.labels = dict.fromkeys(sigmas, tuple(axes))
-        self.summary = plain(presentation.document)
+        self.summary = plain(page.document)
 
     def lines(self) -> list[str]:
         """Return the reasons for this profile, the knowledge so far, and the basis of the plan, a sentence each."""
-        return self._presentation.lines
+        return self._page.lines
 
-    def table(self) -> Table:
+    def table(self) -> TextTable:
         """Return the profiles for a terminal, the chosen one first."""
-        return self._presentation.table()
+        return self._page.table
 
     def _chart(self) -> Chart:
         """Return the sigma that is expected over temperature; with a family, over the length of the soak."""
-        return self._presentation.chart()
+        return self._page.chart
 
     def _write(self, folder: Path) -> None:
         mark, setpoints, report = (folder / name for name in FILES["plan"])
-        plan_profile.write_profile(setpoints, self.found.chosen.profile)
-        self._presentation.write_page(report, self.name[0].upper() + self.name[1:])
+        profile = self.found.chosen.profile
+        write_profile(setpoints, profile)
+        self._page.write(report, self.name[0].upper() + self.name[1:], profile)
         write_json(mark, self.summary)
 
 
@@ -187,121 +173,86 @@ def plan(
         sensor.
     """
     understood = config_of(config).tracking(channel)
-    request = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    inquiry = _Inquiry(understood, hours, range, request, effects, progress or (lambda *state: None))
+    options = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    inquiry = _Inquiry(understood, hours, range, options, effects, progress or (lambda *state: None))
     if family is not None:
         if after is not None or effects:
             raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
-        return inquiry.with_family(Path(family), out)
+        law = inquiry.family(Path(family))
+        return in_folder(out, "plan", [Path(family), *understood.files()], partial(inquiry.short, law))
     check_kinds(effects, "--effects")
     if after is not None:
-        return inquiry.after(recordings_of(after, None, "after"), out)
-    return inquiry.first(out)
+        recordings = recordings_of(after, None, "after")
+        read = [*understood.files(), *paths_of(recordings)]
+        return in_folder(out, "plan", read, partial(inquiry.after, recordings))
+    return in_folder(out, "plan", understood.files(), partial(inquiry.first, inquiry.request(range)))
 
 
 @dataclass(frozen=True)
 class _Inquiry:
-    """The wishes for a plan; `request` are texts for `parse_request`."""
+    """The wishes for a plan; `options` are texts for `parse_request`."""
 
     config: Config
     hours: float
     range: str | tuple[float, float] | None
-    request: Mapping[str, str | None]
+    options: Mapping[str, str | None]
     effects: Sequence[str]
     report: Progress
 
-    def first(self, out: Place | None) -> PlanResult:
-        """Plan what is recorded first."""
-        request, read = parse_request(self.config, self.hours, range=self.range, **self.request), self.config.files()
-        chamber = request.chamber
+    def request(self, range: str | tuple[float, float] | None) -> PlanRequest:
+        """Return the request over a range; None: the config's."""
+        return parse_request(self.config, self.hours, range=range, **self.options)
 
-        def result() -> PlanResult:
-            rated = search(request.subject, chamber, self.hours, request.target, self.report)
-            unit = request.subject.with_curve(chamber.low, chamber.high)
-            if self.effects:
-                rated = preferred(rated, DiscriminationCriterion(unit, chamber, self.hours, self.effects))
-            outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
-            lines = [*plan_profile.lines(rated, request.lag_of), *plan_effects.brief(outlook)]
-            presentation = _Presentation(
-                plan_profile.headline(rated),
-                lines,
-                plan_profile.document(rated, lines) | {"effects": plan_effects.document(outlook)},
-                partial(plan_profile.table, rated),
-                partial(plan_profile.sigma_chart, rated),
-                lambda path, title: plan_profile.write_report(path, rated, lines, title, outlook),
-            )
-            subject, name = rated.subject, f"plan of {rated.hours:g} h for the {rated.subject.channel}"
-            sigmas = {"sigma": rated.chosen.sigma}
-            return PlanResult(name, rated, sigmas, subject.axes, subject.unit.si, presentation, read, outlook)
-
-        return in_folder(out, "plan", read, result)
-
-    def after(self, recordings: Sequence[str], out: Place | None) -> PlanResult:
-        """Plan what is still missing after recordings."""
-        read = [*self.config.files(), *paths_of(recordings)]
-
-        def result() -> PlanResult:
-            self.report("reading what was recorded")
-            parts, dt = read_parts(self.config, recordings, Faults())
-            span = self.range or self._span(parts)
-            request = parse_request(self.config, self.hours, range=span, **self.request)
-            chamber = request.chamber
-            before = of_samples(parts, dt, request.subject, chamber)
-            rated = continuation_of(before, self.hours, request.target, self.report)
-            unit = before.subject.with_curve(chamber.low, chamber.high)
-            outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
-            seen, subject = effects_in(unit, before.parts, before.dt, self.effects), before.subject
-            lines = [
-                *plan_continuation.lines(rated),
-                *plan_effects.seen_lines(seen, subject.unit),
-                *plan_effects.brief(outlook),
-            ]
-            presentation = _Presentation(
-                plan_continuation.headline(rated),
-                lines,
-                plan_continuation.document(rated, lines) | {"effects": plan_effects.document(outlook)},
-                partial(plan_continuation.table, rated),
-                partial(plan_continuation.sigma_chart, rated),
-                lambda path, title: plan_continuation.write_report(path, rated, outlook, lines, title),
-            )
-            name = f"plan after {before.hours:.3g} h of the {subject.channel}"
-            sigmas = {"sigma": before.sigma, "sigma_after": rated.chosen.sigma}
-            return PlanResult(name, rated, sigmas, subject.axes, subject.unit.si, presentation, read, outlook, seen)
-
-        return in_folder(out, "plan", read, result)
-
-    def with_family(self, family: Path, out: Place | None) -> PlanResult:
-        """Plan a short soak of a unit whose family is known."""
+    def family(self, path: Path) -> Family:
+        """Return the family of the tracked sensor."""
         if self.config.filter is None:
             raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
-        tracked, unit = self.config.filter.tracked, tracked_unit(self.config.filter)
-        law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
-        read = [family, *self.config.files()]
+        tracked = self.config.filter.tracked
+        return load_family(path, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
 
-        def result() -> PlanResult:
-            request = parse_request(self.config, self.hours, range=self.range or law.knots.domain, **self.request)
-            noise, walk = np.asarray(request.subject.noise), np.asarray(request.subject.walk)
-            noise_of = "as the config says"
-            if law.bands is not None:
-                typical, noise_of = law.bands.noise, f"the median of {law.units} units"
-                noise = np.array(typical.white)
-                walk = walk if self.request.get("walk") else np.array(typical.walk)
-            self.report("parts of the range")
-            rated = shortened(law, request.chamber, self.hours, noise, walk, request.target)
-            lines = plan_short_soak.lines(rated, unit, noise_of)
-            presentation = _Presentation(
-                plan_short_soak.headline(rated, unit),
-                lines,
-                plan_short_soak.document(rated, unit, lines),
-                partial(plan_short_soak.table, rated, unit),
-                partial(plan_short_soak.hours_chart, rated, unit),
-                lambda path, title: plan_short_soak.write_report(path, rated, unit, lines, title),
-            )
-            sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.without_family}
-            name = f"plan of a short soak for the {law.channel}"
-            return PlanResult(name, rated, sigmas, law.axes, unit.si, presentation, read)
+    def first(self, request: PlanRequest) -> PlanResult:
+        """Plan what is recorded first."""
+        chamber = request.chamber
+        rated = search(request.subject, chamber, self.hours, request.target, self.report)
+        unit = request.subject.with_curve(chamber.low, chamber.high)
+        if self.effects:
+            rated = preferred(rated, DiscriminationCriterion(unit, chamber, self.hours, self.effects))
+        outlook, subject = self._outlook(unit, rated.chosen.profile, chamber.lag), rated.subject
+        page = page_of_search(rated, request.lag_of, outlook)
+        name, sigmas = f"plan of {rated.hours:g} h for the {subject.channel}", {"sigma": rated.chosen.sigma}
+        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, outlook)
 
-        return in_folder(out, "plan", read, result)
+    def after(self, recordings: Sequence[str]) -> PlanResult:
+        """Plan what is still missing after recordings."""
+        self.report("reading what was recorded")
+        parts, dt = read_parts(self.config, recordings, Faults())
+        request = self.request(self.range or self._span(parts))
+        chamber = request.chamber
+        before = of_samples(parts, dt, request.subject, chamber)
+        rated, subject = continuation_of(before, self.hours, request.target, self.report), before.subject
+        unit = subject.with_curve(chamber.low, chamber.high)
+        outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)
+        seen = effects_in(unit, before.parts, before.dt, self.effects)
+        page = plan_continuation.page_of(rated, outlook, seen)
+        name = f"plan after {before.hours:.3g} h of the {subject.channel}"
+        sigmas = {"sigma": before.sigma, "sigma_after": rated.chosen.sigma}
+        return PlanResult(name, rated, page, sigmas, subject.axes, subject.unit.si, outlook, seen)
+
+    def short(self, law: Family) -> PlanResult:
+        """Plan a short soak of a unit whose family is known."""
+        request, unit = self.request(self.range or law.knots.domain), tracked_unit(self.config.filter)
+        noise, walk = np.asarray(request.subject.noise), np.asarray(request.subject.walk)
+        noise_of = "as the config says"
+        if law.bands is not None:
+            typical, noise_of = law.bands.noise, f"the median of {law.units} units"
+            noise = np.array(typical.white)
+            walk = walk if self.options["walk"] else np.array(typical.walk)
+        self.report("parts of the range")
+        rated = shortened(law, request.chamber, self.hours, noise, walk, request.target)
+        page = plan_short_soak.page_of(rated, unit, noise_of)
+        name = f"plan of a short soak for the {law.channel}"
+        sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.without_family}
+        return PlanResult(name, rated, page, sigmas, law.axes, unit.si)
 
     def _outlook(self, unit: UnitModel, profile: Profile, lag: float) -> DetectabilityReport:
         self.report("effects")
@@ -324,14 +275,11 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 def show(result: PlanResult, given: Mapping[str, Any]) -> None:
     """Print the plan; of effects that were named, which are distinguished."""
-    console = terminal()
-    console.print(result.headline, soft_wrap=True)
-    console.print(result.table())
-    for line in result.lines():
-        console.print(line, soft_wrap=True)
+    say(f"{result.headline}\n")
+    terminal().print(result.table())
+    say_lines(result.lines())
     if given["effects"] and result.outlook is not None:
-        console.print(plan_effects.table(result.outlook))
-        for line in plan_effects.lines(result.outlook):
-            console.print(line, soft_wrap=True)
+        terminal().print(plan_effects.table(result.outlook))
+        say_lines(plan_effects.lines(result.outlook))
     if given["out"] is not None:
         say(f"written to {given['out']}/: {', '.join(FILES['plan'])}\n")

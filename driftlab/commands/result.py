@@ -6,6 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -124,10 +125,13 @@ class Result(Mapping[str, NDArray[Any]]):
         return pl.DataFrame({name: np.ascontiguousarray(values) for name, values in columns.items()})
 
     def _repr_html_(self) -> str:
+        drawing = io.BytesIO()
+        self.plot().savefig(drawing, format="png", dpi=80)
+        picture = f'<img src="data:image/png;base64,{base64.b64encode(drawing.getvalue()).decode()}"/>'
         notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
         arrays = "".join(f"<li>{html.escape(line)}</li>" for line in self._arrays())
         return (
-            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{_picture(self.plot())}"
+            f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{picture}"
             f"<details><summary>{len(self)} arrays</summary><ul>{arrays}</ul></details>"
         )
 
@@ -151,16 +155,9 @@ class Result(Mapping[str, NDArray[Any]]):
 
 def in_folder(out: str | PathLike[str] | None, command: str, read: Collection[Path], make: Callable[[], R]) -> R:
     """Make a result; with `out`, write its files into that folder, which is looked at before anything is computed."""
-    if out is None:
-        return make()
-    with output_folder(Path(out), command, read) as folder:
+    with nullcontext() if out is None else output_folder(Path(out), command, read) as folder:
         result = make()
-        result._write(folder)
+        result._read = read
+        if folder is not None:
+            result._write(folder)
     return result
-
-
-def _picture(figure: Figure) -> str:
-    """Return a figure as an element of a page."""
-    drawing = io.BytesIO()
-    figure.savefig(drawing, format="png", dpi=80)
-    return f'<img src="data:image/png;base64,{base64.b64encode(drawing.getvalue()).decode()}"/>'

@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from driftlab import __version__
-from driftlab.commands.console import keep_freed_memory, note_compiling, print_verdict, terminal
+from driftlab.commands.console import keep_freed_memory, note_compiling, print_verdict, say, say_lines, terminal
 from driftlab.commands.estimates import (
     CHECKPOINT,
     Columns,
@@ -35,7 +35,7 @@ from driftlab.recordings.identity import beforehand
 from driftlab.recordings.prefetch import aside
 from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import sheet_of
-from driftlab.reports.run import bias_chart, write_report
+from driftlab.reports.run import bias_chart, page_of
 from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import reading
@@ -98,20 +98,16 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            estimates = EstimatesWriter(folder, self.config, self.journal)
-            estimates.open(self.model)
-            try:
+            with closing(EstimatesWriter(folder, self.config, self.journal)) as estimates:
+                estimates.open(self.model)
                 estimates.add(dict(self))
-            finally:
-                estimates.close()
             note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
             self._write(folder)
 
     def _write(self, folder: Path) -> None:
         write_json(folder / "summary.json", self.summary)
         recording = None if self.recorded is None else [str(self.recorded)]
-        write_report(
-            folder / "report.html",
+        page = page_of(
             self.overview,
             self.summary,
             title=self.name,
@@ -121,6 +117,7 @@ class RunResult(Result):
             sheet=sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"]),
             fitted=map_of(self.config),
         )
+        (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def run(
@@ -248,13 +245,10 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 def show(result: RunResult, given: Mapping[str, Any]) -> None:
     """Print the verdict on the limits, the table of errors and the notes."""
-    console, config = terminal(), result.config
+    config, sensor = result.config, result.model.tracked
     print_verdict(result.verdict)
-    for row in result.judged:
-        if row.verdict != "pass":
-            console.print(f"  {row.line(unit_of(result.model.tracked))}", soft_wrap=True)
+    say_lines((row.line(unit_of(sensor)) for row in result.judged if row.verdict != "pass"), "  ")
     name = config.file.stem if config.file else config.name
-    console.print(yardstick_table({name: result.overview.yardsticks}, config.recording, result.model.tracked))
-    for line in result.lines():
-        console.print(f"note: {line}", soft_wrap=True)
-    console.print(f"written to {given['out']}/: estimates.h5, summary.json, report.html", soft_wrap=True)
+    terminal().print(yardstick_table({name: result.overview.yardsticks}, config.recording, sensor))
+    say_lines(result.lines(), "note: ")
+    say(f"written to {given['out']}/: estimates.h5, summary.json, report.html\n")

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.commands.console import say
+from driftlab.commands.console import say, say_lines
 from driftlab.commands.inputs import ConfigLike, Place, Progress, config_of
 from driftlab.commands.result import Result
 from driftlab.config import Config
-from driftlab.reports.charts import Chart
-from driftlab.reports.recording import chart
+from driftlab.evaluation.overview import thin
+from driftlab.reports.charts import Chart, Clock, Line, Panel, series
 from driftlab.storage.recorder import SIMULATED_UNITS, recording_file
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import SimulatedSource
@@ -76,9 +76,20 @@ class SimulateResult(Result):
         ]
 
     def _chart(self) -> Chart:
-        """Return every channel over time."""
-        units = {name: unit for name, unit in self.channels.items() if unit is not None}
-        return chart(self._columns, self.labels, units)
+        """Return every channel over time, below one another."""
+        time = self._columns["time"]
+        rows, clock = thin(len(time)), Clock(float(time[0]), float(time[-1]))
+        t, panels = clock(time[rows]), []
+        for name, whole in self._columns.items():
+            if name == "time":
+                continue
+            values = whole[rows].reshape(len(rows), -1)
+            d = values.shape[1]
+            texts = [name] if d == 1 else self.labels.get(name) or [str(k) for k in range(d)]
+            roles = ["data"] if d == 1 else [series(k) for k in range(d)]
+            lines = tuple(Line(t, *column) for column in zip(values.T, texts, roles, strict=True))
+            panels.append(Panel(lines, f"{name} [{self.units[name]}]" if name in self.units else name))
+        return Chart(tuple(panels), f"time [{clock.unit}]", "Every channel")
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write the same samples to a file, as `driftlab simulate` does."""
@@ -175,6 +186,5 @@ def show(result: SimulateResult, given: Mapping[str, Any]) -> None:
     """Print what was written."""
     first, last = result.span
     say(f"{result.name}: {result.rows:,} rows, t = {first:g} to {last:.10g} s\n")
-    for line in result.lines():
-        say(f"note: {line}\n")
+    say_lines(result.lines(), "note: ")
     say(f"written to {result.path}: {', '.join(result.channels)}\n")

@@ -34,7 +34,8 @@ from driftlab.production.family import FamilyAnalysis
 from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder, UnitRef
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
-from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
+from driftlab.reports.fleet import write_fleet_report
+from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array

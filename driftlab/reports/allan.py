@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +13,13 @@ from driftlab.noise.allan_fit import LEVEL, Coefficients
 from driftlab.noise.allan_model import KEYS, WALK, AllanCurve, design
 from driftlab.noise.recording import Analysis
 from driftlab.reports.charts import Chart, Line, Panel, series
-from driftlab.reports.figures import figure_of, svg
-from driftlab.reports.pages import write_page
+from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.units import axis_name, number
 from fusion_core.chunk import Array
 from fusion_core.contracts import axis_of
 from fusion_core.units import convert
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
-
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")
@@ -88,16 +81,14 @@ def _curves(analysis: Analysis, channel: str) -> dict[str, Any]:
     }
 
 
-def table(analysis: Analysis, channel: str) -> Table:
+def table(analysis: Analysis, channel: str) -> TextTable:
     """Return the coefficients of a triad, axes as columns, in the units of data sheets."""
     cells = [
         [f"{name}\n[{unit}]", *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells)]
         for name, unit, cells in rows(analysis, channel)
     ]
     title = f"{channel}: value and {100 * LEVEL:.0f} % limits"
-    table = TextTable(["", *analysis.axes[channel]], cells, title).rich()
-    table.columns[0].no_wrap = True
-    return table
+    return TextTable(["", *analysis.axes[channel]], cells, title, rigid=True)
 
 
 def rows(analysis: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
@@ -163,25 +154,9 @@ def _value_text(values: list[float], units: DeviationUnits, key: str) -> str:
     return "[" + ", ".join(f"{number:.4g} {unit}" for number in numbers) + "]"
 
 
-def figure(analysis: Analysis) -> Figure:
-    """Draw the curves with one standard deviation, the Hadamard deviation, the fit and each of its terms."""
-    return figure_of(whole_chart(analysis))
-
-
-def write_results(
-    folder: Path,
-    analysis: Analysis,
-    sheet: Sheet,
-    limits: list[dict[str, Any]],
-    write_json: Callable[[Path, Any], None],
-) -> None:
-    """Write allan.json, summary.json, allan.svg and report.html; `limits` are as JSON holds them."""
-    more = {"serial": sheet.serial or None, "limits": limits}
-    write_json(folder / "allan.json", document(analysis) | more)
-    write_json(folder / "summary.json", document(analysis, curves=False) | more)
-    (folder / "allan.svg").write_text(svg(figure(analysis)) + "\n", encoding="utf-8")
-    write_page(
-        folder / "report.html",
+def page_of(analysis: Analysis, sheet: Sheet) -> str:
+    """Return the page of an analysis."""
+    return page(
         "allan",
         title=f"Allan deviation of {analysis.name}",
         lead=used(analysis),
@@ -213,18 +188,17 @@ CAPTION = (
 
 def charts(analysis: Analysis) -> list[Chart]:
     """Return a chart a sensor, a panel an axis: the curves, the fit and its terms."""
-    return [
-        Chart(
-            tuple(_panels(analysis, channel)), "averaging time [s]", f"Deviations of the {channel}", CAPTION, log=True
-        )
-        for channel in analysis.curves
-    ]
+    return [_chart(_panels(analysis, channel), f"Deviations of the {channel}") for channel in analysis.curves]
 
 
 def whole_chart(analysis: Analysis) -> Chart:
     """Return the panels of all sensors in one chart."""
-    panels = tuple(panel for channel in analysis.curves for panel in _panels(analysis, channel))
-    return Chart(panels, "averaging time [s]", f"Allan deviation of {analysis.name}", CAPTION, log=True)
+    panels = (panel for channel in analysis.curves for panel in _panels(analysis, channel))
+    return _chart(panels, f"Allan deviation of {analysis.name}")
+
+
+def _chart(panels: Iterable[Panel], title: str) -> Chart:
+    return Chart(tuple(panels), "averaging time [s]", title, CAPTION, log=True)
 
 
 def _panels(analysis: Analysis, channel: str) -> Iterator[Panel]:
@@ -274,24 +248,22 @@ class DeviationUnits:
         return dict(reversed(self.human))[key]
 
 
-def _units(deviation: str, si: str, terms_si: tuple[str, ...], human: tuple[str, ...]) -> DeviationUnits:
-    """Return the units of a sensor whose white noise people know in two; `terms_si` are in the order of KEYS."""
-    quantisation, *others = KEYS
-    keys = (quantisation, others[0], *others)
-    return DeviationUnits(deviation, si, dict(zip(KEYS, terms_si, strict=True)), list(zip(keys, human, strict=True)))
+PER = ("/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient but the quantisation, after the unit of the sensor
+
+
+def _units(shown: str, si: str, quantisation: tuple[str, str], white: tuple[str, ...] = ()) -> DeviationUnits:
+    """Return the units of a sensor: `quantisation` for people and in SI, `white` for people beside the usual."""
+    first, *others = KEYS
+    known = [(key, shown + per) for key, per in zip(others, PER, strict=True)]
+    human = [(first, quantisation[0]), known[0], *((others[0], unit) for unit in white), *known[1:]]
+    in_si = {first: quantisation[1]} | {key: si + per for key, per in zip(others, PER, strict=True)}
+    return DeviationUnits(shown, si, in_si, human)
 
 
 UNITS = {
-    "gyro": _units(
-        "deg/h", "rad/s", ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"),
-        ("arcsec", "deg/h/sqrt(Hz)", "deg/sqrt(h)", "deg/h", "deg/h/sqrt(s)", "deg/h/s"),
-    ),
-    "accel": _units(
-        "ug", "m/s^2", ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"),
-        ("mm/s", "ug/sqrt(Hz)", "m/s/sqrt(h)", "ug", "ug/sqrt(s)", "ug/s"),
-    ),
-}  # fmt: skip
-PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
+    "gyro": _units("deg/h", "rad/s", ("arcsec", "rad"), ("deg/sqrt(h)",)),
+    "accel": _units("ug", "m/s^2", ("mm/s", "m/s"), ("m/s/sqrt(h)",)),
+}
 
 
 def units_of(analysis: Analysis, channel: str) -> DeviationUnits:
@@ -300,10 +272,5 @@ def units_of(analysis: Analysis, channel: str) -> DeviationUnits:
     if known is not None and (sensor is None or sensor.unit == known.deviation_si):
         return known
     assert sensor is not None, "what is no triad is a sensor of the config"
-    si = {
-        key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
-        for key, per in zip(KEYS, PER, strict=True)
-    }
-    return DeviationUnits(
-        sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)]
-    )
+    integral = "s" if sensor.unit == "1" else f"{sensor.unit}*s"
+    return _units(sensor.shown, sensor.unit, (f"{sensor.shown}*s", integral))

@@ -6,18 +6,14 @@ parts that charts share stand at the end: a panel an axis, bands, the clock, and
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from driftlab.units import rounded
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from fusion_core.chunk import Array
-
+from fusion_core.chunk import Array
 
 LineStyle = Literal["line", "dashed", "dotted", "points"]
 

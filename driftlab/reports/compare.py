@@ -6,8 +6,8 @@ A config has one colour in all of them and one entry in the legend, so that one 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from driftlab.evaluation.ranking import TO_THE_END, ranking
 from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
 from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
 from driftlab.reports import charts
-from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Look, Panel, Shade, series
+from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Panel, Shade, series
 from driftlab.reports.pages import write_page
 from driftlab.reports.provenance import Sheet
 from driftlab.units import BiasUnit, axis_name, duration, formatted
@@ -28,25 +28,16 @@ Runs = dict[str, Comparison]
 Cells = list[tuple[str, str, list[str], bool]]  # of a table: label, axis, a text a config, whether it belongs above
 
 
-@dataclass(frozen=True)
-class WindowBar:
-    """The error of a config over a horizon, and its sigma: as texts, and in per cent of the widest of the horizon."""
-
-    name: str
-    error: str
-    sigma: str
-    long: float
-    tick: float
-    look: Look
-
-
 def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, Sheet]) -> None:
     """Write `report.html` of a comparison; `sheets` are those of its configs."""
     first = next(iter(runs.values()))
     sensor, unit, (size, near) = first.sensor, first.initial.unit, first.initial.texts
     si, factor, spec = unit.columns[-1]
     scores = {name: run.yardsticks for name, run in runs.items()}
-    ranked = ranking(scores)
+    ranked, rows = ranking(scores), error_rows(list(scores.values()))
+    # the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first
+    over = coasts_over_axes(rows) if len(sensor.axes) > 1 else []
+    errors = [(over, ("rms",)), (rows, sensor.axes)]
     heading = {name: [np.rad2deg(y.heading[name]) for y in scores.values()] for name in LONGEST_FIRST}
     write_page(
         path,
@@ -58,7 +49,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
         best=ranked.best if ranked is not None and len(runs) > 1 else (),
         remarks=notes(runs),
         unit=sensor.shown,
-        errors=_errors(runs, sensor.axes, unit),
+        errors=[cell for part, axes in errors for cell in _cells(part, axes, unit.factor, unit.digits)],
         headings=[(name, _texts(row, ".2f")) for name, row in heading.items()] if sensor.integral else [],
         spans={TO_THE_END: duration(min(run.span for run in runs.values()))},
         bars=[(name, bars) for name in LONGEST_FIRST if (bars := _bars(runs, name, unit))],
@@ -73,8 +64,11 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
     )
 
 
-def _bars(runs: Runs, horizon: str, unit: BiasUnit) -> list[WindowBar]:
-    """Return a bar for every config of which a horizon is known."""
+def _bars(runs: Runs, horizon: str, unit: BiasUnit) -> list[dict[str, Any]]:
+    """Return, of every config of which a horizon is known, its error and its sigma.
+
+    As texts, and as the lengths of a bar and of its tick in per cent of the widest of the horizon.
+    """
     sizes = {
         name: (over_axes(run.yardsticks.coast[horizon]), over_axes(run.yardsticks.coast_sigma[horizon]))
         for name, run in runs.items()
@@ -83,19 +77,12 @@ def _bars(runs: Runs, horizon: str, unit: BiasUnit) -> list[WindowBar]:
     widest = max((max(pair) for pair in known.values()), default=0.0) or 1.0
     looks = {name: LOOKS[series(k)] for k, name in enumerate(runs)}
     return [
-        WindowBar(
-            name, unit.number(error, "–"), unit.number(sigma, "–"), 100 * error / widest, 100 * sigma / widest,
-            looks[name],
-        )
+        {
+            "name": name, "error": unit.number(error, "–"), "sigma": unit.number(sigma, "–"),
+            "long": 100 * error / widest, "tick": 100 * sigma / widest, "look": looks[name],
+        }
         for name, (error, sigma) in known.items()
     ]  # fmt: skip
-
-
-def _errors(runs: Runs, axes: Sequence[str], unit: BiasUnit) -> Cells:
-    """Return the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first."""
-    rows = error_rows([run.yardsticks for run in runs.values()])
-    over = _cells(coasts_over_axes(rows), ("rms",), unit.factor, unit.digits) if len(axes) > 1 else []
-    return [*over, *_cells(rows, axes, unit.factor, unit.digits)]
 
 
 def _cells(rows: Rows, axes: Sequence[str], factor: float, spec: str) -> Cells:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 PLACES = 9  # temperatures of the table
 
@@ -119,21 +116,16 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
-def rows(facts: FamilyMapFacts) -> list[list[str]]:
-    """Return the table's rows: temperature, and of the worst axis sigma of the family, the own map, and both."""
+def table(facts: FamilyMapFacts) -> TextTable:
+    """Return sigma of the worst axis over the temperature: of the family, of the own map, and of both."""
     known, factor = facts.known, facts.unit.factor
     sigmas = [np.max(sigma, axis=1) for sigma in (known.before, facts["own_sigma"], known.sigma)]
-    places = np.linspace(0, len(known.T) - 1, PLACES).astype(int)
-    return [
-        [f"{known.T[k]:.1f}", *("" if np.isnan(v[k]) else text(float(v[k]) * factor) for v in sigmas)] for k in places
+    rows = [
+        [f"{known.T[k]:.1f}", *("" if np.isnan(v[k]) else text(float(v[k]) * factor) for v in sigmas)]
+        for k in np.linspace(0, len(known.T) - 1, PLACES).astype(int)
     ]
-
-
-def table(facts: FamilyMapFacts) -> Table:
-    """Return it for a terminal."""
     title = f"sigma over the range, worst axis [{facts.unit.shown}]"
-    heads = ("°C", "family alone", "own map", "both")
-    return TextTable(heads, rows(facts), title, texts=False).rich(whole=False)
+    return TextTable(("°C", "family alone", "own map", "both"), rows, title, texts=0, whole=False)
 
 
 def chart(facts: FamilyMapFacts) -> Chart:

@@ -8,128 +8,49 @@ U units with a map, d axes, G temperatures; values in SI.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from driftlab.evaluation.limits import verdict_of_units, worst
-from driftlab.family.outliers import Outlier, describe
+from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord
-from driftlab.reports.charts import Chart
-from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
+from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, map_charts
 from driftlab.reports.pages import embedded, write_page
-from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
+from driftlab.spc.charts import LineReport
 from driftlab.spc.sentences import by_how_much, place
-from driftlab.units import BiasUnit, rounded
-from fusion_core.chunk import Array
+from driftlab.units import rounded
 
 FIRST = 20  # of them that are to be seen without opening the list
 LISTED = 200  # odd or failed units in the lists of the page; all are in its table
 
 
-@dataclass(frozen=True)
-class SharedEffectRow:
-    """An effect that the units share.
-
-    Attributes
-    ----------
-    name : str
-    sentence : str
-        What it is, how large, and how sure.
-    unit : str
-        Of the sizes by lot, as they are shown.
-    lots : tuple of (lot, units, axis, size, sigma)
-        Its mean size in each lot, in `unit`.
-    """
-
-    name: str
-    sentence: str
-    unit: str = ""
-    lots: tuple[tuple[str, int, str, float, float], ...] = ()
-
-    @property
-    def axes(self) -> list[str]:
-        """The axes of `lots`, in their order."""
-        return list(dict.fromkeys(axis for _, _, axis, _, _ in self.lots))
-
-    @property
-    def rows(self) -> list[tuple[str, int, list[str]]]:
-        """Of each lot its name, its units, and a text an axis: the size, and by how much it may be off (1 sigma)."""
-        rows: dict[str, tuple[int, dict[str, str]]] = {}
-        for lot, n, axis, size, sigma in self.lots:
-            rows.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
-        return [(lot, n, [texts.get(axis, "–") for axis in self.axes]) for lot, (n, texts) in rows.items()]
-
-
-@dataclass(frozen=True, eq=False)
-class FleetOverview:
-    """The content of the page.
-
-    Attributes
-    ----------
-    title : str
-        Of the fleet.
-    records : iterable of UnitRecord
-        In the order of the manifest; gone through once.
-    unit : BiasUnit
-        In which biases are shown.
-    line : LineReport
-    T : (G,) array
-        degC.
-    curves : (U, d, G) array
-        Maps of the units over T, single precision will do.
-    drawn : sequence of str
-        Whose they are.
-    mean : (d, G) array or None
-        The family's curve.
-    odd : mapping of str to sequence of Outlier
-        By unit.
-    effects : sequence of SharedEffectRow
-    links : mapping of str to str
-        Units' pages, relative to this one.
-    remarks : sequence of str
-        What else should be known.
-    """
-
-    title: str
-    records: Iterable[UnitRecord]
-    unit: BiasUnit
-    line: LineReport
-    T: Array
-    curves: Any
-    drawn: Sequence[str]
-    mean: Array | None = None
-    odd: Mapping[str, Sequence[Outlier]] = field(default_factory=dict)
-    effects: Sequence[SharedEffectRow] = ()
-    links: Mapping[str, str] = field(default_factory=dict)
-    remarks: Sequence[str] = ()
-
-
 def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
-    line, effects = overview.line, overview.effects
+    line, effects, records = overview.line, overview.effects, overview.records
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
-    rows = FleetRows(overview.unit)
-    for record in overview.records:
-        rows.add(record, reasons.get(record.unit, ""), overview.links.get(record.unit, ""))
-    odd, failed, table = len(reasons), len(rows.failed), rows.table()
-    units = f"{rows.count:,} unit{'s' * (rows.count != 1)}"
-    lead = [f"{units}: {rows.count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    failed = [record for record in records if record.state == "failed"]
+    done = [record for record in records if record.state == "done"]
+    limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
+    units = f"{len(records):,} unit{'s' * (len(records) != 1)}"
+    lead = [f"{units}: {len(records) - len(failed):,} done, {len(failed):,} failed", f"{odd:,} odd"]
     lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
     write_page(
         path,
         "fleet",
         title=overview.title,
         lead="; ".join(lead),
-        limits=verdict_of_units(rows.limits).capitalize(),
-        outcome=worst([row for of_unit in rows.limits for row in of_unit]),
+        limits=verdict_of_units(limits).capitalize(),
+        outcome=worst([row for of_unit in limits for row in of_unit]),
         verdict=line.sentences[0],
         remarks=[*line.sentences[1:], *overview.remarks],
-        numbers=rows.numbers(),
-        maps=_maps(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
+        numbers=_numbers(records),
+        maps=map_charts(
+            overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
+        ),
         lots=distributions(line),
         charts=control_charts(line),
         line=line,
@@ -138,144 +59,92 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
         odd_count=odd,
         first=FIRST,
-        failed=[(unit, "", error) for unit, error in rows.failed[:LISTED]],
-        failed_count=failed,
-        left_out=rows.count - len(table["unit"]),
+        failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
+        failed_count=len(failed),
+        left_out=len(records) - len(table["unit"]),
         names=embedded(list(line.units)),
         table=embedded(table),
     )
 
 
-def _maps(overview: FleetOverview, ranges: Array) -> list[Chart]:
-    if not len(overview.drawn):
-        return []
-    curves, axes = overview.curves, overview.line.axes
-    maps = MapFan(overview.T, curves, overview.drawn, axes, overview.unit, overview.mean, overview.odd)
-    return [maps.fan(ranges), *([maps.spread()] if len(overview.drawn) > 1 else [])]
-
-
 ROWS = 5000
-COLUMNS = ("unit", "date", "state", "odd", "verdict", "hours", "low", "high")
 VERDICTS = ("pass", "undecided", "fail", "not measured", "not judged")
 
 
-class FleetRows:
-    """The records of all units, one after the other, for the page.
+def _numbers(records: Sequence[UnitRecord]) -> list[tuple[str, str]]:
+    """Return hours of recordings, processor time, and versions."""
+    seconds, versions = sum(record.seconds for record in records), Counter(record.driftlab for record in records)
+    numbers = [("recordings at rest", f"{sum(record.hours for record in records):,.1f} h")]
+    if seconds:
+        each = f"{seconds / len(records):.2g} s a unit"
+        numbers.append(("time of one processor", f"{seconds:,.1f} s, {each}"))
+    for version, count in versions.items():
+        if version:
+            text = version if len(versions) == 1 else f"{version}, {count:,} units"
+            numbers.append(("computed by driftlab", text))
+    return numbers
 
-    The table has at most ROWS: the odd, the failed, and every one, second, fourth, ... of the others, as many as fit.
 
-    Attributes
-    ----------
-    count : int
-        Units.
-    failed : list of (unit, error)
-    limits : list of lists of dict
-        Of each unit that is done, held against it.
-    ranges : list of (from, to)
-        Temperatures of each unit that is done, degC.
+def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any]:
+    """Return the columns of the table, in the order of the units, for `fleet.js`; `reasons` are why units are odd.
+
+    It has at most ROWS: the odd, the failed, and every one, second, fourth, ... of the others, as many as fit.
     """
-
-    def __init__(self, unit: BiasUnit) -> None:
-        self.unit, self.count, self.hours, self.seconds = unit, 0, 0.0, 0.0
-        self.failed: list[tuple[str, str]] = []
-        self.limits: list[list[dict[str, Any]]] = []
-        self.ranges: list[tuple[float, float]] = []
-        self.versions: dict[str, int] = {}
-        self.axes: tuple[str, ...] = ()
-        self._special: list[tuple[int, dict[str, Any]]] = []
-        self._sample: list[tuple[int, dict[str, Any]]] = []
-        self._others, self._step = 0, 1
-
-    def add(self, record: UnitRecord, why: str, link: str) -> None:
-        """Take the next record; `why` it is odd, and the `link` to its page."""
-        self.count += 1
-        if record.state == "failed":
-            self.failed.append((record.unit, record.error))
-        elif record.state == "done":
-            self.limits.append(record.limits)
-            self.ranges += [] if record.domain is None else [record.domain]
-        self.axes = self.axes or record.axes
-        self.hours, self.seconds = self.hours + record.hours, self.seconds + record.seconds
-        self.versions[record.driftlab] = self.versions.get(record.driftlab, 0) + 1
-        row = self.count, _row(record, self.unit, why, link)
-        if record.state == "failed" or why:
-            self._special.append(row)
-            return
-        if self._others % self._step == 0:
-            self._sample.append(row)
-        self._others += 1
-        if len(self._sample) > ROWS:
-            self._sample, self._step = self._sample[::2], 2 * self._step
-
-    def numbers(self) -> list[tuple[str, str]]:
-        """Return hours of recordings, processor time, and versions."""
-        numbers = [("recordings at rest", f"{self.hours:,.1f} h")]
-        if self.seconds and self.count:
-            each = f"{self.seconds / self.count:.2g} s a unit"
-            numbers.append(("time of one processor", f"{self.seconds:,.1f} s, {each}"))
-        for version, count in self.versions.items():
-            if version:
-                text = version if len(self.versions) == 1 else f"{version}, {count:,} units"
-                numbers.append(("computed by driftlab", text))
-        return numbers
-
-    def table(self) -> dict[str, Any]:
-        """Return the columns of the table, in the order in which the units came, for `fleet.js`."""
-        rows = [row for _, row in sorted([*self._special, *self._sample], key=lambda numbered: numbered[0])]
-        lots = sorted({row["lot"] for row in rows})
-        places = {lot: k for k, lot in enumerate(lots)}
-        more = dict.fromkeys(name for row in rows for name in row["more"])
-        figures = []
-        for f, name in enumerate(FIGURES):
-            values = [row["figures"][f] for row in rows]
-            columns = [[v[k] if k < len(v) else None for v in values] for k in range(len(self.axes))]
-            if any(value is not None for column in columns for value in column):
-                figures.append({"name": name, "unit": self.unit.shown + PER.get(name, ""), "columns": columns})
-        return {
-            "axes": list(self.axes), "lots": lots, "verdicts": list(VERDICTS), "figures": figures,
-            "lot": [places[row["lot"]] for row in rows],
-            **{name: [row[name] for row in rows] for name in COLUMNS},
-            "why": {k: row["why"] for k, row in enumerate(rows) if row["why"]},
-            "links": {k: row["link"] for k, row in enumerate(rows) if row["link"]},
-            "more": {name: [row["more"].get(name, "") for row in rows] for name in more},
-        }  # fmt: skip
-
-
-def _row(record: UnitRecord, unit: BiasUnit, why: str, link: str) -> dict[str, Any]:
-    low, high = record.domain or (None, None)
-    figures = [figure.value if (figure := record.figures.get(name)) else () for name in FIGURES]
+    special = [k for k, r in enumerate(overview.records) if r.state == "failed" or reasons.get(r.unit)]
+    others, step = sorted(set(range(len(overview.records))) - set(special)), 1
+    while len(others[::step]) > ROWS:
+        step *= 2
+    records = [overview.records[k] for k in sorted([*special, *others[::step]])]
+    places = {lot: k for k, lot in enumerate(sorted({record.lot for record in records}))}
+    axes = next((record.axes for record in overview.records if record.axes), ())
+    unit, figures = overview.unit, []
+    for name in FIGURES:
+        values = [figure.value if (figure := record.figures.get(name)) else () for record in records]
+        short = [[None if v is None else rounded(v * unit.factor, 4) for v in of_axes] for of_axes in values]
+        columns = [[row[k] if k < len(row) else None for row in short] for k in range(len(axes))]
+        if any(value is not None for column in columns for value in column):
+            figures.append({"name": name, "unit": unit.shown + PER.get(name, ""), "columns": columns})
+    domains = [record.domain or (None, None) for record in records]
+    why = [record.error if record.state == "failed" else reasons.get(record.unit, "") for record in records]
+    links = [overview.links.get(record.unit, "") for record in records]
+    more = dict.fromkeys(name for record in records for name in record.more)
     return {
-        "unit": record.unit, "lot": record.lot, "date": record.date, "more": record.more,
-        "state": int(record.state == "failed"), "odd": int(bool(why)),
-        "verdict": VERDICTS.index(worst(record.limits) or "not judged"),
-        "why": record.error if record.state == "failed" else why, "link": link,
-        "hours": rounded(record.hours, 4), "low": rounded(low, 4), "high": rounded(high, 4),
-        "figures": [[None if v is None else rounded(v * unit.factor, 4) for v in values] for values in figures],
+        "axes": list(axes), "lots": list(places), "verdicts": list(VERDICTS), "figures": figures,
+        "lot": [places[record.lot] for record in records],
+        "unit": [record.unit for record in records],
+        "date": [record.date for record in records],
+        "state": [int(record.state == "failed") for record in records],
+        "odd": [int(bool(reasons.get(record.unit))) for record in records],
+        "verdict": [VERDICTS.index(worst(record.limits) or "not judged") for record in records],
+        "hours": [rounded(record.hours, 4) for record in records],
+        "low": [rounded(low, 4) for low, _ in domains],
+        "high": [rounded(high, 4) for _, high in domains],
+        "why": {k: text for k, text in enumerate(why) if text},
+        "links": {k: link for k, link in enumerate(links) if link},
+        "more": {name: [record.more.get(name, "") for record in records] for name in more},
     }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class LineChange:
-    """A step or a trend of one chart, from which unit on, and between which units it lies."""
-
-    chart: ControlChart
-    change: StepChange | Trend
-    text: str
-    where: str
-    ends: tuple[str, str]
-    p: str
-
-
-def changes(line: LineReport) -> list[LineChange]:
-    """Return the changes of a line in their order, then its trends."""
+def changes(line: LineReport) -> list[dict[str, Any]]:
+    """Return the changes of a line in their order, then its trends: each from which unit on, and between which."""
     steps = [(chart, change) for chart in line.controls for change in chart.changes]
     result = []
     for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
-        text, ends = by_how_much(line, chart, change), (line.units[change.low], line.units[change.high])
-        p = "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}"
-        result.append(LineChange(chart, change, text, place(line, change.at), ends, p))
+        result.append({
+            "chart": chart, "change": change, "text": by_how_much(line, chart, change), "where": place(line, change.at),
+            "ends": (line.units[change.low], line.units[change.high]),
+            "p": "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
+        })  # fmt: skip
     for chart in line.controls:
         if (trend := chart.trend) is not None:
             text, ends = by_how_much(line, chart, trend), (line.units[int(chart.at[0])], line.units[int(chart.at[-1])])
-            result.append(LineChange(chart, trend, f"{text}, a trend", ends[0], ends, "–"))
+            row = {
+                "chart": chart,
+                "change": trend,
+                "text": f"{text}, a trend",
+                "where": ends[0],
+                "ends": ends,
+                "p": "–",
+            }
+            result.append(row)
     return result

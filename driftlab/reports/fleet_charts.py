@@ -7,19 +7,21 @@ the units lie, and those that are odd. m values, U units, d axes, G temperatures
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.outliers import Outlier
+from driftlab.family.record import UnitRecord
 from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series
 from driftlab.spc.charts import ControlChart, LineReport
 from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
 
 MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
+MAX_LOTS = 60  # lots that are drawn: the latest
 LIMITS = 300  # points of a limit that differs from unit to unit
 TITLES = {
     "residual": "Residual of the map, rms of 30 s averages",
@@ -120,60 +122,12 @@ def _limits(
     return [Line(place[at], shown(values[at]), name, role, style=style) for values in both]
 
 
-MAX_LOTS = 60  # lots that are drawn: the latest
+def distributions(line: LineReport) -> list[dict[str, Any]]:
+    """Return the distribution of each quantity, a row a lot, a column an axis; none where the units have no lots.
 
-
-@dataclass(frozen=True)
-class Box:
-    """The units of one lot on one axis.
-
-    Attributes
-    ----------
-    n : int
-    text : str
-        The median, with its unit's digits; an arrow where the lot's mean is beyond the limits of the line.
-    out : bool
-        Whether it is.
-    low, quarter, half, most, high : float
-        5, 25, 50, 75, 95 %, as per cent of the scale.
+    Each has `title`, `unit`, `axes`, the values at either end of the boxes of each axis (`scale`), the number of lots
+    that are not drawn (`left_out`), and `rows` of a lot and its boxes, None where it has no value on an axis.
     """
-
-    n: int
-    text: str
-    out: bool
-    low: float
-    quarter: float
-    half: float
-    most: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Distribution:
-    """One quantity, a row a lot, a column an axis.
-
-    Attributes
-    ----------
-    title, unit : str
-    axes : list of str
-    scale : list of (str, str)
-        Of each axis, the values at either end of its boxes.
-    rows : list of (lot, boxes)
-        None where a lot has no value on an axis.
-    left_out : int
-        Lots that are not drawn.
-    """
-
-    title: str
-    unit: str
-    axes: list[str]
-    scale: list[tuple[str, str]]
-    rows: list[tuple[str, list[Box | None]]]
-    left_out: int
-
-
-def distributions(line: LineReport) -> list[Distribution]:
-    """Return the distribution of each quantity by lot; none where the units have no lots."""
     lots = list(dict.fromkeys(lot for lot in line.lots if lot))
     if not lots:
         return []
@@ -181,10 +135,16 @@ def distributions(line: LineReport) -> list[Distribution]:
     for name, charts in _by_quantity(line).items():
         spans, unit = [_lot_span(chart) for chart in charts], line.shown(name)
         boxes = [_boxes(line, chart, span) for chart, span in zip(charts, spans, strict=True)]
-        rows = [(lot, [by_lot.get(lot) for by_lot in boxes]) for lot in lots[-MAX_LOTS:]]
-        scale = [(number(low * unit.factor, zeros=True), number(high * unit.factor, zeros=True)) for low, high in spans]
-        axes, left_out = [chart.axis for chart in charts], max(len(lots) - MAX_LOTS, 0)
-        result.append(Distribution(TITLES.get(name, name), unit.shown, axes, scale, rows, left_out))
+        result.append(
+            {
+                "title": TITLES.get(name, name),
+                "unit": unit.shown,
+                "axes": [chart.axis for chart in charts],
+                "scale": [[number(end * unit.factor, zeros=True) for end in span] for span in spans],
+                "rows": [(lot, [by_lot.get(lot) for by_lot in boxes]) for lot in lots[-MAX_LOTS:]],
+                "left_out": max(len(lots) - MAX_LOTS, 0),
+            }
+        )
     return result
 
 
@@ -194,14 +154,19 @@ def _lot_span(chart: ControlChart) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> dict[str, Box]:
+def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> dict[str, dict[str, Any]]:
+    """Return the units of each lot on one axis: how many, the median as a text, and places in per cent of the scale.
+
+    `out` is where the lot's mean is beyond the limits of the line.
+    """
     low, high = span
     factor, names = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at]
     boxes = {}
     for lot in chart.lots:
-        values = np.percentile(chart.value[names == lot.name], (5, 25, 50, 75, 95))
+        values = np.percentile(chart.value[names == lot.name], SHARES)
         places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
-        boxes[lot.name] = Box(lot.n, number(values[2] * factor, zeros=True), lot.out, *places)
+        places = dict(zip(("low", "quarter", "half", "most", "high"), places, strict=True))
+        boxes[lot.name] = {"n": lot.n, "text": number(values[2] * factor, zeros=True), "out": lot.out, **places}
     return boxes
 
 
@@ -212,92 +177,138 @@ EACH = 20  # units of which each is drawn: percentiles of so few say little
 DRAWN = 40  # odd units on an axis at most
 
 
-@dataclass(frozen=True, eq=False)
-class MapFan:
-    """The maps of a fleet's units.
+@dataclass(frozen=True)
+class SharedEffectRow:
+    """An effect that the units share.
 
     Attributes
     ----------
+    name : str
+    sentence : str
+        What it is, how large, and how sure.
+    unit : str
+        Of the sizes by lot, as they are shown.
+    lots : tuple of (lot, units, axis, size, sigma)
+        Its mean size in each lot, in `unit`.
+    """
+
+    name: str
+    sentence: str
+    unit: str = ""
+    lots: tuple[tuple[str, int, str, float, float], ...] = ()
+
+    @property
+    def axes(self) -> list[str]:
+        """The axes of `lots`, in their order."""
+        return list(dict.fromkeys(axis for _, _, axis, _, _ in self.lots))
+
+    @property
+    def rows(self) -> list[tuple[str, int, list[str]]]:
+        """Of each lot its name, its units, and a text an axis: the size, and by how much it may be off (1 sigma)."""
+        rows: dict[str, tuple[int, dict[str, str]]] = {}
+        for lot, n, axis, size, sigma in self.lots:
+            rows.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
+        return [(lot, n, [texts.get(axis, "–") for axis in self.axes]) for lot, (n, texts) in rows.items()]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetOverview:
+    """The content of the page.
+
+    Attributes
+    ----------
+    title : str
+        Of the fleet.
+    records : sequence of UnitRecord
+        In the order of the manifest.
+    unit : BiasUnit
+        In which biases are shown.
+    line : LineReport
     T : (G,) array
         degC.
     curves : (U, d, G) array
-        Over T, SI.
+        Maps of the units over T, single precision will do.
     drawn : sequence of str
         Whose they are.
-    axes : sequence of str
-    unit : BiasUnit
-        In which biases are shown.
     mean : (d, G) array or None
-        The family's curve, SI.
+        The family's curve.
     odd : mapping of str to sequence of Outlier
-        By unit, why it is odd.
+        By unit.
+    effects : sequence of SharedEffectRow
+    links : mapping of str to str
+        Units' pages, relative to this one.
+    remarks : sequence of str
+        What else should be known.
     """
 
+    title: str
+    records: Sequence[UnitRecord]
+    unit: BiasUnit
+    line: LineReport
     T: Array
     curves: Any
     drawn: Sequence[str]
-    axes: Sequence[str]
-    unit: BiasUnit
-    mean: Array | None
-    odd: Mapping[str, Sequence[Outlier]]
+    mean: Array | None = None
+    odd: Mapping[str, Sequence[Outlier]] = field(default_factory=dict)
+    effects: Sequence[SharedEffectRow] = ()
+    links: Mapping[str, str] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
 
-    def fan(self, ranges: Array) -> Chart:
-        """Return the fan of the curves, and how many units were measured at each temperature.
 
-        `ranges` (n, 2) are the temperatures that each unit was soaked at, from and to, degC.
-        """
-        T, (low, high) = self.T, ranges.T
-        near = 0.5 * float(np.diff(T).max())  # a soak reaches the temperature of the grid that it comes nearest to
-        count = np.array([np.sum((low <= at + near) & (at - near <= high)) for at in T], dtype=np.float64)
-        line, span = Line(T, count, "units measured", "data"), (0.0, 1.1 * max(count.max(), 1.0))
-        below = Panel((line,), "units measured", height=0.6, span=span)
-        panels = self._panels(percentiles(self.curves), self.curves, self.mean, "bias")
-        return Chart(
-            (*panels, below),
-            LABEL,
-            "Maps of the units",
-            self._caption("Below: at how many units' soaks this temperature was."),
-        )
+def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:
+    """Return the fan of the units' curves, and that of what they are less their median.
 
-    def spread(self) -> Chart:
-        """Return the fan of the curves less their median."""
-        bands = percentiles(self.curves)
-        middle = bands[SHARES.index(50)].astype(self.curves.dtype)
-        panels = self._panels(bands - middle, self.curves - middle, None, "less the median:")
-        return Chart(panels, LABEL, "Deviation from the median of the units", self._caption(""))
+    Below the first, how many units were measured at each temperature: `ranges` (n, 2) are those that each unit was
+    soaked at, from and to, degC.
+    """
+    curves, T, U = overview.curves, overview.T, len(overview.drawn)
+    if not U:
+        return []
+    caption = (
+        f"Of {U:,} unit{'s' * (U != 1)}: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its "
+        "own. Lines with a unit's name: of an odd shape on this axis."
+    )
+    low, high = ranges.T
+    near = 0.5 * float(np.diff(T).max())  # a soak reaches the temperature of the grid that it comes nearest to
+    count = np.array([np.sum((low <= at + near) & (at - near <= high)) for at in T], dtype=np.float64)
+    line, span = Line(T, count, "units measured", "data"), (0.0, 1.1 * max(count.max(), 1.0))
+    bands, below = percentiles(curves), Panel((line,), "units measured", height=0.6, span=span)
+    panels = (*_fan(overview, bands, curves, overview.mean, "bias"), below)
+    more = f"{caption} Below: at how many units' soaks this temperature was."
+    charts = [Chart(panels, LABEL, "Maps of the units", more)]
+    if U > 1:
+        middle = bands[SHARES.index(50)].astype(curves.dtype)
+        panels = _fan(overview, bands - middle, curves - middle, None, "less the median:")
+        charts.append(Chart(panels, LABEL, "Deviation from the median of the units", caption))
+    return charts
 
-    def _panels(self, bands: Array, curves: Any, mean: Array | None, quantity: str) -> tuple[Panel, ...]:
-        # what else is odd than a shape is not to be seen in a map
-        bent = {name: {axis for one in odd if one.T is not None for axis in one.axis.split()}
-                for name, odd in self.odd.items()}  # fmt: skip
-        bent = {name: axes for name, axes in bent.items() if axes}
-        named = [name for name in self.drawn if name in bent][:NAMED]
-        looks = {name: (name, series(k + 1)) for k, name in enumerate(named)}
-        T, factor = self.T, self.unit.factor
 
-        def lines(axis: int) -> Iterator[Line]:
-            five, quarter, half, most, all_but_five = bands[:, axis] * factor
-            yield Line(T, None, "90 % of the units", "estimate", five, all_but_five)
-            yield Line(T, None, "half of the units (darker)", "estimate", quarter, most)
-            yield Line(T, half, "median", "estimate")
-            if mean is not None:
-                yield Line(T, mean[axis] * factor, "mean of the family", "sigma", style="dashed")
-            if len(self.drawn) <= EACH:
-                for curve in curves[:, axis]:
-                    yield Line(T, np.asarray(curve, dtype=np.float64) * factor, "a unit", "data")
-            odd = [k for k, name in enumerate(self.drawn) if self.axes[axis] in bent.get(name, ())]
-            for k in odd[:DRAWN]:
-                name, role = looks.get(self.drawn[k], ("more odd units", "limit"))
-                yield Line(T, np.asarray(curves[k, axis], dtype=np.float64) * factor, name, role)
+def _fan(overview: FleetOverview, bands: Array, curves: Any, mean: Array | None, quantity: str) -> tuple[Panel, ...]:
+    drawn, axes = overview.drawn, overview.line.axes
+    # what else is odd than a shape is not to be seen in a map
+    bent = {name: {axis for one in odd if one.T is not None for axis in one.axis.split()}
+            for name, odd in overview.odd.items()}  # fmt: skip
+    bent = {name: axes for name, axes in bent.items() if axes}
+    named = [name for name in drawn if name in bent][:NAMED]
+    looks = {name: (name, series(k + 1)) for k, name in enumerate(named)}
+    T, factor = overview.T, overview.unit.factor
 
-        return axis_panels(self.axes, lines, quantity, self.unit.shown, height=1.2)
+    def lines(axis: int) -> Iterator[Line]:
+        five, quarter, half, most, all_but_five = bands[:, axis] * factor
+        yield Line(T, None, "90 % of the units", "estimate", five, all_but_five)
+        yield Line(T, None, "half of the units (darker)", "estimate", quarter, most)
+        yield Line(T, half, "median", "estimate")
+        if mean is not None:
+            yield Line(T, mean[axis] * factor, "mean of the family", "sigma", style="dashed")
+        if len(drawn) <= EACH:
+            for curve in curves[:, axis]:
+                yield Line(T, np.asarray(curve, dtype=np.float64) * factor, "a unit", "data")
+        odd = [k for k, name in enumerate(drawn) if axes[axis] in bent.get(name, ())]
+        for k in odd[:DRAWN]:
+            name, role = looks.get(drawn[k], ("more odd units", "limit"))
+            yield Line(T, np.asarray(curves[k, axis], dtype=np.float64) * factor, name, role)
 
-    def _caption(self, more: str) -> str:
-        U = len(self.drawn)
-        return (
-            f"Of {U:,} unit{'s' * (U != 1)}: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its "
-            f"own. Lines with a unit's name: of an odd shape on this axis. {more}"
-        ).strip()
+    return axis_panels(axes, lines, quantity, overview.unit.shown, height=1.2)
 
 
 def percentiles(curves: Any) -> Array:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from driftlab.reports.charts import Chart
 from driftlab.reports.pages import embedded, page
 from driftlab.units import axis_name, unit_of
-
-if TYPE_CHECKING:
-    from fusion_core.contracts import Sensor
+from fusion_core.contracts import Sensor
 
 
 def live_page(

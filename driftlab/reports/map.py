@@ -65,10 +65,15 @@ def _of_axis(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...
             data.append(Line(x, y * unit.factor, way_name, role, style="points"))
             left.append(Line(x, less, way_name, role, style="points"))
     shades, estimate = _holes(verdict), Line(T, curve, "curve", "estimate", low, high)
-    lines = (_white(verdict, unit, axis), *left, *_halves(verdict, unit, axis))
+    lines = [_white(verdict, unit, axis), *left]
+    if verdict.seen:
+        half = verdict.memory.difference[:, axis] / 2 * unit.factor
+        for way_name, way in WAYS.items():
+            seen = f"{way_name}, by the difference seen"
+            lines.append(Line(verdict.memory.T, half * way, seen, way_name, style="dashed"))
     return (
         Panel((*data, estimate), f"bias {name} [{unit.shown}]", shades, height=1.3),
-        Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),)),
+        Panel(tuple(lines), f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),)),
     )
 
 
@@ -79,16 +84,6 @@ def _white(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Line:
     n = np.where(ways > 0, count.sum(axis=0) / np.maximum(ways, 1), np.nan)
     sigma = verdict.soak.white[axis] * unit.factor / np.sqrt(n)
     return band_alone(verdict.coverage.T, sigma, "white noise alone", "sigma")
-
-
-def _halves(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
-    if not verdict.seen:
-        return ()
-    half = verdict.memory.difference[:, axis] / 2 * unit.factor
-    return tuple(
-        Line(verdict.memory.T, half * way, f"{name}, by the difference seen", name, style="dashed")
-        for name, way in WAYS.items()
-    )
 
 
 def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:

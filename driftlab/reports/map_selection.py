@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,44 +13,26 @@ from driftlab import __version__
 from driftlab.maps.kind_selection import ERROR_RANGES, KindComparison, Tried
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
 from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, series
-from driftlab.reports.figures import figure_of
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit, with_uncertainty
 from fusion_core.chunk import Array
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
-
 
 CURVES = 4  # kinds whose curves are drawn
 WIDE = 5.0  # between errors that are drawn by their logarithm
 
 
-def columns(axes: Sequence[str], unit: BiasUnit) -> list[str]:
-    """Return the heads of the columns of `rows`."""
-    of_axes = [f"{axis} [{unit.shown}]" for axis in axes] if len(axes) > 1 else []
-    return ["kind", f"left-out error [{unit.shown}]", f"above the smallest [{unit.shown}]", *of_axes]
-
-
-def rows(comparison: KindComparison, unit: BiasUnit) -> list[list[str]]:
-    """Return the cells of the table: the chosen kind, then the others from the smallest error on, no map, failures."""
+def comparison_table(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> TextTable:
+    """Return the chosen kind, then the others from the smallest error on, and no map; without those that failed."""
     chosen, without = comparison.chosen, comparison.without
-    others = sorted((row for row in comparison.tried if row is not chosen), key=lambda row: row.error)
     cells = []
-    for row in (row for row in [chosen, *others, without] if not row.failed):
+    for row in [chosen, *(row for row in _by_error(comparison) if row is not chosen), without]:
         name = f"{row.name} *" if row is chosen else row.name
         more = "" if row is without else "smallest" if row is comparison.best else _pm(row.more, row.more_sigma, unit)
         of_axes = [f"{value * unit.factor:.3g}" for value in row.rms] if len(row.rms) > 1 else []
         cells.append([name, _pm(row.error, row.sigma, unit), more, *of_axes])
-    return cells
-
-
-def comparison_table(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
-    """Return the table for a terminal."""
-    title = "left-out error of each kind; * is taken"
-    table = TextTable(columns(axes, unit), rows(comparison, unit), title)
-    return table.rich(whole=False, framed=False, width=12)
+    of_axes = [f"{axis} [{unit.shown}]" for axis in axes] if len(axes) > 1 else []
+    heads = ["kind", f"left-out error [{unit.shown}]", f"above the smallest [{unit.shown}]", *of_axes]
+    return TextTable(heads, cells, "left-out error of each kind; * is taken", whole=False, framed=False, width=12)
 
 
 def failures(comparison: KindComparison) -> list[str]:
@@ -184,22 +165,13 @@ def curve_chart(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str])
     return Chart(axis_panels(axes, lines, "bias", unit.shown), "temperature [°C]", "Curves of the kinds")
 
 
-@dataclass(frozen=True)
-class ComparisonSection:
-    """The section of a page on the choice of a kind."""
-
-    sentences: list[str]
-    table: TextTable
-    charts: list[Chart]
-
-
-def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> ComparisonSection:
+def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
     """Return the section of a page: its sentences, its table and its charts."""
-    return ComparisonSection(
-        [*verdict(comparison, unit, axes), *failures(comparison)],
-        TextTable(columns(axes, unit), rows(comparison, unit)),
-        [error_chart(comparison, unit), curve_chart(comparison, unit, axes)],
-    )
+    return {
+        "sentences": [*verdict(comparison, unit, axes), *failures(comparison)],
+        "table": comparison_table(comparison, unit, axes),
+        "charts": [error_chart(comparison, unit), curve_chart(comparison, unit, axes)],
+    }
 
 
 def _pm(value: float, sigma: float, unit: BiasUnit) -> str:
@@ -252,7 +224,7 @@ def _number_of(unit: BiasUnit) -> Callable[[float, str], str]:
     return lambda value, width: f"{value * unit.factor:{width}{digits}}"
 
 
-def selection_table(selection: Selection, unit: BiasUnit) -> Table:
+def selection_table(selection: Selection, unit: BiasUnit) -> TextTable:
     """Return Sr of every size; * marks the chosen one of each target."""
     number = _number_of(unit)
     heads = [f"{target} {part}\n{_unit_text(target, unit)}" for target in TITLES for part in PARTS]
@@ -263,8 +235,8 @@ def selection_table(selection: Selection, unit: BiasUnit) -> Table:
             train, validation, test = (number(value, "") for value in target.Sr[k])
             row += [train, f"{validation}{'*' if n == target.chosen else ' '}", test]
         cells.append(row)
-    table = TextTable(["n", *heads], cells, "Sr, eq. (12); * is chosen", texts=False)
-    return table.rich(whole=False, framed=False)
+    title = "Sr, eq. (12); * is chosen"
+    return TextTable(["n", *heads], cells, title, texts=0, whole=False, framed=False)
 
 
 def comparison(selection: Selection, unit: BiasUnit) -> list[str]:
@@ -279,11 +251,6 @@ def comparison(selection: Selection, unit: BiasUnit) -> list[str]:
         f"derivative against the test part's difference quotients, rms of each axis in {unit.shown}/K:",
         *(f"  {name:<34}" + "".join(number(value, "9") for value in values) for name, values in errors.items()),
     ]
-
-
-def figure(selection: Selection, unit: BiasUnit) -> Figure:
-    """Draw `chart` by matplotlib."""
-    return figure_of(chart(selection, unit))
 
 
 def chart(selection: Selection, unit: BiasUnit) -> Chart:

@@ -1,10 +1,14 @@
-"""A plan: sentences, a table of profiles, charts, JSON and its page; and the parts that all plans share."""
+"""A plan as a page: sentences, a table of profiles, charts and JSON; and the plan of what is recorded first.
+
+`plan_continuation` makes the page of a plan after recordings, `plan_short_soak` that of a unit whose family is known.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +24,148 @@ from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it
 NOTES = "Remarks"  # heading of the sentences on a page
+CHOSEN = "Chosen profile"
 
 
-def headline(plan: SearchResult) -> str:
+@dataclass(frozen=True)
+class PlanPage:
+    """A plan in words, as a table, as charts, and as JSON.
+
+    Attributes
+    ----------
+    headline : str
+        What to record, and what comes of it.
+    lines : list of str
+        The reasons for the profile, and the basis of the plan, a sentence each.
+    document : dict
+        The plan as JSON holds it: SI, temperatures in degC.
+    table : TextTable
+        The profiles, the chosen one first.
+    chart : Chart
+        The one that a notebook shows.
+    parts : list of (str, object)
+        Of the page: headings, and under each a Chart, a TextTable, a section of effects, or a list of sentences.
+    outcome : str
+        Class of the headline on the page.
+    """
+
+    headline: str
+    lines: list[str]
+    document: dict[str, Any]
+    table: TextTable
+    chart: Chart
+    parts: list[tuple[str, Any]]
+    outcome: str = ""
+
+    def write(self, path: Path, title: str, profile: Profile) -> None:
+        """Write the page; the set points of the profile stand at its end."""
+        rows = [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
+        setpoints = TextTable(["time [h]", "temperature [°C]"], rows, texts=0)
+        write_page(
+            path, "plan", title=title, lead=self.headline, outcome=self.outcome, parts=self.parts, setpoints=setpoints
+        )
+
+
+def write_profile(path: Path, profile: Profile) -> None:
+    """Write the set points of a profile for the chamber; straight lines in between."""
+    rows = zip(profile.time, profile.temperature, strict=True)
+    lines = "".join(f"{t:.1f},{T:.3f}\n" for t, T in rows)
+    path.write_text("time [s],temperature [degC]\n" + lines, encoding="utf-8")
+
+
+# what the three forms share
+
+
+def profile_chart(profile: Profile, lag: float, title: str, caption: str) -> Chart:
+    """Return the set points over time, and the temperature of a unit that follows them with a lag in s."""
+    t, body = profile.samples(lag, WIDE)
+    lines = (
+        Line(t / 3600, profile.chamber(t), "set point", "temperature"),
+        Line(t / 3600, body, "unit", "estimate"),
+    )
+    return Chart((Panel(lines, "temperature [°C]"),), "time [h]", title, caption)
+
+
+def chosen_profile(profile: Profile, lag: float) -> tuple[str, Chart]:
+    """Return the part of a page on the chosen profile."""
+    caption = f"{profile.name}; the set points are in setpoints.csv"
+    return CHOSEN, profile_chart(profile, lag, CHOSEN, caption)
+
+
+def sigma_panels(
+    axes: Sequence[str], curves: Sequence[tuple[Array, Array, str]], unit: BiasUnit, **how: Any
+) -> tuple[Panel, ...]:
+    """Return sigma over temperature, a panel an axis: of curves (T, sigma, name) the first solid, the second dashed."""
+
+    def lines(axis: int) -> Iterator[Line]:
+        for k, (T, sigma, name) in enumerate(curves):
+            yield Line(T, sigma[:, axis] * unit.factor, name, f"series:{k}", style="dashed" if k else "line")
+
+    return axis_panels(axes, lines, "sigma", unit.shown, log=True, **how)
+
+
+def hours_chart(lines: Sequence[Line], target: float | None, unit: BiasUnit, title: str, caption: str) -> Chart:
+    """Return sigma over the length of a soak."""
+    label = f"sigma, rms of the worst axis [{unit.shown}]"
+    panel = Panel(tuple(lines), label, rules=target_rule(target, unit.factor), log=True)
+    return Chart((panel,), "length [h]", title, caption, log=True)
+
+
+def head(subject: UnitModel, chamber: Chamber, hours: float, /, **more: Any) -> dict[str, Any]:
+    """Return the head of a plan as JSON holds it: the chamber, with `more` after its range, and the unit."""
+    return {
+        "schema": 1,
+        "driftlab": __version__,
+        "hours": hours,
+        "range": [chamber.low, chamber.high],
+        **more,
+        "unit": subject.unit.si,
+        "channel": subject.channel,
+        "kind": subject.map.kind,
+        "noise": by_axis(subject.axes, subject.noise),
+        "walk": by_axis(subject.axes, subject.walk),
+        "noise_of": subject.noise_of,
+    }
+
+
+def by_axis(axes: Sequence[str], values: Array) -> dict[str, Any]:
+    """Return values (d,), or the columns of values (N, d), by the names of the axes."""
+    return dict(zip(axes, values.T, strict=True))
+
+
+def expected_sigma(axes: Sequence[str], unit: BiasUnit, rated: RatedProfile) -> dict[str, Any]:
+    """Return the sigma of a map over temperature as JSON holds it."""
+    return {"unit": unit.si, "temperature_degC": rated.temperature, **by_axis(axes, rated.sigma)}
+
+
+def knots(profile: Profile) -> dict[str, Any]:
+    """Return the set points of a profile as JSON holds them."""
+    return {"knots": {"time_s": profile.time, "temperature_degC": profile.temperature}}
+
+
+# before anything is recorded
+
+
+def page_of_search(plan: SearchResult, lag_of: str, outlook: DetectabilityReport) -> PlanPage:
+    """Return the page of a first soak; `lag_of` says where the lag of the body is from."""
+    lines = [*_reasons(plan, lag_of), *plan_effects.brief(outlook)]
+    table, sigma, pareto = _profiles(plan), _sigma_chart(plan), _pareto(plan)
+    parts = [
+        chosen_profile(plan.chosen.profile, plan.chamber.lag),
+        ("Profiles of the same hours", table),
+        (plan_effects.HEADING, plan_effects.section(outlook)),
+        (NOTES, lines),
+        (sigma.title, sigma),
+        (pareto.title, pareto),
+    ]
+    document = _search_document(plan, lines) | {"effects": plan_effects.document(outlook)}
+    return PlanPage(_headline(plan), lines, document, table, sigma, parts)
+
+
+def _headline(plan: SearchResult) -> str:
     """Return the recording to make, and the sigma that its map will have."""
     best, unit = plan.chosen, plan.subject.unit
     value, at, axis = best.worst
@@ -40,32 +177,37 @@ def headline(plan: SearchResult) -> str:
     )
 
 
-def lines(plan: SearchResult, lag_of: str) -> list[str]:
+def _reasons(plan: SearchResult, lag_of: str) -> list[str]:
     """Return the reasons for the choice, and the assumptions it rests on, a sentence each."""
-    subject, best = plan.subject, plan.chosen
-    reasons = [_why(plan), *_target(plan), *_limits(plan)]
+    subject, best, unit = plan.subject, plan.chosen, plan.subject.unit
     low, high = best.covered
-    reasons.append(
-        f"the body follows the chamber with {plan.chamber.lag:.4g} s ({lag_of}) and comes to {low:.4g} to {high:.4g} °C"
-    )
-    unit = subject.unit
     each = zip(subject.noise, subject.walk, subject.floor, strict=True)
     values = dict.fromkeys(
         f"noise {unit.text(n, '/sqrt(Hz)')}, walk {unit.text(k, '/sqrt(s)')} (Allan floor {_size(f, unit)})"
         for n, k, f in each
     )
-    reasons.append(f"it stands on {'; '.join(values)}: {subject.noise_of}{_tuning(subject.noise_of)}")
-    if subject.shape is None:
-        reasons.append(
-            f"the curve is not known: {subject.map.kind} is planned as rough as it can be, and what it cannot follow "
-            "is not counted; name a fitted map, be it of another unit of the product"
-        )
-    else:
-        reasons.append(f"the curve is {subject.shape_of}; loops of hysteresis and effects of rate are not in sigma")
-    return reasons
+    tuning = (
+        "; a walk that was tuned wider than the unit's makes sigma too large: `driftlab allan` measures it on a log at "
+        "rest, --walk takes it"
+    )
+    curve = (
+        f"the curve is not known: {subject.map.kind} is planned as rough as it can be, and what it cannot follow "
+        "is not counted; name a fitted map, be it of another unit of the product"
+        if subject.shape is None
+        else f"the curve is {subject.shape_of}; loops of hysteresis and effects of rate are not in sigma"
+    )
+    return [
+        _beside_classic(plan),
+        *_target(plan),
+        *_limits(plan),
+        f"the body follows the chamber with {plan.chamber.lag:.4g} s ({lag_of}) and comes to {low:.4g} to "
+        f"{high:.4g} °C",
+        f"it stands on {'; '.join(values)}: {subject.noise_of}{tuning if subject.noise_of == FILTERS else ''}",
+        curve,
+    ]
 
 
-def _why(plan: SearchResult) -> str:
+def _beside_classic(plan: SearchResult) -> str:
     classic, best = plan.classic, plan.chosen
     if classic is None or classic is best:
         return "no other profile of these hours is better"
@@ -82,9 +224,8 @@ def _why(plan: SearchResult) -> str:
 def _target(plan: SearchResult) -> list[str]:
     if plan.target is None:
         return []
-    unit = plan.subject.unit
+    unit, shortest = plan.subject.unit, plan.shortest
     asked = f"{plan.target * unit.factor:.4g} {unit.shown}"
-    shortest = plan.shortest
     if shortest is None:
         return [f"{asked} is reached by no profile of any length that can be meant: see what limits it below"]
     return [f"{asked} is reached in {shortest.profile.hours:.3g} h at the shortest: {shortest.profile.name}"]
@@ -102,54 +243,27 @@ def _limits(plan: SearchResult) -> list[str]:
     ]
 
 
-def _tuning(whose: str) -> str:
-    if whose != FILTERS:
-        return ""
-    return (
-        "; a walk that was tuned wider than the unit's makes sigma too large: `driftlab allan` measures it on a log at "
-        "rest, --walk takes it"
-    )
-
-
 def _size(value: float, unit: BiasUnit) -> str:
     return f"{number(value * unit.factor, zeros=True)} {unit.shown}"
 
 
-def table(plan: SearchResult) -> Table:
-    """Return the profiles for a terminal, the chosen one first."""
-    return _profiles(plan).rich()
-
-
 def _profiles(plan: SearchResult) -> TextTable:
-    shown, low, high = plan.subject.unit.shown, plan.chamber.low, plan.chamber.high
-    heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]", "covers\n[°C]"]
+    unit, low, high = plan.subject.unit, plan.chamber.low, plan.chamber.high
+
+    def row(rated: RatedProfile) -> list[str]:
+        value, at, _ = rated.worst
+        sizes = [number(v * unit.factor, zeros=True) for v in (rated.score, value)]
+        covered = f"{rated.covered[0]:.1f} to {rated.covered[1]:.1f}"
+        short = "" if rated.share >= MIN_COVERAGE else " (!)"
+        chosen = " (chosen)" if rated is plan.chosen else ""
+        return [rated.profile.name + chosen, *sizes, f"{at:.1f}", covered + short]
+
+    heads = ["profile", f"rms\n[{unit.shown}]", f"largest\n[{unit.shown}]", "at\n[°C]", "covers\n[°C]"]
     title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({plan.hours:g} h each)"
-    return TextTable(heads, [_row(plan, profile) for profile in plan.judged], title)
+    return TextTable(heads, list(map(row, plan.judged)), title)
 
 
-def _row(plan: SearchResult, rated: RatedProfile) -> list[str]:
-    value, at, _ = rated.worst
-    sizes = [number(v * plan.subject.unit.factor, zeros=True) for v in (rated.score, value)]
-    short = "" if rated.share >= MIN_COVERAGE else " (!)"
-    low, high = rated.covered
-    name = rated.profile.name + (" (chosen)" if rated is plan.chosen else "")
-    return [name, *sizes, f"{at:.1f}", f"{low:.1f} to {high:.1f}{short}"]
-
-
-# charts
-
-
-def profile_chart(profile: Profile, lag: float, title: str, caption: str) -> Chart:
-    """Return the set points over time, and the temperature of a unit that follows them with a lag in s."""
-    t, body = profile.samples(lag, WIDE)
-    lines = (
-        Line(t / 3600, profile.chamber(t), "set point", "temperature"),
-        Line(t / 3600, body, "unit", "estimate"),
-    )
-    return Chart((Panel(lines, "temperature [°C]"),), "time [h]", title, caption)
-
-
-def sigma_chart(plan: SearchResult) -> Chart:
+def _sigma_chart(plan: SearchResult) -> Chart:
     """Return sigma over temperature, a panel an axis: of the chosen profile, and of the classic staircase."""
     best, classic, unit = plan.chosen, plan.classic, plan.subject.unit
     curves = [(best.temperature, best.sigma, "chosen")]
@@ -158,24 +272,6 @@ def sigma_chart(plan: SearchResult) -> Chart:
     caption = "one standard deviation of the map's error, without its mean over the soak"
     panels = sigma_panels(plan.subject.axes, curves, unit, rules=target_rule(plan.target, unit.factor))
     return Chart(panels, "temperature [°C]", "Predicted sigma of the map", caption)
-
-
-def sigma_panels(
-    axes: Sequence[str], curves: Sequence[tuple[Array, Array, str]], unit: BiasUnit, **how: Any
-) -> tuple[Panel, ...]:
-    """Return sigma over temperature, a panel an axis: of curves (T, sigma, name) the first solid, the second dashed."""
-
-    def lines(axis: int) -> Iterator[Line]:
-        for k, (T, sigma, name) in enumerate(curves):
-            yield Line(T, sigma[:, axis] * unit.factor, name, f"series:{k}", style="dashed" if k else "line")
-
-    return axis_panels(axes, lines, "sigma", unit.shown, log=True, **how)
-
-
-def hours_panel(lines: Sequence[Line], target: float | None, unit: BiasUnit) -> tuple[Panel]:
-    """Return sigma over the length of a soak."""
-    label = f"sigma, rms of the worst axis [{unit.shown}]"
-    return (Panel(tuple(lines), label, rules=target_rule(target, unit.factor), log=True),)
 
 
 def _pareto(plan: SearchResult) -> Chart:
@@ -187,22 +283,32 @@ def _pareto(plan: SearchResult) -> Chart:
         Line(hours, best * unit.factor, "best profile", "series:0"),
         Line(hours, classic * unit.factor, "staircase one way", "series:1", style="dashed"),
     )
-    caption = "each point is a search of its own"
-    return Chart(hours_panel(lines, plan.target, unit), "length [h]", "Gain of more hours", caption, log=True)
+    return hours_chart(lines, plan.target, unit, "Gain of more hours", "each point is a search of its own")
 
 
-# files
-
-
-def document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
-    """Return the plan as JSON holds it: SI, temperatures in degC."""
+def _search_document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
     subject, chamber, best = plan.subject, plan.chamber, plan.chosen
+
+    def content(rated: RatedProfile) -> dict[str, Any]:
+        value, at, axis = rated.worst
+        return {
+            "name": rated.profile.name,
+            "family": rated.profile.family,
+            "hours": rated.profile.hours,
+            "sigma_rms": by_axis(subject.axes, rated.rms),
+            "sigma_largest": value,
+            "at_degC": at,
+            "axis": subject.axes[axis],
+            "covered_degC": rated.covered,
+        }
+
+    shortest = None if plan.shortest is None else content(plan.shortest) | knots(plan.shortest.profile)
     settings = {"rate_K_s": chamber.rate, "lag_s": chamber.lag, "start_degC": chamber.start}
     return {
-        **head(subject, chamber, plan.hours, {"chamber": settings}),
+        **head(subject, chamber, plan.hours, chamber=settings),
         "curve_of": subject.shape_of,
-        "profile": _as_json(plan, best) | knots(best.profile),
-        "expected_sigma": expected_sigma(subject.axes, subject.unit, best.temperature, best.sigma),
+        "profile": content(best) | knots(best.profile),
+        "expected_sigma": expected_sigma(subject.axes, subject.unit, best),
         "pareto": [
             {
                 "hours": point.hours,
@@ -212,100 +318,7 @@ def document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
             }
             for point in plan.pareto
         ],
-        "profiles": [_as_json(plan, rated) for rated in plan.judged],
-        "target": None if plan.target is None else {"sigma": plan.target, "shortest": _shortest(plan)},
+        "profiles": list(map(content, plan.judged)),
+        "target": None if plan.target is None else {"sigma": plan.target, "shortest": shortest},
         "notes": notes,
     }
-
-
-def head(subject: UnitModel, chamber: Chamber, hours: float, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the head of a plan as JSON holds it: the chamber, with `more` after its range, and the unit."""
-    return {
-        "schema": 1,
-        "driftlab": __version__,
-        "hours": hours,
-        "range": [chamber.low, chamber.high],
-        **more,
-        "unit": subject.unit.si,
-        "channel": subject.channel,
-        "kind": subject.map.kind,
-        "noise": by_axis(subject.axes, subject.noise),
-        "walk": by_axis(subject.axes, subject.walk),
-        "noise_of": subject.noise_of,
-    }
-
-
-def _shortest(plan: SearchResult) -> dict[str, Any] | None:
-    return None if plan.shortest is None else _as_json(plan, plan.shortest) | knots(plan.shortest.profile)
-
-
-def _as_json(plan: SearchResult, rated: RatedProfile) -> dict[str, Any]:
-    value, at, axis = rated.worst
-    return {
-        "name": rated.profile.name,
-        "family": rated.profile.family,
-        "hours": rated.profile.hours,
-        "sigma_rms": by_axis(plan.subject.axes, rated.rms),
-        "sigma_largest": value,
-        "at_degC": at,
-        "axis": plan.subject.axes[axis],
-        "covered_degC": rated.covered,
-    }
-
-
-def by_axis(axes: Sequence[str], values: Array) -> dict[str, Any]:
-    """Return values (d,), or the columns of values (N, d), by the names of the axes."""
-    return dict(zip(axes, values.T, strict=True))
-
-
-def expected_sigma(axes: Sequence[str], unit: BiasUnit, T: Array, sigma: Array) -> dict[str, Any]:
-    """Return sigma (N, d) over temperatures (N,), degC, as JSON holds it."""
-    return {"unit": unit.si, "temperature_degC": T, **by_axis(axes, sigma)}
-
-
-def knots(profile: Profile) -> dict[str, Any]:
-    """Return the set points of a profile as JSON holds them."""
-    return {"knots": {"time_s": profile.time, "temperature_degC": profile.temperature}}
-
-
-def write_profile(path: Path, profile: Profile) -> None:
-    """Write the set points of a profile for the chamber; straight lines in between."""
-    rows = zip(profile.time, profile.temperature, strict=True)
-    text = "".join(f"{t:.1f},{T:.3f}\n" for t, T in rows)
-    path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
-
-
-def write_plan(
-    path: Path, title: str, lead: str, parts: Sequence[tuple[str, Any]], profile: Profile, outcome: str = ""
-) -> None:
-    """Write the page of a plan.
-
-    Parameters
-    ----------
-    path : Path
-    title, lead : str
-        The lead is what to record, and `outcome` its class.
-    parts : sequence of (str, object)
-        Headings, and under each a Chart, a TextTable, an `EffectsSection`, or a list of sentences.
-    profile : Profile
-        Its set points stand at the end.
-    outcome : str
-    """
-    rows = [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
-    setpoints = TextTable(["time [h]", "temperature [°C]"], rows, texts=False)
-    write_page(path, "plan", title=title, lead=lead, outcome=outcome, parts=parts, setpoints=setpoints)
-
-
-def write_report(path: Path, plan: SearchResult, notes: list[str], title: str, outlook: DetectabilityReport) -> None:
-    """Write the page."""
-    profile = plan.chosen.profile
-    what = f"{profile.name}; the set points are in setpoints.csv"
-    first, *others = profile_chart(profile, plan.chamber.lag, "Chosen profile", what), sigma_chart(plan), _pareto(plan)
-    parts = [
-        (first.title, first),
-        ("Profiles of the same hours", _profiles(plan)),
-        (plan_effects.HEADING, plan_effects.section(outlook)),
-        (NOTES, notes),
-        *((chart.title, chart) for chart in others),
-    ]
-    write_plan(path, title, headline(plan), parts, profile)

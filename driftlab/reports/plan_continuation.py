@@ -1,26 +1,41 @@
-"""A plan after recordings: whether they are enough, a table of further profiles, a chart, JSON and its page."""
+"""A plan after recordings as a page: whether they are enough, a table of further profiles, a chart and JSON."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from driftlab.planning.continuation import LITTLE, Continuation
-from driftlab.planning.detectability import DetectabilityReport
+from driftlab.planning.detectability import DetectabilityReport, EffectEstimate
 from driftlab.planning.search import MIN_COVERAGE, RatedProfile
-from driftlab.reports import plan as plan_page
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Shade, target_rule
+from driftlab.reports.plan import NOTES, PlanPage, by_axis, head, knots, profile_chart, sigma_panels
 from driftlab.reports.tables import TextTable
 from driftlab.units import number
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 MAX_ROWS = 6  # profiles of the table
 UNKNOWN = "not known"  # a sigma beyond all that was recorded
+FURTHER = "The further profile"
+
+
+def page_of(plan: Continuation, outlook: DetectabilityReport, seen: Sequence[EffectEstimate]) -> PlanPage:
+    """Return the page of a plan; `seen` are the effects in what was recorded."""
+    notes = [
+        *lines(plan), *plan_effects.seen_lines(seen, plan.recorded.subject.unit), *plan_effects.brief(outlook),
+    ]  # fmt: skip
+    profile, chart, table = plan.chosen.profile, _sigma_chart(plan), profiles(plan)
+    parts = [
+        (chart.title, chart),
+        ("Gain of a further recording", table),
+        (NOTES, notes),
+        (FURTHER, profile_chart(profile, plan.recorded.chamber.lag, FURTHER, profile.name)),
+        (plan_effects.HEADING, plan_effects.section(outlook)),
+    ]
+    document = _document(plan, notes) | {"effects": plan_effects.document(outlook)}
+    return PlanPage(headline(plan), notes, document, table, chart, parts, "pass" if plan.enough else "unknown")
 
 
 def headline(plan: Continuation) -> str:
@@ -64,13 +79,6 @@ def _gained(plan: Continuation) -> str:
     )
 
 
-def _further(plan: Continuation) -> str:
-    """Return the gain of further hours where the recordings are enough."""
-    if plan.gain <= 0:
-        return f"no further profile of {plan.hours:g} h makes sigma smaller"
-    return f"should there be time: {plan.chosen.profile.name}; {_gained(plan)}"
-
-
 def lines(plan: Continuation) -> list[str]:
     """Return the state of knowledge so far, and its basis, a sentence each."""
     before, unit = plan.recorded, plan.recorded.subject.unit
@@ -87,8 +95,10 @@ def lines(plan: Continuation) -> list[str]:
     each = zip(subject.axes, subject.noise * unit.factor, subject.walk * unit.factor, strict=True)
     noises = ", ".join(f"{a} {n:.3g} {unit.shown}/sqrt(Hz) and {k:.3g} {unit.shown}/sqrt(s)" for a, n, k in each)
     sentences.append(f"noise and walk as measured over blocks of minutes: {noises}")
-    if plan.enough:
-        sentences.append(_further(plan))
+    if plan.enough and plan.gain <= 0:
+        sentences.append(f"no further profile of {plan.hours:g} h makes sigma smaller")
+    elif plan.enough:
+        sentences.append(f"should there be time: {plan.chosen.profile.name}; {_gained(plan)}")
     if len(before.parts) > 1:
         sentences.append("recordings are fitted one after the other; another level after a pause counts as walk")
     worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
@@ -100,38 +110,24 @@ def lines(plan: Continuation) -> list[str]:
     return sentences
 
 
-def cells(plan: Continuation) -> list[list[str]]:
-    """Return the rows of the table: what is known so far, then the best profiles."""
-    before = plan.recorded
+def profiles(plan: Continuation) -> TextTable:
+    """Return the state of knowledge so far, then the best profiles."""
+    before, unit = plan.recorded, plan.recorded.subject.unit
+
+    def row(name: str, score: float, largest: float, at: float) -> list[str]:
+        return [name, *(number(value * unit.factor, missing=UNKNOWN) for value in (score, largest)), f"{at:.1f}"]
+
+    def further(rated: RatedProfile) -> list[str]:
+        short = "" if rated.share >= MIN_COVERAGE else " (not all of the range)"
+        return row(rated.profile.name + short, rated.score, *rated.worst[:2])
+
     value, at, _ = before.worst if np.isfinite(before.score) else (np.inf, np.nan, 0)
-    whole = "" if before.whole else " (where seen)"
-    first = _row(plan, f"none{whole}", before.score, value, at)
-    return [first, *(_profile_row(plan, rated) for rated in plan.judged[:MAX_ROWS])]
+    first = row("none" if before.whole else "none (where seen)", before.score, value, at)
+    heads = ["further profile", f"rms after it\n[{unit.shown}]", f"largest\n[{unit.shown}]", "at\n[°C]"]
+    return TextTable(heads, [first, *map(further, plan.judged[:MAX_ROWS])], "sigma of the map, fitted to all of it")
 
 
-def _profile_row(plan: Continuation, rated: RatedProfile) -> list[str]:
-    value, at, _ = rated.worst
-    short = "" if rated.share >= MIN_COVERAGE else " (not all of the range)"
-    return _row(plan, rated.profile.name + short, rated.score, value, at)
-
-
-def _row(plan: Continuation, name: str, score: float, largest: float, at: float) -> list[str]:
-    factor = plan.recorded.subject.unit.factor
-    return [name, *(number(value * factor, missing=UNKNOWN) for value in (score, largest)), f"{at:.1f}"]
-
-
-def _profiles(plan: Continuation) -> TextTable:
-    shown = plan.recorded.subject.unit.shown
-    heads = ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]"]
-    return TextTable(heads, cells(plan), "sigma of the map, fitted to all of it")
-
-
-def table(plan: Continuation) -> Table:
-    """Return the table for a terminal."""
-    return _profiles(plan).rich()
-
-
-def sigma_chart(plan: Continuation) -> Chart:
+def _sigma_chart(plan: Continuation) -> Chart:
     """Return sigma over temperature, a panel an axis: so far, and with the further profile."""
     before, best, unit = plan.recorded, plan.chosen, plan.recorded.subject.unit
     low, high = before.seen
@@ -142,20 +138,19 @@ def sigma_chart(plan: Continuation) -> Chart:
         (before.temperature, before.sigma, "so far"),
     ]
     rules = target_rule(plan.target, unit.factor)
-    panels = plan_page.sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
+    panels = sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
     return Chart(panels, "temperature [°C]", "Sigma of the map", "one standard deviation of the map's error")
 
 
-def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
-    """Return the plan as JSON holds it: SI, temperatures in degC."""
+def _document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
     before, best, axes = plan.recorded, plan.chosen, plan.recorded.subject.axes
     return {
-        **plan_page.head(before.subject, before.chamber, plan.hours, {}),
+        **head(before.subject, before.chamber, plan.hours),
         "recorded": {
             "hours": before.hours,
             "seen_degC": before.seen,
             "sigma_rms": before.score if np.isfinite(before.score) else None,
-            "sigma": plan_page.by_axis(axes, before.sigma),
+            "sigma": by_axis(axes, before.sigma),
         },
         "temperature_degC": best.temperature,
         "enough": plan.enough or None,
@@ -163,28 +158,12 @@ def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
         "profile": {
             "name": best.profile.name,
             "hours": best.profile.hours,
-            "sigma_rms": plan_page.by_axis(axes, best.rms),
-            "sigma": plan_page.by_axis(axes, best.sigma),
-            **plan_page.knots(best.profile),
+            "sigma_rms": by_axis(axes, best.rms),
+            "sigma": by_axis(axes, best.sigma),
+            **knots(best.profile),
         },
         "notes": notes,
     }
-
-
-def write_report(path: Path, plan: Continuation, outlook: DetectabilityReport, notes: list[str], title: str) -> None:
-    """Write the page."""
-    profile, chart = plan.chosen.profile, sigma_chart(plan)
-    parts = [
-        (chart.title, chart),
-        ("Gain of a further recording", _profiles(plan)),
-        (plan_page.NOTES, notes),
-        (
-            "The further profile",
-            plan_page.profile_chart(profile, plan.recorded.chamber.lag, "The further profile", profile.name),
-        ),
-        (plan_effects.HEADING, plan_effects.section(outlook)),
-    ]
-    plan_page.write_plan(path, title, headline(plan), parts, profile, "pass" if plan.enough else "unknown")
 
 
 def _size(plan: Continuation, value: float) -> str:

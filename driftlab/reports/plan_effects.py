@@ -3,47 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from driftlab.planning.detectability import Detectability, DetectabilityReport, EffectEstimate
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit, number
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 PLAINLY = 0.9  # share of the nats: with less left, another effect takes a part of it that is worth saying
 HEADING = "Effects that it would identify"  # on a page
 
 
-def cells(outlook: DetectabilityReport) -> list[list[str]]:
-    """Return the rows of the table, in the order of the smallest size that is identified."""
-    silent = [[name, "not seen", "", "0", ""] for name in outlook.silent]
-    return [*(_row(outlook, item) for item in outlook.effects), *silent]
+def table(outlook: DetectabilityReport) -> TextTable:
+    """Return the table, in the order of the smallest size that is identified."""
+    unit, factor = outlook.shown, outlook.shown.factor
 
+    def row(item: Detectability) -> list[str]:
+        size, best, worst = (number(v * factor, missing="none") for v in (item.found_from, item.best, item.worst))
+        grid = best if best == worst else f"{best} to {worst}"
+        return [item.name, size, grid, f"{item.nats:.1f}", ", ".join(item.confused_with)]
 
-def _row(outlook: DetectabilityReport, item: Detectability) -> list[str]:
-    factor = outlook.shown.factor
-    size, best, worst = (number(v * factor, missing="none") for v in (item.found_from, item.best, item.worst))
-    grid = best if best == worst else f"{best} to {worst}"
-    return [item.name, size, grid, f"{item.nats:.1f}", ", ".join(item.confused_with)]
-
-
-def _effects(outlook: DetectabilityReport) -> TextTable:
-    unit = outlook.shown
-    size = f"{number(outlook.size * unit.factor)} {unit.shown}"
     sizes = (f"{name}\n[{unit.shown}]" for name in ("found from", "over its grid"))
-    heads = ["effect", *sizes, f"of {size}\n[nats]", "confused with"]
+    heads = ["effect", *sizes, f"of {number(outlook.size * factor)} {unit.shown}\n[nats]", "confused with"]
     title = "effects that the loop would find on it, from lowest to highest, on every axis alike"
-    return TextTable(heads, cells(outlook), title)
-
-
-def table(outlook: DetectabilityReport) -> Table:
-    """Return the table for a terminal."""
-    table = _effects(outlook).rich(whole=False)
-    table.columns[0].no_wrap = True
-    return table
+    rows = [*map(row, outlook.effects), *([name, "not seen", "", "0", ""] for name in outlook.silent)]
+    return TextTable(heads, rows, title, rigid=True, whole=False)
 
 
 def matrix(outlook: DetectabilityReport) -> tuple[list[str], list[tuple[str, list[tuple[str, str]]]]]:
@@ -51,29 +34,20 @@ def matrix(outlook: DetectabilityReport) -> tuple[list[str], list[tuple[str, lis
 
     Each with a word beside it where the two are not distinguished at twice the smallest size that is found.
     """
+
+    def left(item: Detectability, other: str) -> tuple[str, str]:
+        if other == item.name:
+            return "", ""
+        return f"{100 * item.left[other]:.0f}", "alike" if other in item.confused_with else ""
+
     names = [item.name for item in outlook.effects]
-    return names, [(item.name, [_left(item, name) for name in names]) for item in outlook.effects]
+    return names, [(item.name, [left(item, name) for name in names]) for item in outlook.effects]
 
 
-def _left(item: Detectability, other: str) -> tuple[str, str]:
-    if other == item.name:
-        return "", ""
-    return f"{100 * item.left[other]:.0f}", "alike" if other in item.confused_with else ""
-
-
-@dataclass(frozen=True)
-class EffectsSection:
-    """The section of a page: the table, the matrix of shares that are left between the names, and the sentences."""
-
-    table: TextTable
-    names: list[str]
-    matrix: list[tuple[str, list[tuple[str, str]]]]
-    lines: list[str]
-
-
-def section(outlook: DetectabilityReport) -> EffectsSection:
-    """Return the section of a page."""
-    return EffectsSection(_effects(outlook), *matrix(outlook), lines(outlook))
+def section(outlook: DetectabilityReport) -> dict[str, Any]:
+    """Return the section of a page: table, matrix of the shares that are left between the names, and sentences."""
+    names, rows = matrix(outlook)
+    return {"table": table(outlook), "names": names, "matrix": rows, "lines": lines(outlook)}
 
 
 def brief(outlook: DetectabilityReport) -> list[str]:

@@ -1,9 +1,8 @@
-"""A plan with a family: a table of parts of the range and hours, sentences, charts, JSON and its page."""
+"""A plan with a family as a page: a table of parts of the range and hours, sentences, charts and JSON."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +13,30 @@ from driftlab.planning.short_soak import SHARES, ShortSoakPlan
 from driftlab.reports import plan as plan_page
 from driftlab.reports.charts import Chart, Line
 from driftlab.reports.family_map import GAUSSIAN, measured_on
+from driftlab.reports.plan import NOTES, PlanPage, chosen_profile, hours_chart, sigma_panels
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit
 
-if TYPE_CHECKING:
-    from rich.table import Table
+
+def page_of(plan: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> PlanPage:
+    """Return the page of a plan; `noise_of` says where noise and walk are from."""
+    lines, table, chart, sigma = (
+        _lines(plan, unit, noise_of),
+        _sigmas(plan, unit),
+        _hours(plan, unit),
+        _sigma(plan, unit),
+    )
+    parts = [
+        chosen_profile(plan.chosen.profile, plan.chamber.lag),
+        ("Expected sigma with the family (without), at the best place", table),
+        (NOTES, lines),
+        (chart.title, chart),
+        (sigma.title, sigma),
+    ]
+    return PlanPage(_headline(plan, unit), lines, _document(plan, unit, lines), table, chart, parts)
 
 
-def headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
+def _headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
     """Return the soak to make, and the sigma that its map will have."""
     best, chamber = plan.chosen, plan.chamber
     part = "the whole range" if best.share == 1 else f"the {best.place} {100 * best.share:.0f} % of the range"
@@ -35,7 +50,7 @@ def headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
     return f"{_size(plan.target or 0.0, unit)} is reached by no part and no length of the table; the nearest: {soak}"
 
 
-def lines(plan: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> list[str]:
+def _lines(plan: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> list[str]:
     """Return the gain by the family, and the assumptions of the plan, a sentence each."""
     without = f"the same soak without the family leaves {_size(plan.chosen.own_score, unit)}, with the best polynomial"
     sentences = [without]
@@ -70,15 +85,10 @@ def _sigmas(plan: ShortSoakPlan, unit: BiasUnit) -> TextTable:
 
     rows = [[f"{100 * share:.0f} %", *(cell(plan.best(share, hours)) for hours in plan.hours)] for share in SHARES]
     title = f"expected sigma over the range with the family (without) [{unit.shown}]"
-    return TextTable(["range", *(f"{hours:.3g} h" for hours in plan.hours)], rows, title, texts=False)
+    return TextTable(["range", *(f"{hours:.3g} h" for hours in plan.hours)], rows, title, texts=0)
 
 
-def table(plan: ShortSoakPlan, unit: BiasUnit) -> Table:
-    """Return it for a terminal."""
-    return _sigmas(plan, unit).rich()
-
-
-def hours_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
+def _hours(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
     """Return sigma over the length of the soak, a line for each share of the range."""
     drawn, without = [], []
     for k, share in enumerate(SHARES):
@@ -89,22 +99,32 @@ def hours_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
         drawn.append(Line(hours, sigma * unit.factor, f"{100 * share:.0f} % of the range", f"series:{k}"))
         if share == 1:
             without.append(Line(hours, alone * unit.factor, "all of it, without the family", "data", style="dashed"))
-    panels = plan_page.hours_panel([*drawn, *without], plan.target, unit)
-    return Chart(panels, "length [h]", "Sigma by length of soak", "each point: the best place of that share", log=True)
+    caption = "each point: the best place of that share"
+    return hours_chart([*drawn, *without], plan.target, unit, "Sigma by length of soak", caption)
 
 
-def sigma_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
+def _sigma(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
     """Return sigma over temperature of what was chosen, with the family and without."""
     best = plan.chosen
     curves = [(best.temperature, best.sigma, "with the family"), (best.temperature, best.without_family, "without")]
-    caption = "one standard deviation, level included"
-    panels = plan_page.sigma_panels(plan.family.axes, curves, unit)
-    return Chart(panels, "temperature [°C]", "Predicted sigma of the map", caption)
+    panels = sigma_panels(plan.family.axes, curves, unit)
+    return Chart(panels, "temperature [°C]", "Predicted sigma of the map", "one standard deviation, level included")
 
 
-def document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str, Any]:
-    """Return the plan as JSON holds it: SI, temperatures in degC."""
+def _document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str, Any]:
     best, axes = plan.chosen, plan.family.axes
+
+    def content(soak: RatedProfile) -> dict[str, Any]:
+        return {
+            "share": soak.share,
+            "place": soak.place,
+            "hours": soak.profile.hours,
+            "name": soak.profile.name,
+            "covered_degC": soak.covered,
+            "sigma": soak.score,
+            "without_family": soak.own_score,
+        }
+
     target = {"sigma": plan.target, "reached": plan.reached, "hours_without_family": plan.own_hours}
     return {
         "schema": 1,
@@ -116,35 +136,9 @@ def document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str,
         "units": plan.family.units,
         "noise": plan_page.by_axis(axes, plan.noise),
         "walk": plan_page.by_axis(axes, plan.walk),
-        "profile": _as_json(best) | plan_page.knots(best.profile),
-        "expected_sigma": plan_page.expected_sigma(axes, unit, best.temperature, best.sigma),
-        "tried": [_as_json(soak) for soak in plan.tried],
+        "profile": content(best) | plan_page.knots(best.profile),
+        "expected_sigma": plan_page.expected_sigma(axes, unit, best),
+        "tried": list(map(content, plan.tried)),
         "target": None if plan.target is None else target,
         "notes": notes,
     }
-
-
-def _as_json(soak: RatedProfile) -> dict[str, Any]:
-    return {
-        "share": soak.share,
-        "place": soak.place,
-        "hours": soak.profile.hours,
-        "name": soak.profile.name,
-        "covered_degC": soak.covered,
-        "sigma": soak.score,
-        "without_family": soak.own_score,
-    }
-
-
-def write_report(path: Path, plan: ShortSoakPlan, unit: BiasUnit, notes: list[str], title: str) -> None:
-    """Write the page."""
-    profile = plan.chosen.profile
-    what = f"{profile.name}; the set points are in setpoints.csv"
-    charts = [hours_chart(plan, unit), sigma_chart(plan, unit)]
-    parts = [
-        ("Chosen profile", plan_page.profile_chart(profile, plan.chamber.lag, "Chosen profile", what)),
-        ("Expected sigma with the family (without), at the best place", _sigmas(plan, unit)),
-        (plan_page.NOTES, notes),
-        *((chart.title, chart) for chart in charts),
-    ]
-    plan_page.write_plan(path, title, headline(plan, unit), parts, profile)

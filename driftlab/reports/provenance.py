@@ -14,21 +14,16 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from driftlab import __version__
-from driftlab.config import paths_of
-from driftlab.evaluation.limits import RULE, outcome, verdict
+from driftlab.config import Config, paths_of
+from driftlab.evaluation.limits import RULE, LimitResult, outcome, verdict
 from driftlab.recordings.identity import identity, of_source, sha256
 from driftlab.storage.recorder import started_at
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FileSource
+from fusion_core.contracts import FileSource, FittedMap
 from fusion_core.host.provenance import Participant, participants
-
-if TYPE_CHECKING:
-    from driftlab.config import Config
-    from driftlab.evaluation.limits import LimitResult
-    from fusion_core.contracts import FittedMap
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -29,11 +28,6 @@ from fusion_core.contracts import FittedMap, MeasurementModel, ReportSection, Se
 from fusion_core.errors import FusionError, moment
 from fusion_core.host.guard import guarded
 from fusion_core.host.registry import registry
-
-
-def write_report(path: Path, overview: Overview, summary: dict[str, Any], **values: Any) -> None:
-    """Write `report.html` of one run; arguments are those of `page_of`."""
-    path.write_text(page_of(overview, summary, **values), encoding="utf-8")
 
 
 def page_of(

@@ -35,38 +35,36 @@ class TextTable:
     rows : sequence of sequences of str
     title : str
         On a terminal; a page has a heading.
-    texts : bool
-        Whether the first column is one of texts, at the left; numbers are at the right.
+    texts : int
+        How many of the first columns are of texts, at the left; numbers are at the right.
+    rigid, whole : bool
+        Whether texts, and numbers, are never folded.
+    framed : bool
+        Whether columns are divided by lines.
+    width : int, optional
+        Of the first column at least, which is then folded last.
     """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     title: str = ""
-    texts: bool = True
+    texts: int = 1
+    rigid: bool = False
+    whole: bool = True
+    framed: bool = True
+    width: int | None = None
 
-    def rich(self, *, whole: bool = True, framed: bool = True, width: int | None = None) -> Table:
-        """Return the table for a terminal.
-
-        Parameters
-        ----------
-        whole : bool
-            Whether numbers are never folded.
-        framed : bool
-            Whether columns are divided by lines.
-        width : int, optional
-            Of the first column at least, which is then folded last.
-        """
+    def __rich__(self) -> Table:
+        """Return the table for a terminal."""
         from rich import box
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(title=self.title, title_justify="left", box=box.HEAVY_HEAD if framed else box.SIMPLE_HEAD)
+        table = Table(title=self.title, title_justify="left", box=box.HEAVY_HEAD if self.framed else box.SIMPLE_HEAD)
         for k, head in enumerate(self.heads):
-            first = k == 0 and self.texts
-            least = width if first else None
-            table.add_column(
-                Text(head), justify="left" if first else "right", no_wrap=whole and not first, min_width=least
-            )
+            text = k < self.texts
+            whole, least = (self.rigid, self.width) if text else (self.whole, None)
+            table.add_column(Text(head), justify="left" if text else "right", no_wrap=whole, min_width=least)
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table

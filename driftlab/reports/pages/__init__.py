@@ -8,14 +8,13 @@ from __future__ import annotations
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from markupsafe import Markup, escape
 
 from driftlab import __version__
-from driftlab.reports.charts import LOOKS, content
+from driftlab.reports.charts import LOOKS, Chart, content
 from fusion_core.escaping import css_text, line, lines, script_json
-
-if TYPE_CHECKING:
-    from driftlab.reports.charts import Chart
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
@@ -27,9 +26,10 @@ def page(template: str, **values: Any) -> str:
     """Return a template of this package, filled; a value that is a Chart is printed with `{{ interactive(chart) }}`."""
     import jinja2
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True, finalize=_escaped
-    )
+    loader = jinja2.PackageLoader("driftlab.reports", "pages")
+    # texts with the codes of characters that are invisible, or that turn what is beside them
+    escaped = lambda value: lines(value) if type(value) is str else value  # noqa: E731
+    environment = jinja2.Environment(loader=loader, autoescape=True, finalize=escaped)
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     environment.filters["prose"] = prose
     return environment.get_template(f"{template}.html").render(version=__version__, **values)
@@ -40,10 +40,8 @@ def looks() -> dict[str, dict[str, str | float]]:
     return {role: vars(look) for role, look in LOOKS.items()}
 
 
-def interactive(chart: Chart) -> Any:
+def interactive(chart: Chart) -> Markup:
     """Return the figure of a chart as a page holds it; `charts.js` draws it."""
-    from markupsafe import Markup
-
     caption = Markup("<figcaption>{}</figcaption>").format(prose(lines(chart.caption))) if chart.caption else ""
     return Markup(
         '<figure class="chart" aria-label="{title}"><div class="tools"><span class="keys"></span>'
@@ -58,40 +56,25 @@ def interactive(chart: Chart) -> Any:
     )
 
 
-def prose(text: str) -> Any:
+def prose(text: str) -> Markup:
     """Return a sentence as a page shows it: commands and keys, which stand in backticks, as code."""
-    from markupsafe import Markup, escape
-
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
-def embedded(value: Any) -> Any:
+def embedded(value: Any) -> Markup:
     """Return JSON that a page may hold in a script: no text in it can end the script."""
-    from markupsafe import Markup
-
     return Markup(script_json(value))
 
 
-def quoted(text: str) -> Any:
+def quoted(text: str) -> Markup:
     """Return text as a string of CSS that a page may hold: letters, digits and spaces, and the code of all else."""
-    from markupsafe import Markup
-
     return Markup(css_text(text))
 
 
-def drawing(svg: str) -> Any:
+def drawing(svg: str) -> Markup:
     """Return SVG text that a page may hold as it is."""
-    from markupsafe import Markup
-
     return Markup(svg)
 
 
-def _escaped(value: Any) -> Any:
-    """Return a text of a page with the codes of characters that are invisible, or that turn what is beside them."""
-    return lines(value) if type(value) is str else value
-
-
-def _asset(name: str) -> Any:
-    from markupsafe import Markup
-
+def _asset(name: str) -> Markup:
     return Markup(files("driftlab.reports.pages").joinpath(name).read_text(encoding="utf-8"))

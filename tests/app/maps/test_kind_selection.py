@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftlab.maps.kind_selection import ErrorScale, candidates, compare, divide
-from driftlab.reports.map_selection import comparison_document, config_line, failures, rows, verdict
+from driftlab.reports.map_selection import comparison_document, comparison_table, config_line, failures, verdict
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, SwingTooSmall
@@ -171,6 +171,6 @@ def test_a_kind_has_the_configs_settings_where_it_names_it():
 
 
 def test_the_table_begins_with_the_chosen_one_and_ends_with_no_map(of_step):
-    table = rows(of_step, RATE)
+    table = comparison_table(of_step, RATE, "x").rows
     assert table[0][0] == "spline *"
     assert table[-1][0] == "no map"

@@ -11,7 +11,8 @@ from command_line import driftlab
 from units_at_rest import unit_at_rest
 
 from driftlab.maps.network_size import BINS, PARTS, BinnedPart, select, split
-from driftlab.reports.map_selection import TITLES, chart, comparison, figure, selection_document, selection_table
+from driftlab.reports.figures import figure_of
+from driftlab.reports.map_selection import TITLES, chart, comparison, selection_document, selection_table
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
@@ -166,9 +167,9 @@ def test_the_report_says_what_was_found(easy):
     assert content["bias"]["chosen"] == 2
     assert list(content["bias"]["Sr"]) == list(PARTS)
     assert content["slope"]["unit"] == "rad/s/K"
-    assert selection_table(easy, RATE).row_count == 4
+    assert len(selection_table(easy, RATE).rows) == 4
     assert len(comparison(easy, RATE)) == 4
-    labels = [panel.get_ylabel() for panel in figure(easy, RATE).axes]
+    labels = [panel.get_ylabel() for panel in figure_of(chart(easy, RATE)).axes]
     assert labels == [f"Sr of the {TITLES['bias']} [deg/h]", f"Sr of the {TITLES['slope']} [deg/h/K]"]
     chosen = chart(easy, RATE).panels[0].lines[-1]
     assert (chosen.x[0], chosen.name) == (easy.bias.chosen, "chosen")

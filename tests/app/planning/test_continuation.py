@@ -79,7 +79,7 @@ def test_a_part_of_the_range_is_offered_and_named():
     assert any(name.startswith("-10 to 6.667 °C: ") for name in names)
     scores = [item.score for item in found.judged]
     assert scores == sorted(scores)
-    assert len(plan_continuation.cells(found)) == 7
+    assert len(plan_continuation.profiles(found).rows) == 7
 
 
 def test_what_the_kind_cannot_follow_is_not_recorded_away():

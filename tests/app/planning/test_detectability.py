@@ -9,7 +9,7 @@ from driftlab.identification.state import name_of
 from driftlab.planning.detectability import MonteCarlo, effects_in, predict_detectability
 from driftlab.planning.simulated_search import Information, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
-from driftlab.reports.plan_effects import cells, lines, matrix
+from driftlab.reports.plan_effects import lines, matrix, table
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.hysteresis import Hysteresis
@@ -102,7 +102,7 @@ def test_what_only_warms_up_cannot_show_a_loop():
     assert never.only == "warms up"
     assert any(line.startswith("hysteresis: is not seen") and "bend of the map" in line for line in lines(never))
     names, rows = matrix(seen)
-    assert len(cells(never)) == len(never.effects) + len(never.silent)
+    assert len(table(never).rows) == len(never.effects) + len(never.silent)
     assert len(names) == len(rows)
     assert all(row[k] == ("", "") for k, (_, row) in enumerate(rows))
 

@@ -13,8 +13,8 @@ from driftlab.evaluation.limits import verdict_of_units
 from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES
 from driftlab.reports import fleet as fleet_rows
-from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
-from driftlab.reports.fleet_charts import control_charts, percentiles
+from driftlab.reports.fleet import write_fleet_report
+from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, control_charts, percentiles
 from driftlab.spc.line import line_of
 from driftlab.units import RATE
 
