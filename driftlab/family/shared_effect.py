@@ -5,13 +5,22 @@ n units, d axes, q coefficients an axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    model_serializer,
+)
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, columns_of, seen_temperatures
 from driftlab.family.parallel import ParallelMap, serial
@@ -33,7 +42,6 @@ HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 MIN_UNITS = 2  # of a lot, for a law of its own
 NAMED = 6  # lots that are named one by one
 SIGNS = 2.0  # spread over mean, beyond which signs differ
-GAINS = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")  # of an effect, in the file
 
 
 class UnitDensities(NamedTuple):
@@ -46,7 +54,7 @@ class UnitDensities(NamedTuple):
 class EffectDistribution(BaseModel):
     """Law of the coefficients (d, q) over units: N(mean, spread^2), `sigma` of the mean; SI."""
 
-    model_config = ConfigDict(frozen=True, validate_by_name=True)
+    model_config = ConfigDict(frozen=True, validate_by_name=True, serialize_by_alias=True)
 
     mean: Numbers
     sigma: Annotated[Numbers, Field(alias="mean_sigma")]
@@ -62,7 +70,7 @@ class EffectDistribution(BaseModel):
 class OfLot(BaseModel):
     """An effect in a lot: units, mean and deviation (d, q), evidence (nats), and whether that is enough."""
 
-    model_config = ConfigDict(frozen=True, validate_by_name=True)
+    model_config = EffectDistribution.model_config
 
     lot: str
     units: int
@@ -72,14 +80,11 @@ class OfLot(BaseModel):
     has: bool
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LotEffects:
-    """The laws of an effect.
+class LotEffects(EffectDistribution):
+    """The laws of an effect: of the units that have it, of those that have it not, and of lots.
 
     Attributes
     ----------
-    law : EffectDistribution
-        Of the units that have it.
     others : EffectDistribution or None
         Of the units of the lots that have it not; None where every lot is one law's.
     lots : tuple of OfLot
@@ -88,8 +93,7 @@ class LotEffects:
         Probability that lots of one law differ as much.
     """
 
-    law: EffectDistribution
-    others: EffectDistribution | None = None
+    others: Annotated[EffectDistribution | None, Field(alias="other_lots")] = None
     lots: tuple[OfLot, ...] = ()
     differs: float = 1.0
 
@@ -99,12 +103,19 @@ class LotEffects:
 
     def law_of(self, lot: str) -> EffectDistribution:
         """Return the law of the units of a lot."""
-        return self.law if self.others is None or self.has(lot) else self.others
+        return self if self.others is None or self.has(lot) else self.others
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+def _of_kind(value: Any) -> Effect:
+    return value if isinstance(value, Effect) else TypeAdapter(Annotated[Effect, Installed()]).validate_python(value)
+
+
+def _settings(effect: Effect) -> dict[str, Any]:
+    return effect.model_dump(mode="json", exclude_none=True)
+
+
 class SharedEffect(LotEffects):
-    """One effect with its laws.
+    """One effect with its laws, as `family.json` has it.
 
     Attributes
     ----------
@@ -120,7 +131,7 @@ class SharedEffect(LotEffects):
         Effects that predict left-out units as well.
     """
 
-    effect: Effect
+    effect: Annotated[Effect, PlainValidator(_of_kind), PlainSerializer(_settings)]
     unit: str
     evidence: float
     of_mean: float
@@ -130,33 +141,12 @@ class SharedEffect(LotEffects):
     in_other_lots: float | None
     indistinguishable_from: tuple[str, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the effect as `family.json` has it."""
-        return {
-            "kind": self.effect.kind,
-            "channel": self.effect.subject,
-            "parameters": parameters(self.effect),
-            "effect": self.effect.model_dump(mode="json", exclude_none=True),
-            "unit": self.unit,
-            **self.law.model_dump(mode="json", by_alias=True),
-            "other_lots": self.others and self.others.model_dump(mode="json", by_alias=True),
-            "lots": [lot.model_dump(mode="json", by_alias=True) for lot in self.lots],
-            **{name: getattr(self, name) for name in GAINS},
-            "indistinguishable_from": list(self.indistinguishable_from),
-            "explanation": self.effect.explanation,
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the effect that `as_json` wrote; raises ValidationError where it is not installed."""
-        others = content["other_lots"]
-        return cls(
-            effect=TypeAdapter(Annotated[Effect, Installed()]).validate_python(content["effect"]), unit=content["unit"],
-            law=EffectDistribution.model_validate(content),
-            others=others and EffectDistribution.model_validate(others),
-            lots=tuple(OfLot.model_validate(lot) for lot in content["lots"]), **{name: content[name] for name in GAINS},
-            indistinguishable_from=tuple(content["indistinguishable_from"]),
-        )  # fmt: skip
+    @model_serializer(mode="wrap")
+    def _described(self, inner: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the content of the file: what the effect says of itself stands beside it."""
+        effect = self.effect
+        about = {"kind": effect.kind, "channel": effect.subject, "parameters": parameters(effect)}
+        return {**about, **inner(self), "explanation": effect.explanation}
 
 
 def without_effects(
@@ -303,7 +293,7 @@ def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: 
     known = {name: units for name, units in members.items() if name and len(units) >= MIN_UNITS}
     whole = _law(effect, c, v, np.arange(len(lots)))
     if len(known) < 2:
-        return LotEffects(law=whole)
+        return LotEffects(**dict(whole))
     differs, of_lots = _differ(c, v, list(known.values())), []
     for name, units in known.items():
         one, evidence = _law(effect, c, v, units, lag=False), _evidence(effect, c, v, contrasts, units)
@@ -311,10 +301,10 @@ def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: 
         of_lots.append(OfLot(lot=name, units=len(units), mean=one.mean, sigma=one.sigma, evidence=evidence, has=has))
     having = [one.lot for one in of_lots if one.has]
     if differs > DIFFERS or not having or len(having) == len(of_lots):
-        return LotEffects(law=whole, lots=tuple(of_lots), differs=differs)
+        return LotEffects(**dict(whole), lots=tuple(of_lots), differs=differs)
     inside = np.array([lot in having for lot in lots])
     law, others = (_law(effect, c, v, np.flatnonzero(part)) for part in (inside, ~inside))
-    return LotEffects(law=law, others=others, lots=tuple(of_lots), differs=differs)
+    return LotEffects(**dict(law), others=others, lots=tuple(of_lots), differs=differs)
 
 
 def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> EffectDistribution:
@@ -378,7 +368,7 @@ def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     """Return an effect with its sizes and its evidence, in sentences."""
     name = described(effect.effect)
     lines = [
-        f"{name}: {_where(effect)}, {_sizes(effect, effect.law, unit, axes)}; {effect.evidence:.0f} nats "
+        f"{name}: {_where(effect)}, {_sizes(effect, effect, unit, axes)}; {effect.evidence:.0f} nats "
         f"({effect.price:.0f} needed), and a unit that was left out is predicted {effect.left_out:.2g} nats better."
     ]
     if effect.others is not None:

@@ -29,16 +29,14 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from pydantic import ValidationError
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
-from driftlab.identification.candidates import installed
+from driftlab.identification.candidates import installed, offers_by_kind, proposals
 from driftlab.identification.state import name_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
-from fusion_core.errors import FusionError, MissingChannel
 from fusion_core.host.registry import kind_of
 
 CHANCE = 5.0  # nats beyond the price, as in the loop
@@ -120,36 +118,20 @@ def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> t
     channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
     alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
     chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
-    offers: list[Offer] = []
-    refused: dict[str, str] = {}
-    for cls in installed():
-        kind = kind_of(cls)
-        if kind in without:
-            refused[kind] = "not wanted"
-        elif cls.course == "line":
-            refused[kind] = "its phase is no property of a unit"
-        else:
-            try:
-                offers += _offers_of(cls, sample[0].axes, chunks)
-            except MissingChannel:
-                continue
-            except FusionError as error:
-                refused[kind] = f"broken: {error}"
-    return offers, refused
+    lines = [kind_of(cls) for cls in installed() if cls.course == "line"]
+    refused = {**dict.fromkeys(lines, "its phase is no property of a unit"), **dict.fromkeys(without, "not wanted")}
+    broken: dict[str, str] = {}
+    kinds = offers_by_kind(partial(_offers_of, sample[0].axes, chunks), refused, broken)
+    offers = [offer for _, of_kind in kinds for offer in of_kind]
+    return offers, {**refused, **{kind: f"broken: {why}" for kind, why in broken.items()}}
 
 
-def _offers_of(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk]) -> list[Offer]:
-    try:
-        blank = cls(axes=axes)  # type: ignore[call-arg]
-    except ValidationError:
-        return []
-    offers = []
-    for proposed in blank.proposals(chunks):
-        effect = proposed.beside_map(None) if set(proposed.requires) <= set(chunks[0].channels) else None
-        size = 0 if effect is None else 1 if effect.acts_on_input else _coefficients(effect, chunks[0])
-        if effect is not None and 0 < size <= MAX_COEFFICIENTS:
-            offers.append(Offer(effect, size))
-    return offers
+def _offers_of(axes: tuple[str, ...], chunks: Sequence[Chunk], cls: type[Effect]) -> list[Offer]:
+    sized = [
+        Offer(effect, 1 if effect.acts_on_input else _coefficients(effect, chunks[0]))
+        for effect in proposals(cls, axes, chunks, None)
+    ]
+    return [offer for offer in sized if 0 < offer.size <= MAX_COEFFICIENTS]
 
 
 def _coefficients(effect: Effect, chunk: Chunk) -> int:

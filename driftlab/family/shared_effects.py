@@ -8,11 +8,12 @@ n units, d axes, q coefficients an axis of an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
 from driftlab.family.contrasts import EffectContrasts
 from driftlab.family.parallel import ParallelMap, serial
@@ -43,16 +44,24 @@ MAX_EFFECTS = 4
 MIN_UNITS = 10
 
 
-@dataclass(frozen=True, eq=False)
-class SharedEffects:
-    """Result of the search.
+class RejectedEffect(BaseModel):
+    """The best of a kind that was not added, or the kind, and why."""
+
+    model_config = ConfigDict(frozen=True)
+
+    effect: str
+    reason: str
+
+
+class SharedEffects(BaseModel):
+    """Result of the search, as `family.json` has it without the units.
 
     Attributes
     ----------
     verdict : str
         `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished.
     effects : tuple of SharedEffect
-    rejected : tuple of (str, str)
+    rejected : tuple of RejectedEffect
         The best of every other kind, and why it was not added.
     tried, units, searched : int
         Candidates; units in all; and units that were searched.
@@ -62,14 +71,16 @@ class SharedEffects:
         By unit, beside the effects.
     """
 
-    verdict: str
-    effects: tuple[SharedEffect, ...]
-    rejected: tuple[tuple[str, str], ...]
-    tried: int
-    units: int
-    searched: int
-    of_units: Mapping[str, tuple[OfUnit, ...]] = field(default_factory=dict)
-    noise: Mapping[str, UnitDensities] = field(default_factory=dict)
+    model_config = ConfigDict(frozen=True)
+
+    verdict: str = "nothing_common"
+    effects: tuple[SharedEffect, ...] = ()
+    rejected: tuple[RejectedEffect, ...] = ()
+    tried: int = 0
+    units: int = 0
+    searched: int = 0
+    of_units: Annotated[InstanceOf[dict[str, tuple[OfUnit, ...]]], Field(exclude=True)] = {}
+    noise: Annotated[InstanceOf[dict[str, UnitDensities]], Field(exclude=True)] = {}
 
     def apart(self, soaked: UnitInformation, lot: str = "") -> UnitInformation:
         """Return the information of a unit's soaks with the effects in the model; itself where there are none."""
@@ -79,29 +90,8 @@ class SharedEffects:
 
     def of_unit(self, unit: str) -> SharedEffects:
         """Return the effects with the sizes and the noise of one unit alone."""
-        of_units = {name: self.of_units[name] for name in (unit,) if name in self.of_units}
-        return replace(self, of_units=of_units, noise={name: self.noise[name] for name in of_units})
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the effects as `family.json` has them, without the units."""
-        return {
-            "verdict": self.verdict,
-            "effects": [effect.as_json() for effect in self.effects],
-            "rejected": [{"effect": name, "reason": reason} for name, reason in self.rejected],
-            "tried": self.tried,
-            "units": self.units,
-            "searched": self.searched,
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the effects that `as_json` wrote; raises ValidationError where one is not installed."""
-        return cls(
-            content["verdict"],
-            tuple(SharedEffect.from_json(effect) for effect in content["effects"]),
-            tuple((one["effect"], one["reason"]) for one in content["rejected"]),
-            *(content[name] for name in ("tried", "units", "searched")),
-        )
+        own = {name: {unit: sizes[unit]} for name, sizes in self if name in ("of_units", "noise") and unit in sizes}
+        return self.model_copy(update={"of_units": {}, "noise": {}, **own})
 
 
 def find_common(
@@ -125,14 +115,14 @@ def find_common(
     drawn, count = _drawn(units, sample, seed)
     if len(drawn) < MIN_UNITS:
         why = f"{len(drawn)} units; {MIN_UNITS} are needed to tell what they have in common"
-        return SharedEffects("nothing_common", (), (("all", why),), 0, count, len(drawn))
+        return SharedEffects(rejected=(RejectedEffect(effect="all", reason=why),), units=count, searched=len(drawn))
     search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], without, each)
     search.run()
     effects = search.measured(units, bias_unit)
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
     return SharedEffects(
-        verdict if effects else "nothing_common", effects, search.rejected(), len(search.offers), count, len(drawn),
-        search.of_units, search.noise,
+        verdict=verdict if effects else "nothing_common", effects=effects, rejected=search.rejected(),
+        tried=len(search.offers), units=count, searched=len(drawn), of_units=search.of_units, noise=search.noise,
     )  # fmt: skip
 
 
@@ -212,7 +202,7 @@ class _Search:
     def _contrasts(self, offers: list[Offer], beside: list[Effect]) -> EffectContrasts:
         return contrasts_of(self.sample, offers, beside, self.each)
 
-    def rejected(self) -> tuple[tuple[str, str], ...]:
+    def rejected(self) -> tuple[RejectedEffect, ...]:
         """Return the best of every kind that was not added in the last round, and why; and what was refused."""
         kinds = {effect.kind for effect in self._others(None) if not effect.several}
         reasons = []
@@ -226,7 +216,7 @@ class _Search:
             else:
                 why = f"{one.chance:.1f} nats of {one.price + CHANCE:.1f} needed"
             reasons.append((described(one.effect), why))
-        return (*reasons, *self.refused.items())
+        return tuple(RejectedEffect(effect=name, reason=why) for name, why in (*reasons, *self.refused.items()))
 
     def measured(self, units: Iterable[tuple[UnitInformation, str]], bias_unit: str) -> tuple[SharedEffect, ...]:
         """Return the effects with their sizes in all units."""
@@ -240,7 +230,7 @@ class _Search:
             where = np.flatnonzero([law.has(lot) for lot in self.lots])
             effects.append(
                 SharedEffect(
-                    **vars(law), effect=effect,
+                    **dict(law), effect=effect,
                     unit=", ".join(dict.fromkeys(effect.units_of(bias_unit))) or bias_unit,
                     evidence=taken.chance, of_mean=taken.mean, of_size=taken.size, price=taken.price + CHANCE,
                     left_out=nested([offer], contrasts, taken, where) / max(len(where), 1),
@@ -259,7 +249,7 @@ def sentences(common: SharedEffects, unit: BiasUnit, axes: Sequence[str]) -> lis
     """Return the verdict in sentences, sizes in the unit of tables."""
     if not common.effects:
         if not common.tried:
-            return [f"What the units have in common was not asked: {reason}." for _, reason in common.rejected[:1]]
+            return [f"What the units have in common was not asked: {one.reason}." for one in common.rejected[:1]]
         return [f"No effect of {common.tried} candidates is common to the {common.units:,} units."]
     lines = [line for effect in common.effects for line in of_effect(effect, unit, axes)]
     if common.searched < common.units:
