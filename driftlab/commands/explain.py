@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,14 +14,14 @@ import numpy as np
 from driftlab import __version__
 from driftlab.commands.console import print_verdict, say, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
-from driftlab.commands.result import Result
+from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
 from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import OverviewAccumulator
+from driftlab.evaluation.overview import Overview, OverviewAccumulator
 from driftlab.evaluation.run_limits import map_of
 from driftlab.evaluation.scores import moving_average
-from driftlab.evaluation.summary import remarks, summarise
+from driftlab.evaluation.summary import remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.identification.candidates import check_kinds
@@ -37,7 +36,6 @@ from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
 from driftlab.reports.figures import figure_of
 from driftlab.reports.provenance import Sheet, sheet_of
-from driftlab.storage.folders import output_folder
 from driftlab.storage.in_memory import InMemoryName
 from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
@@ -149,52 +147,56 @@ def explain(
     DataError, ConfigError, UnitError
         If the config or a recording cannot be used.
     """
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
     given = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in given.items()}
     understood = config_of(config).tracking(channel)
     used = [*understood.files(), *paths_of(name for names in recordings.values() for name in names)]
-    with TemporaryDirectory(prefix="driftlab-") if out is None else nullcontext(out) as place:
-        folder = Path(place) / "explained" if out is None else Path(place)
-        return _closed(understood, recordings, folder, used, progress or (lambda text: None), estimate, without)
+
+    def explained() -> ExplainResult:
+        # the matrices are small: fits side by side are faster than divided matrices
+        with TemporaryDirectory(prefix="driftlab-") as folder, threadpool_limits(1):
+            told = progress or (lambda text: None)
+            whole = _closed(understood, recordings, Path(folder), told, without, estimate=estimate)
+            return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}, used)
+
+    return in_folder(out, "explain", used, explained)
 
 
 def _closed(
     config: Config,
     recordings: Mapping[str, Sequence[str]],
-    out: Path,
-    used: Collection[Path],
+    folder: Path,
     progress: Progress,
-    estimate: bool,
     without: Collection[str],
-) -> ExplainResult:
-    """Close the loop, and write its files into the folder `out`; it appears when all are whole."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
+    *,
+    estimate: bool,
+) -> Identification:
+    """Close the loop, and write its files into a folder."""
     settings = the_map(config)
     check_kinds(without)
     calibration, train = distinct(config, recordings)
-    # the matrices are small: fits side by side are faster than divided matrices
-    with output_folder(out, "explain", used) as folder, threadpool_limits(1):
-        declared, fitted = _declared(config, settings, calibration, folder, progress)
-        evidence = gather(calibrated(declared), calibration, train, progress)
-        explanation = investigate(evidence, settings, declared_effects(config), progress, without)
-        new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
-        _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
-        progress("opening the holdout")
-        # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
-        both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
-        outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
-        identities = {role: list(map(identity, names)) for role, names in recordings.items()}
-        whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
-        if whole.refuted:
-            _refute(folder, config, new, whole)
-        chosen = 0 if whole.refuted else 1
-        whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-        limits = _limit_results(both[chosen], [measured[chosen] for _, measured in outcomes])
-        rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
-        whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
-        _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
-        return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, used)
+    declared, fitted = _declared(config, settings, calibration, folder, progress)
+    evidence = gather(calibrated(declared), calibration, train, progress)
+    explanation = investigate(evidence, settings, declared_effects(config), progress, without)
+    new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
+    _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
+    progress("opening the holdout")
+    # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
+    both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
+    outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
+    identities = {role: list(map(identity, names)) for role, names in recordings.items()}
+    whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
+    if whole.refuted:
+        _refute(folder, config, new, whole)
+    chosen = 0 if whole.refuted else 1
+    whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
+    limits = _limit_results(both[chosen], [measured[chosen] for _, measured in outcomes])
+    rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
+    whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
+    _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
+    return whole
 
 
 def _declared(
@@ -287,7 +289,7 @@ def outcome_of(
     for what, config in (("declared", declared), ("explained", explained)):
         progress(f"running {recording} through the {what} config")
         runs.append(_run(with_recording(config, recording)))
-    (first, before, _, limited), (second, after, notes, limited_after) = runs
+    (first, before, _, limited), (second, after, run, limited_after) = runs
     coasting = np.isfinite(first["coast"][:, 0])
     outcome = Outcome(
         name=recording,
@@ -299,24 +301,25 @@ def outcome_of(
         after=second["coast"][coasting],
         before_sigma=first["coast_sigma"][coasting],
         after_sigma=second["coast_sigma"][coasting],
-        summaries=(before, after),
-        remarks=tuple(notes),
+        overviews=(before, after),
+        journal=run.journal,
+        remarks=tuple(remarks(after, run.model, run.journal)),
     )
     return outcome, (limited, limited_after)
 
 
-def _run(config: Config) -> tuple[dict[str, Any], dict[str, Any], list[str], dict[str, Measured]]:
-    """Return the columns of a run, its summary, the notes on it, and the quantities that limits may be set for."""
+def _run(config: Config) -> tuple[dict[str, Any], Overview, Run, dict[str, Measured]]:
+    """Return the columns of a run, its overview, itself, and the quantities that limits may be set for."""
     journal = RunLog()
     run = Run(config, journal)
     columns, model = joined(run), run.model
     alignment = journal.alignments[0]
-    overview = OverviewAccumulator(model, alignment).read(columns).overview()
+    overview = OverviewAccumulator(model, alignment).read(columns).overview(journal.faults.first_row)
     limited = {
         "noise": of_alignment(model.tracked, alignment, model.align),
         "coast": of_coast(overview.yardsticks, overview.end - alignment.t, model.align),
     }
-    return columns, summarise(overview, model, journal), remarks(overview, model, journal), limited
+    return columns, overview, run, limited
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -334,7 +337,7 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             group = file.create_group(name)
             group.attrs["recording"] = Path(outcome.name).name
             group.create_dataset("t", data=outcome.t).attrs["unit"] = "s"
-            group["t"].attrs["first_row"] = outcome.summaries[0]["t"]["first_row_s"]
+            group["t"].attrs["first_row"] = outcome.overviews[0].first_row
             for column in PREDICTED:
                 group.create_dataset(column, data=getattr(outcome, column)).attrs["unit"] = outcome.unit.si
     path.write_bytes(whole.getbuffer())

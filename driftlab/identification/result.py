@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,15 +20,18 @@ from driftlab import __version__
 from driftlab.identification.acceptance import CHANCE, GAIN
 from driftlab.identification.diagnosis import MAX_NATS, Diagnosis, Finding, judge
 from driftlab.identification.model import Joint, joint
-from driftlab.identification.prediction_errors import LeftOut, check_length, left_out, rms
 from driftlab.identification.records import Evidence, Progress, missing_excitation
 from driftlab.identification.search import search
-from driftlab.identification.state import Search, Trial, name_of
+from driftlab.identification.state import LeftOut, Search, Trial, check_length, left_out, name_of, rms
 from driftlab.noise.local_level import falling
 from driftlab.soak.blocks import means, runs
-from driftlab.units import RATE, BiasUnit
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
+
+if TYPE_CHECKING:
+    from driftlab.evaluation.overview import Overview
+    from driftlab.filtering.segment import RunLog
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Identification:
         The verdict in sentences.
     outcomes : tuple of Outcome
         Each holdout recording through both configs.
+    change : ErrorChange or None
+        Of the prediction error over all of them.
     content : dict
         That of `loop.json`.
     """
@@ -58,6 +63,7 @@ class Identification:
     fit: Joint
     lines: tuple[str, ...]
     outcomes: tuple[Outcome, ...] = ()
+    change: ErrorChange | None = None
     content: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -73,7 +79,7 @@ class Identification:
     @property
     def worse(self) -> bool:
         """True if the holdout is predicted worse with the effects, by chance or beyond it."""
-        return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
+        return self.change is not None and self.change.after > self.change.before
 
 
 def investigate(
@@ -116,9 +122,8 @@ def closed(
     first = sentence(change, outcomes)
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     lines = (*([first] if first else []), *identified.lines, *remarks)
-    whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), lines=lines)
-    content = {**as_json(whole, recordings), "holdout_change": asdict(change)}
-    return replace(whole, content=content)
+    whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
+    return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
 
 
 NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
@@ -130,7 +135,7 @@ SURE = 1.645  # deviations: one-sided, 95 %
 class Outcome:
     """One holdout recording through both configs: N times, d axes, SI.
 
-    `summaries` are those of the two runs, `remarks` what a user should know of the second.
+    `overviews` are of the two runs; log and remarks are of the second.
     """
 
     name: str
@@ -142,8 +147,9 @@ class Outcome:
     after: Array
     before_sigma: Array
     after_sigma: Array
-    summaries: tuple[dict[str, Any], dict[str, Any]]
-    remarks: tuple[str, ...]
+    overviews: tuple[Overview, Overview]
+    journal: RunLog
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -216,12 +222,12 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
     """Return the content of `loop.json`."""
     state, verdict = whole.search, whole.verdict
     before, after = rms(whole.left_out)
-    unit = state.evidence.unit.si
+    unit = state.evidence.unit
     return {
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
-        "unit": unit,
+        "unit": unit.si,
         "recordings": recordings,
         "effects": [_effect(whole.fit, finding, state.evidence) for finding in verdict.findings],
         "rejected": [
@@ -246,8 +252,10 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
         ],
         "candidates_tried": state.tried,
         "left_out": {"before": before, "after": after},
-        "before": _errors([outcome.summaries[0] for outcome in whole.outcomes], unit),
-        "after": _errors([outcome.summaries[1] for outcome in whole.outcomes], unit),
+        **{
+            name: _errors([outcome.overviews[k] for outcome in whole.outcomes], unit)
+            for k, name in enumerate(("before", "after"))
+        },
     }  # fmt: skip
 
 
@@ -306,30 +314,22 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
+def _errors(overviews: Sequence[Overview], unit: BiasUnit) -> dict[str, Any]:
     """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values.
 
     Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
     """
-    key = BiasUnit(unit, unit).key
-
-    def rms(values: list[Any]) -> Any:
-        return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
-
-    d = len(figures(summaries[0], "filter_rmse")["whole"])
-    return {
-        key("coast_rmse"): rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
-        key("coast_sigma"): rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
-        key("filter_rmse"): rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
-        "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
-        "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),
+    scores = [overview.yardsticks for overview in overviews]
+    rms = {
+        "coast_rmse": [one.coast["to the end"] for one in scores],
+        "coast_sigma": [one.coast_sigma["to the end"] for one in scores],
+        "filter_rmse": [one.filter_whole for one in scores],
     }
-
-
-def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
-    errors: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
-    return errors
+    return {
+        **{unit.key(name): np.sqrt(np.mean(np.square(values), axis=0)) for name, values in rms.items()},
+        "nis": float(np.mean([overview.nis.mean for overview in overviews])),
+        "whiteness_p": float(min(np.min(one.whiteness_p[-len(one.bias) :]) for one in overviews)),
+    }
 
 
 def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:

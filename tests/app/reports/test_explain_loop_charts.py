@@ -1,18 +1,19 @@
 """What the figures of the loop show, and that a browser and matplotlib draw it."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browsers import colours, overflow
 
+from driftlab.filtering.segment import RunLog
 from driftlab.identification.acceptance import FAST, SLOW, CandidateEvidence
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.diagnosis import Diagnosis, Finding
 from driftlab.identification.least_squares import Term
-from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Outcome
-from driftlab.identification.state import Trial, name_of
+from driftlab.identification.state import LeftOut, Trial, name_of, to_show
 from driftlab.reports.explain import MAX_RATIO, NEEDED, bars, left_out_chart, loop_chart, prediction_chart
 from driftlab.reports.figures import figure_of
 from driftlab.units import BiasUnit
@@ -22,7 +23,7 @@ from fusion_plugins.effects.interaction import Interaction
 AXES = ("x", "y", "z")
 RATE = BiasUnit("rad/s", "deg/h")
 DEG_H = np.rad2deg(3600.0)
-FIRST = {"t": {"first_row_s": 0.0}}
+FIRST = SimpleNamespace(first_row=0.0)
 
 
 def trial(effect, ratio):
@@ -57,7 +58,8 @@ def outcome(d=3, n=500, temperature=True):
     curves = [rng.normal(size=(n, d)) * 1e-5 for _ in range(3)]
     sigma = np.full((n, d), 1e-6)
     T = 20 + np.sin(t / 500) if temperature else None
-    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), ())
+    journal = RunLog(alignments=[SimpleNamespace(dt=10.0)])
+    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), journal)
 
 
 def test_bias_and_error_of_each_axis_are_drawn_with_two_deviations():
@@ -84,8 +86,9 @@ def test_no_spike_of_an_error_is_left_out():
 
 
 def test_what_was_refused_and_what_moved_are_shaded():
-    summary = FIRST | {"refused_s": [[600.0, 700.0]], "motion_s": [[1200.0, 1300.0]], "updates": {"interval_s": 10.0}}
-    shown = replace(outcome(), summaries=(FIRST, summary))
+    shown = outcome()
+    shown.journal.refused.spans.append((600.0, 700.0))
+    shown.journal.moving.spans.append((1200.0, 1300.0))
     chart = prediction_chart(shown, AXES)
     assert chart.label.endswith("[min]")
     for panel in chart.panels:
