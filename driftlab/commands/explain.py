@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ from driftlab.commands.console import print_verdict, say, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
-from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
+from driftlab.evaluation.limits import LimitResult, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
 from driftlab.evaluation.overview import Overview, OverviewAccumulator
 from driftlab.evaluation.run_limits import map_of
@@ -30,6 +31,7 @@ from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
+from driftlab.recordings.epochs import epochs
 from driftlab.recordings.identity import identity, sha256
 from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
@@ -39,6 +41,7 @@ from driftlab.reports.provenance import Sheet, sheet_of
 from driftlab.storage.in_memory import InMemoryName
 from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import comment
@@ -192,7 +195,7 @@ def _closed(
         _refute(folder, config, new, whole)
     chosen = 0 if whole.refuted else 1
     whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-    limits = _limit_results(both[chosen], [measured[chosen] for _, measured in outcomes])
+    limits = _limit_results(both[chosen], [(outcome.overviews[chosen], runs[chosen]) for outcome, runs in outcomes])
     rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
     whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
     _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
@@ -253,12 +256,17 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
     path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
-def _limit_results(config: Config, measured: Sequence[dict[str, Measured]]) -> list[LimitResult]:
+def _limit_results(config: Config, runs: Sequence[tuple[Overview, Run]]) -> list[LimitResult]:
     """Hold the worst holdout, and the map, against the limits of the config."""
     if config.limits is None:
         return []
-    worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
-    fitted = map_of(config)
+    measured = []
+    for overview, run in runs:
+        model, alignment = run.model, run.journal.alignments[0]
+        noise = of_alignment(model.tracked, alignment, model.align)
+        coast = of_coast(overview.yardsticks, overview.end - alignment.t, model.align)
+        measured.append({"noise": noise, "coast": coast})
+    worst, fitted = max(measured, key=lambda one: float(np.max(one["coast"].values))), map_of(config)
     return check_limits(
         config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))}
     )
@@ -283,13 +291,14 @@ def _write(folder: Path, whole: Identification, sheet: Sheet, progress: Progress
 
 def outcome_of(
     declared: Config, explained: Config, recording: str, progress: Progress
-) -> tuple[Outcome, tuple[dict[str, Measured], dict[str, Measured]]]:
-    """Run one holdout recording through both configs; return what they predict, and what of each is limited."""
-    runs = []
-    for what, config in (("declared", declared), ("explained", explained)):
-        progress(f"running {recording} through the {what} config")
-        runs.append(_run(with_recording(config, recording)))
-    (first, before, _, limited), (second, after, run, limited_after) = runs
+) -> tuple[Outcome, tuple[Run, Run]]:
+    """Run one holdout recording, which is read once, through both configs; return what they predict, and the runs."""
+    config, faults = with_recording(declared, recording), Faults()
+    stream = list(epochs(read(config, faults), config.filter.update_interval if config.filter else 1.0))
+    progress(f"running {recording} through the declared config")
+    first, before, run_before = _run(config, stream, deepcopy(faults))
+    progress(f"running {recording} through the explained config")
+    second, after, run = _run(with_recording(explained, recording), stream, faults)
     coasting = np.isfinite(first["coast"][:, 0])
     outcome = Outcome(
         name=recording,
@@ -305,21 +314,15 @@ def outcome_of(
         journal=run.journal,
         remarks=tuple(remarks(after, run.model, run.journal)),
     )
-    return outcome, (limited, limited_after)
+    return outcome, (run_before, run)
 
 
-def _run(config: Config) -> tuple[dict[str, Any], Overview, Run, dict[str, Measured]]:
-    """Return the columns of a run, its overview, itself, and the quantities that limits may be set for."""
-    journal = RunLog()
-    run = Run(config, journal)
-    columns, model = joined(run), run.model
-    alignment = journal.alignments[0]
-    overview = OverviewAccumulator(model, alignment).read(columns).overview(journal.faults.first_row)
-    limited = {
-        "noise": of_alignment(model.tracked, alignment, model.align),
-        "coast": of_coast(overview.yardsticks, overview.end - alignment.t, model.align),
-    }
-    return columns, overview, run, limited
+def _run(config: Config, stream: Sequence[Chunk], faults: Faults) -> tuple[dict[str, Any], Overview, Run]:
+    """Return the columns of a run over epochs, its overview, and itself."""
+    run = Run(config, RunLog(faults))
+    columns = joined(run.over(stream))
+    overview = OverviewAccumulator(run.model, run.journal.alignments[0]).read(columns).overview(faults.first_row)
+    return columns, overview, run
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
