@@ -81,26 +81,15 @@ def initial_error(sensor: Sensor) -> InitialError:
 
 @dataclass(frozen=True)
 class Condition:
-    """Errors of one config in one condition, in SI, one value an axis.
+    """Errors of one config in one condition, in SI, one value an axis."""
 
-    Attributes
-    ----------
-    first, whole : (d,) arrays
-        Rms over the first 30 s after the alignment, and the whole interval (tables 6 and 7).
-    segments : (SEGMENTS, d) array
-        Rms over each of five equal parts of the recording, each run on its own (tables 8 and 10); NaN where a part
-        is too short to align in.
-    convergence : (d,) array
-        Time after the alignment at which the error is first below the threshold, s; NaN where it never is (table 12).
-    estimates : dict of str to array
-        The run (`RunSegment.columns`).
-    """
-
-    first: Array
-    whole: Array
+    first: Array  # (d,) rms over the first 30 s after the alignment (tables 6 and 7)
+    whole: Array  # (d,) rms over the whole interval
+    # (SEGMENTS, d) rms over equal parts, each run on its own; NaN: too short to align in (tables 8 and 10)
     segments: Array
+    # (d,) time after the alignment at which the error falls below the threshold, s; NaN: never (table 12)
     convergence: Array
-    estimates: Columns
+    estimates: Columns  # the run (`RunSegment.columns`)
 
 
 @dataclass(frozen=True)
@@ -327,25 +316,13 @@ class Axes:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The configs by what their coasts are off by over one horizon.
+    """The configs by what their coasts are off by over one horizon."""
 
-    Attributes
-    ----------
-    horizon : str
-        Name of the horizon.
-    errors, sigmas : dict of str to float
-        Of each config, the smallest error first: rms over the axes of error and sigma of the coast, in SI.
-    best : tuple of str
-        The config of the smallest error, and those that do not differ from it.
-    axes : Axes or None
-        How the first of `errors` stands against the next one; None without one, and of a single axis.
-    """
-
-    horizon: str
-    errors: dict[str, float]
-    sigmas: dict[str, float]
-    best: tuple[str, ...]
-    axes: Axes | None
+    horizon: str  # its name
+    errors: dict[str, float]  # of each config, the smallest first: rms over the axes, SI
+    sigmas: dict[str, float]  # rms over the axes of the deviation, SI
+    best: tuple[str, ...]  # the config of the smallest error, and those that do not differ from it
+    axes: Axes | None  # the first of `errors` against the next one; None without one, and of a single axis
 
 
 def ranking(runs: Mapping[str, Scores], horizons: Sequence[str] = LONGEST_FIRST) -> Ranking | None:

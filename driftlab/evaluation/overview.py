@@ -45,49 +45,24 @@ Columns = dict[str, "Array"]
 
 @dataclass(frozen=True)
 class Overview:
-    """A run at a glance.
+    """A run at a glance."""
 
-    Attributes
-    ----------
-    count, used : int
-        Updates, and those whose measurement was used.
-    start, end : float
-        Time of the first and the last update, s.
-    first_row : float
-        Time of the recording's first row, s; of the first update where it is not known.
-    bias, sigma : (d,) arrays
-        At the end, in SI.
-    yardsticks : Scores
-    nis : NisTest
-    whiteness_p : (m,) array
-        Of the used updates after the first alignment, as is `nis`.
-    curves : dict of str to array
-        At most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores.
-    errors : dict of str to array
-        `t`, and the error of `bias` and `coast`, with every spike of it.
-    nis_curve : (K, 3) array
-        Time in s, mean nis and number of updates of up to 2 STRETCHES stretches.
-    nis_highest : float
-        Largest nis of one update among them.
-    swing : float
-        Of the temperature, K; 0 where there is none.
-    """
-
-    count: int
-    used: int
-    start: float
-    end: float
-    first_row: float
-    bias: Array
-    sigma: Array
-    yardsticks: Scores
-    nis: NisTest
-    whiteness_p: Array
+    count: int  # updates
+    used: int  # those whose measurement was used
+    start: float  # time of the first update, s
+    end: float  # time of the last one, s
+    first_row: float  # time of the recording's first row, s; of the first update where it is not known
+    bias: Array  # (d,) at the end, SI
+    sigma: Array  # (d,) its deviation
+    yardsticks: Scores  # scores of the run
+    nis: NisTest  # of the used updates after the first alignment
+    whiteness_p: Array  # (m,) of the same
+    # at most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores
     curves: Columns
-    errors: Columns
-    nis_curve: Array
-    nis_highest: float
-    swing: float
+    errors: Columns  # `t`, and the error of `bias` and `coast`, with every spike of it
+    nis_curve: Array  # (K, 3) time in s, mean nis and number of updates of up to 2 STRETCHES stretches
+    nis_highest: float  # largest nis of one update among them
+    swing: float  # of the temperature, K; 0 where there is none
 
 
 class OverviewAccumulator:

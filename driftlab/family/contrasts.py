@@ -44,21 +44,11 @@ LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and
 
 @dataclass(frozen=True, eq=False)
 class EffectContrasts:
-    """Contrasts of units for effects, a column a coefficient.
+    """Contrasts of units for effects, a column a coefficient."""
 
-    Attributes
-    ----------
-    c : (..., d, K) array
-        Coefficients, SI; 0 where a unit cannot show any.
-    information : (..., d, K) array
-        1 / variance of each under the unit's own noise.
-    placebos : (..., d, K, J) array
-        Noise along each placebo, in its own deviation; 0 where nothing of it is its own.
-    """
-
-    c: Array
-    information: Array
-    placebos: Array
+    c: Array  # (..., d, K) coefficients, SI; 0 where a unit cannot show any
+    information: Array  # (..., d, K) 1 / variance of each under the unit's own noise
+    placebos: Array  # (..., d, K, J) noise along each placebo, in its own deviation; 0 where nothing of it is its own
 
     def of(self, columns: slice) -> EffectContrasts:
         """Return some of the columns."""

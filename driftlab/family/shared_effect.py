@@ -81,21 +81,12 @@ class OfLot(BaseModel):
 
 
 class LotEffects(EffectDistribution):
-    """The laws of an effect: of the units that have it, of those that have it not, and of lots.
+    """The laws of an effect: of the units that have it, of those that have it not, and of lots."""
 
-    Attributes
-    ----------
-    others : EffectDistribution or None
-        Of the units of the lots that have it not; None where every lot is one law's.
-    lots : tuple of OfLot
-        In the order of their names; none where no lots are known.
-    differs : float
-        Probability that lots of one law differ as much.
-    """
-
+    # of the units of the lots that have it not; None where every lot is one law's
     others: Annotated[EffectDistribution | None, Field(alias="other_lots")] = None
-    lots: tuple[OfLot, ...] = ()
-    differs: float = 1.0
+    lots: tuple[OfLot, ...] = ()  # in the order of their names; none where no lots are known
+    differs: float = 1.0  # probability that lots of one law differ as much
 
     def has(self, lot: str) -> bool:
         """Return True if the units of a lot have the effect."""
@@ -115,31 +106,17 @@ def _settings(effect: Effect) -> dict[str, Any]:
 
 
 class SharedEffect(LotEffects):
-    """One effect with its laws, as `family.json` has it.
+    """One effect with its laws, as `family.json` has it."""
 
-    Attributes
-    ----------
-    effect : Effect
-        With its hyper-parameters.
-    unit : str
-        Of the coefficients.
-    evidence, of_mean, of_size, price : float
-        Nats: that it is there, of the mean of the units' coefficients and of their squares; and the threshold.
-    left_out, in_other_lots : float, float or None
-        Gain on units, mean a unit in nats, that had no part in the law nor in the hyper-parameters; and in lots.
-    indistinguishable_from : tuple of str
-        Effects that predict left-out units as well.
-    """
-
-    effect: Annotated[Effect, PlainValidator(_of_kind), PlainSerializer(_settings)]
-    unit: str
-    evidence: float
-    of_mean: float
-    of_size: float
-    price: float
-    left_out: float
-    in_other_lots: float | None
-    indistinguishable_from: tuple[str, ...]
+    effect: Annotated[Effect, PlainValidator(_of_kind), PlainSerializer(_settings)]  # with its hyper-parameters
+    unit: str  # of the coefficients
+    evidence: float  # that it is there, nats
+    of_mean: float  # the same of the mean of the units' coefficients alone
+    of_size: float  # the same of their squares alone
+    price: float  # threshold of the evidence
+    left_out: float  # mean gain of a unit that had no part in the law nor in the hyper-parameters, nats
+    in_other_lots: float | None  # the same of whole lots
+    indistinguishable_from: tuple[str, ...]  # effects that predict left-out units as well
 
     @model_serializer(mode="wrap")
     def _described(self, inner: SerializerFunctionWrapHandler) -> dict[str, Any]:

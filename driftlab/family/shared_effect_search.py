@@ -72,27 +72,15 @@ class Offer:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An offer and its evidence, nats.
-
-    Attributes
-    ----------
-    mean, size : float
-        Of the mean of the coefficients, and of their squares.
-    chance, price : float
-        Of both, and of all trials.
-    lot : str
-        The lot that was looked at alone; empty: all.
-    left_out : (n,) array
-        Gain in the log-likelihood of the coefficients of each unit, predicted from others.
-    """
+    """An offer and its evidence, nats."""
 
     offer: Offer
-    mean: float
-    size: float
-    chance: float
-    price: float
-    lot: str
-    left_out: Array
+    mean: float  # of the mean of the coefficients
+    size: float  # of their squares
+    chance: float  # of both
+    price: float  # of all trials
+    lot: str  # that was looked at alone; empty: all
+    left_out: Array  # (n,) gain in the log-likelihood of the coefficients of each unit, predicted from others
 
     @property
     def effect(self) -> Effect:

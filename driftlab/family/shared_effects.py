@@ -54,33 +54,19 @@ class RejectedEffect(BaseModel):
 
 
 class SharedEffects(BaseModel):
-    """Result of the search, as `family.json` has it without the units.
-
-    Attributes
-    ----------
-    verdict : str
-        `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished.
-    effects : tuple of SharedEffect
-    rejected : tuple of RejectedEffect
-        The best of every other kind, and why it was not added.
-    tried, units, searched : int
-        Candidates; units in all; and units that were searched.
-    of_units : mapping of str to tuple of OfUnit
-        By unit, of each effect: coefficients and deviations (d, q), shrunken to the law.
-    noise : mapping of str to UnitDensities
-        By unit, beside the effects.
-    """
+    """Result of the search, as `family.json` has it without the units."""
 
     model_config = ConfigDict(frozen=True)
 
-    verdict: str = "nothing_common"
+    verdict: str = "nothing_common"  # `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished
     effects: tuple[SharedEffect, ...] = ()
-    rejected: tuple[RejectedEffect, ...] = ()
-    tried: int = 0
-    units: int = 0
-    searched: int = 0
+    rejected: tuple[RejectedEffect, ...] = ()  # the best of every other kind, and why it was not added
+    tried: int = 0  # candidates
+    units: int = 0  # in all
+    searched: int = 0  # units that were searched
+    # (d, q) of each effect, by unit
     of_units: Annotated[InstanceOf[dict[str, tuple[OfUnit, ...]]], Field(exclude=True)] = {}
-    noise: Annotated[InstanceOf[dict[str, UnitDensities]], Field(exclude=True)] = {}
+    noise: Annotated[InstanceOf[dict[str, UnitDensities]], Field(exclude=True)] = {}  # by unit, beside the effects
 
     def apart(self, soaked: UnitInformation, lot: str = "") -> UnitInformation:
         """Return the information of a unit's soaks with the effects in the model; itself where there are none."""

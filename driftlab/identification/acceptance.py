@@ -36,33 +36,17 @@ DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further 
 
 @dataclass(frozen=True)
 class CandidateEvidence:
-    """A candidate's figures, as above.
+    """A candidate's figures, as above; gains, chance and price in nats."""
 
-    Attributes
-    ----------
-    ratio : float
-        Mean square of the left-out error, with over without.
-    steady : float
-        Mean of the logarithms of the ratios part by part, over the deviation of that mean.
-    parts : int
-        Number of parts.
-    poorest : float
-        The largest of the ratios of whole recordings.
-    beside : bool
-        Whether there are other effects in the model.
-    left_out, chance, gain, price : float
-        Left-out gain, chance of the matched filter's answer, its gain beyond the criterion, and log M, in nats.
-    """
-
-    ratio: float
-    steady: float
-    parts: int
-    poorest: float
-    beside: bool
-    left_out: float
-    chance: float
-    gain: float
-    price: float
+    ratio: float  # mean square of the left-out error, with over without
+    steady: float  # mean of the logarithms of the ratios part by part, over the deviation of that mean
+    parts: int  # their number
+    poorest: float  # the largest of the ratios of whole recordings
+    beside: bool  # whether there are other effects in the model
+    left_out: float  # left-out gain
+    chance: float  # of the matched filter's answer
+    gain: float  # of the matched filter, beyond the criterion
+    price: float  # log M
 
     @property
     def needed(self) -> float:

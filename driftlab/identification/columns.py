@@ -34,21 +34,12 @@ class RowSegment:
 
 @dataclass(frozen=True)
 class EffectColumns:
-    """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start.
+    """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start."""
 
-    Attributes
-    ----------
-    p : int
-        Number of coefficients.
-    columns, places : tuples of (k,) arrays of int, one an axis
-        Columns, and the coefficients they belong to.
-    starts : (R,) array of int, or None
-        Columns of the response to a start of 1 in each recording; None where the effect has no unknown start.
-    """
-
-    p: int
-    columns: tuple[Indices, ...]
-    places: tuple[Indices, ...]
+    p: int  # number of coefficients
+    columns: tuple[Indices, ...]  # (k,) of each axis
+    places: tuple[Indices, ...]  # (k,) of each axis: the coefficients that the columns belong to
+    # (R,) response to a start of 1 in each recording; None where the effect has no unknown start
     starts: Indices | None
 
 

@@ -56,29 +56,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The verdict on a search.
+    """The verdict on a search."""
 
-    Attributes
-    ----------
-    word : str
-        In one word.
-    findings : tuple of Finding
-        The effects that were added.
-    rejected : tuple of Trial
-        The best of each effect that was not.
-    left : tuple of Structure
-        Significant structure of the residual.
-    promising : tuple of Trial
-        Of the rejected, those that another recording may confirm.
-    experiments : tuple of Experiment
-        Recordings that would tell rivals apart, and confirm what stands on slow evidence.
-    """
-
-    word: Word
-    findings: tuple[Finding, ...]
-    rejected: tuple[Trial, ...]
-    left: tuple[Structure, ...]
-    promising: tuple[Trial, ...]
+    word: Word  # in one word
+    findings: tuple[Finding, ...]  # effects that were added
+    rejected: tuple[Trial, ...]  # the best of each effect that was not
+    left: tuple[Structure, ...]  # significant structure of the residual
+    promising: tuple[Trial, ...]  # of the rejected, those that another recording may confirm
+    # recordings that would tell rivals apart, and confirm what stands on slow evidence
     experiments: tuple[Experiment, ...]
 
 

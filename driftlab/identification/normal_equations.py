@@ -28,21 +28,11 @@ TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not deter
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Symmetric, non-negative normal equations.
+    """Symmetric, non-negative normal equations."""
 
-    Attributes
-    ----------
-    A : (k, k) array
-        Inner products of the columns, ridges added.
-    b : (k,) array
-        Theirs with the signal.
-    yy : float
-        The signal's sum of squares.
-    """
-
-    A: Array
-    b: Array
-    yy: float
+    A: Array  # (k, k) inner products of the columns, ridges added
+    b: Array  # (k,) theirs with the signal
+    yy: float  # the signal's sum of squares
 
     @classmethod
     def of(cls, G: Array) -> NormalEquations:

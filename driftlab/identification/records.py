@@ -41,28 +41,14 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Record:
-    """One recording in N means, and rows of them.
+    """One recording in N means, and rows of them."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the recording.
-    calibration, train : bool
-        Its roles; it may have both.
-    chunk : Chunk
-        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is without the
-        thermometer's steps; and the other channels.
-    starts : (n,) array of int
-        The first mean of each row.
-    ranges : mapping of str to (columns, 2) array
-        Smallest and largest value of each channel, update by update.
-    """
-
-    name: str
-    calibration: bool
-    train: bool
-    chunk: Chunk
-    starts: NDArray[np.int64]
+    name: str  # of the recording
+    calibration: bool  # whether it has this role
+    train: bool  # whether it has this one; it may have both
+    chunk: Chunk  # N means in SI; the sensor's channel (N, d) less the reference, `temperature` without steps
+    starts: NDArray[np.int64]  # (n,) the first mean of each row
+    # (columns, 2) smallest and largest value of each channel, update by update
     ranges: Mapping[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -84,33 +70,15 @@ class Record:
 
 @dataclass(frozen=True)
 class Evidence:
-    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at.
+    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at."""
 
-    Attributes
-    ----------
-    records : tuple of Record
-        The recordings, those of the calibration first.
-    channel : str
-        Of the tracked sensor.
-    axes : tuple of str
-        Its axes.
-    unit : BiasUnit
-        Of its bias.
-    interval : float
-        Of a row, s.
-    align : float
-        How long a unit is aligned, s.
-    noise : (d,) array or None
-        Declared white-noise density, SI/sqrt(Hz); None: as the model leaves it.
-    """
-
-    records: tuple[Record, ...]
-    channel: str
-    axes: tuple[str, ...]
-    unit: BiasUnit
-    interval: float
-    align: float
-    noise: Array | None = None
+    records: tuple[Record, ...]  # those of the calibration first
+    channel: str  # of the tracked sensor
+    axes: tuple[str, ...]  # of the sensor
+    unit: BiasUnit  # of its bias
+    interval: float  # of a row, s
+    align: float  # how long a unit is aligned, s
+    noise: Array | None = None  # (d,) declared density of white noise, SI/sqrt(Hz); None: as the model leaves it
 
     def __len__(self) -> int:
         return sum(len(record) for record in self.records)

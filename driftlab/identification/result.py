@@ -36,35 +36,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Identification:
-    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout.
+    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout."""
 
-    Attributes
-    ----------
-    search : Search
-        The identified model, and the trials.
-    verdict : Diagnosis
-    left_out : tuple of LeftOut
-        Prediction errors of left-out parts without the effects and with them.
-    fit : Joint
-        The model fitted to all rows.
-    lines : tuple of str
-        The verdict in sentences.
-    outcomes : tuple of Outcome
-        Each holdout recording through both configs.
-    change : ErrorChange or None
-        Of the prediction error over all of them.
-    content : dict
-        That of `loop.json`.
-    """
-
-    search: Search
-    verdict: Diagnosis
-    left_out: tuple[LeftOut, ...]
-    fit: Joint
-    lines: tuple[str, ...]
-    outcomes: tuple[Outcome, ...] = ()
-    change: ErrorChange | None = None
-    content: dict[str, Any] = field(default_factory=dict)
+    search: Search  # the identified model, and the trials
+    verdict: Diagnosis  # on it
+    left_out: tuple[LeftOut, ...]  # prediction errors of left-out parts without the effects and with them
+    fit: Joint  # the model fitted to all rows
+    lines: tuple[str, ...]  # the verdict in sentences
+    outcomes: tuple[Outcome, ...] = ()  # each holdout recording through both configs
+    change: ErrorChange | None = None  # of the prediction error over all of them
+    content: dict[str, Any] = field(default_factory=dict)  # that of `loop.json`
 
     @property
     def anything(self) -> bool:

@@ -23,30 +23,14 @@ SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own we
 
 @dataclass(frozen=True)
 class Trial:
-    """One family's best candidate beside a base.
+    """One family's best candidate beside a base."""
 
-    Attributes
-    ----------
-    model : tuple of Term
-        The base, its memories as they were chosen with the candidate, and the candidate last.
-    evidence : CandidateEvidence
-        Its figures.
-    blocks : (d, blocks) array
-        Sums of squares of the left-out errors, in the columns' scale.
-    likelihood : float
-        Gain in log-likelihood, each side at its best noise and parameters paid for, in nats.
-    passes : bool
-        Whether the evidence is enough.
-    reason : str
-        The figure that is not enough.
-    """
-
-    model: Model
-    evidence: CandidateEvidence
-    blocks: Array
-    likelihood: float
-    passes: bool
-    reason: str
+    model: Model  # the base, its memories as they were chosen with the candidate, and the candidate last
+    evidence: CandidateEvidence  # figures of the candidate
+    blocks: Array  # (d, blocks) sums of squares of the left-out errors, in the columns' scale
+    likelihood: float  # gain in log-likelihood, each side at its best noise and parameters paid for, nats
+    passes: bool  # whether the evidence is enough
+    reason: str  # the figure that is not enough
 
     @property
     def term(self) -> Term:
@@ -72,41 +56,22 @@ class Trial:
 
 @dataclass
 class Search:
-    """A search: the model so far, the fits that it stands on, and the trials.
+    """A search: the model so far, the fits that it stands on, and the trials."""
 
-    Attributes
-    ----------
-    squares : LeastSquares
-        Fits, on all columns.
-    model : tuple of Term
-        The model.
-    noises : list of LocalLevel, one an axis
-        Of the model's residuals.
-    added : list of (Trial, tuple of Trial)
-        Each addition with its rivals, in the order of the model's terms after those that were declared.
-    trials : list of Trial
-        The last that were tried, and not added.
-    tried : int
-        Candidates at once, at most.
-    without : frozenset of str
-        Kinds of effects that are not to be tried.
-    broken : dict of str to str
-        Kinds that were left out because they do not keep their contract, and how.
-    same : dict of str to str
-        Names whose regressors are exactly another's, and that one's name: they are not tried.
-    """
-
-    squares: LeastSquares
+    squares: LeastSquares  # fits, on all columns
     progress: Progress
-    declared: Model
-    model: Model
-    left_out: tuple[LeftOutPart, ...]
-    noises: list[LocalLevel] = field(default_factory=list)
+    declared: Model  # terms that the config has already
+    model: Model  # so far
+    left_out: tuple[LeftOutPart, ...]  # parts that are left out in turn
+    noises: list[LocalLevel] = field(default_factory=list)  # of the model's residuals, one an axis
+    # each addition with its rivals, in the order of the model's terms after the declared ones
     added: list[tuple[Trial, tuple[Trial, ...]]] = field(default_factory=list)
-    trials: list[Trial] = field(default_factory=list)
-    tried: int = 0
-    without: frozenset[str] = frozenset()
+    trials: list[Trial] = field(default_factory=list)  # the last that were tried, and not added
+    tried: int = 0  # candidates at once, at most
+    without: frozenset[str] = frozenset()  # kinds of effects that are not to be tried
+    # kinds that were left out because they do not keep their contract, and how
     broken: dict[str, str] = field(default_factory=dict)
+    # names whose regressors are exactly another's, and that one's name: they are not tried
     same: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -195,28 +160,14 @@ def name_of(effect: Effect) -> str:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Errors of a part that was left out, its mean taken off, from the end of its alignment on.
+    """Errors of a part that was left out, its mean taken off, from the end of its alignment on."""
 
-    Attributes
-    ----------
-    name : str
-        The recording.
-    train : bool
-        Whether it is for training.
-    part : LeftOutPart
-        The rows that were left out of it.
-    t : (n,) array
-        Times, s.
-    before, after : (n, d) arrays
-        Errors of the declared model and of the final one, SI.
-    """
-
-    name: str
-    train: bool
-    part: LeftOutPart
-    t: Array
-    before: Array
-    after: Array
+    name: str  # of the recording
+    train: bool  # whether it is for training
+    part: LeftOutPart  # rows that were left out of it
+    t: Array  # (n,) times, s
+    before: Array  # (n, d) errors of the declared model, SI
+    after: Array  # (n, d) errors of the final one, SI
 
 
 def check_length(evidence: Evidence) -> None:

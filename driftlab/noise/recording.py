@@ -39,35 +39,19 @@ class TooShort(DataError):
 
 @dataclass(frozen=True)
 class Analysis:
-    """Curves and coefficients of one recording.
+    """Curves and coefficients of one recording."""
 
-    Attributes
-    ----------
-    dt : float
-        Mean sampling interval within the stretches, s.
-    used_s, total_s, start_s : float
-        Length of all stretches that were used, of the recording, and the time of the first sample used, s.
-    axes, curves, coefficients : dict of channel to list of d items
-        Name, curve and coefficients of each axis.
-    notes : list of str
-        Remarks for the user, a sentence each.
-    plugins : list of dict
-        Those that took part.
-    sensors : dict of channel to Sensor
-        As the config has them.
-    """
-
-    name: str
-    dt: float
-    used_s: float
-    total_s: float
-    start_s: float
-    axes: dict[str, list[str]]
-    curves: dict[str, list[AllanCurve]]
-    coefficients: dict[str, list[Coefficients]]
-    notes: list[str]
-    plugins: list[Participant] = field(default_factory=list)
-    sensors: dict[str, Sensor] = field(default_factory=dict)
+    name: str  # of the recording
+    dt: float  # mean sampling interval within the stretches, s
+    used_s: float  # length of all stretches that were used, s
+    total_s: float  # length of the recording, s
+    start_s: float  # time of the first sample used, s
+    axes: dict[str, list[str]]  # names, by channel
+    curves: dict[str, list[AllanCurve]]  # of each axis, by channel
+    coefficients: dict[str, list[Coefficients]]  # of each axis, by channel
+    notes: list[str]  # remarks for the user, a sentence each
+    plugins: list[Participant] = field(default_factory=list)  # those that took part
+    sensors: dict[str, Sensor] = field(default_factory=dict)  # as the config has them, by channel
 
     @property
     def first(self) -> AllanCurve:

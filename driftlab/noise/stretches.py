@@ -82,27 +82,13 @@ def at_rest(settings: MeasurementModel, samples: Chunk) -> RestWindows:
 
 @dataclass(frozen=True)
 class Pieces:
-    """The usable samples of a recording, cut at gaps and at rows that are not usable.
+    """The usable samples of a recording, cut at gaps and at rows that are not usable."""
 
-    Attributes
-    ----------
-    rows : (S, 2) array
-        First row and end of each piece, of one row too.
-    missing : (S - 1,) array
-        Samples lost behind each piece but the last; NEVER where rows that are not usable lie between.
-    parts : (P, 2) array
-        First piece of each span whose gaps can be bridged, and the piece after its last.
-    places : (P,) array
-        Samples that each span would have without a gap.
-    dt : float
-        Mean step of the spans, s.
-    """
-
-    rows: Index
-    missing: Index
-    parts: Index
-    places: Index
-    dt: float
+    rows: Index  # (S, 2) first row and end of each piece, of one row too
+    missing: Index  # (S - 1,) samples lost behind each piece but the last; NEVER: rows that are not usable lie between
+    parts: Index  # (P, 2) first piece of each span whose gaps can be bridged, and the piece after its last
+    places: Index  # (P,) samples that each span would have without a gap
+    dt: float  # mean step of the spans, s
 
     @property
     def samples(self) -> int:
