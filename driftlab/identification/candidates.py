@@ -15,10 +15,9 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError
 
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
-from driftlab.identification.normal_equations import Indices
 from driftlab.identification.state import Search, name_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis

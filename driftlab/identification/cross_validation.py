@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
-from driftlab.identification.normal_equations import Indices
 from driftlab.noise.local_level import LocalLevel
 from fusion_core.chunk import Array
 

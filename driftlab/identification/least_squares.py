@@ -20,8 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.identification.columns import EffectRegressors
-from driftlab.identification.normal_equations import Indices, NormalEquations, free_starts
+from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations, free_starts
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 

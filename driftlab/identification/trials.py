@@ -23,9 +23,8 @@ import numpy as np
 
 from driftlab.identification.acceptance import CandidateEvidence, accept, fast_evidence
 from driftlab.identification.candidates import Family, family_of
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, left_with_starts
 from driftlab.identification.least_squares import LeastSquares, Model, Term
-from driftlab.identification.normal_equations import left_with_starts
 from driftlab.identification.state import Errors, Search, Trial
 from driftlab.noise.local_level import LocalLevel, effective
 from fusion_core.chunk import Array

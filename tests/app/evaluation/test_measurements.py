@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from driftlab.config import Limits
-from driftlab.evaluation.bias_instability import Averages
 from driftlab.evaluation.limits import SIDE, check_limits, outcome, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
+from driftlab.evaluation.run_limits import Averages
 from driftlab.evaluation.scores import score
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
