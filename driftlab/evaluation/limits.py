@@ -36,14 +36,6 @@ RULE = (
 )
 EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
 VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit
-MEASURED_BY = {
-    "bias_instability": "driftlab allan",
-    "residual": "driftlab fit-map",
-    "coast": "driftlab run",
-    "swing": "driftlab fit-map",
-    "noise": "driftlab allan",
-    "hysteresis": "driftlab fit-map",
-}
 NAMES = {
     "bias_instability": "bias instability",
     "residual": "residual of the map",
@@ -52,82 +44,40 @@ NAMES = {
     "noise": "white noise",
     "hysteresis": "hysteresis",
 }
+MEASURED_BY = {"bias_instability": "allan", "noise": "allan", "coast": "run"}  # others: `driftlab fit-map`
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement of a limited quantity.
+    """A measurement of a limited quantity, a value an axis; one of zero does not show, and is judged by `high`."""
 
-    Attributes
-    ----------
-    values : (d,) array
-        One value an axis.
-    axes : tuple of str
-        Their names.
-    low, high : (d,) arrays or None
-        The true value is above `low` with 95 %, and below `high` with 95 %; None where the uncertainty is not known.
-        A value of zero is one that does not show, and is judged by `high`.
-    stands_on : str
-        What the values were measured on, for the table.
-    missing : str
-        Why they must not be judged; empty where they may.
-    seconds : float
-        Time they stand on, s; NaN where more of it would not tell more.
-    otherwise : str
-        What would decide where time does not.
-    beside : str
-        Remark beside the verdict where no limit is set for it.
-    """
-
-    values: Array
-    axes: Sequence[str]
-    low: Array | None = None
-    high: Array | None = None
-    stands_on: str = ""
-    missing: str = ""
-    seconds: float = float("nan")
-    otherwise: str = ""
-    beside: str = ""
+    values: Array  # (d,), SI
+    axes: Sequence[str]  # their names
+    low: Array | None = None  # (d,) the true value is above it with 95 %; None where the uncertainty is not known
+    high: Array | None = None  # (d,) the true value is below it with 95 %
+    stands_on: str = ""  # what the values were measured on, for the table
+    missing: str = ""  # why they must not be judged; empty where they may
+    seconds: float = float("nan")  # time they stand on, s; NaN where more of it would not tell more
+    otherwise: str = ""  # what would decide where time does not
+    beside: str = ""  # remark beside the verdict where no limit is set for it
 
 
 @dataclass(frozen=True)
 class LimitResult:
-    """One limit, what was measured, and the decision.
+    """One limit, what was measured, and the decision; in SI."""
 
-    Attributes
-    ----------
-    name : str
-        Of the limit, as the config has it.
-    limit, value, guard : float
-        In SI; `value` is of the axis that decides, NaN where there is none, `guard` what is added to it or taken off;
-        NaN where that is not known.
-    axis : str
-        The axis that decides.
-    decision : str
-        `pass`, `fail` or `undecided`.
-    measured : bool
-        Whether there is a value that may be judged.
-    note : str
-        What the value stands on, or why there is none.
-    needs : str
-        What would decide it; empty where it is decided.
-    more : float
-        Time that would, beside what was measured, s; NaN where none would, or that is not known.
-    beside : str
-        Remark beside the verdict on all limits, since none is set for it; the first row has it.
-    """
-
-    name: str
+    name: str  # of the limit, as the config has it
     limit: float
-    value: float
-    guard: float
-    axis: str
-    decision: Decision
-    measured: bool = True
-    note: str = ""
-    needs: str = ""
+    value: float  # of the axis that decides; NaN where there is none
+    guard: float  # what is added to it or taken off; NaN where that is not known
+    axis: str  # that decides
+    decision: Decision  # `pass`, `fail` or `undecided`
+    measured: bool = True  # whether there is a value that may be judged
+    note: str = ""  # what the value stands on, or why there is none
+    needs: str = ""  # what would decide it; empty where it is decided
+    # time that would, beside what was measured, s; NaN where none would, or that is not known
     more: float = float("nan")
-    beside: str = ""
+    beside: str = ""  # remark beside the verdict on all limits, since none is set for it; the first row has it
 
     @property
     def verdict(self) -> str:
@@ -243,7 +193,7 @@ def outcome(line: str) -> str:
 
 def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
     if measured is None:
-        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
+        return _missing(name, limit, f"`driftlab {MEASURED_BY.get(name, 'fit-map')}` measures it")
     if measured.missing:
         return _missing(name, limit, measured.missing)
     values, axes = np.asarray(measured.values, dtype=np.float64), list(measured.axes)

@@ -1,7 +1,8 @@
 """The limits of a config, held against what a run has measured.
 
-For the Allan deviation of a run less its map, its filter's input is averaged over a second or more. An average counts where half of it or more was measured at rest; all stretches of such averages are analysed, short gaps
-bridged where the unit did not move. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
+For the Allan deviation of a run less its map, the input of its filter is averaged over a second or more. An average
+counts where half of it or more was measured at rest; all stretches of such averages are analysed, short gaps bridged
+where the unit did not move. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
 """
 
 from __future__ import annotations

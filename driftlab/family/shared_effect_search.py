@@ -27,8 +27,10 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.parallel import ParallelMap, serial
@@ -49,7 +51,7 @@ HALVINGS = 36  # of the interval that holds s^2
 MIN_UNITS = 5  # for a mean and its scatter
 MIN_PLACEBOS = 3  # for the noise of a unit
 
-Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,11 +227,9 @@ def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate
 
 def between_lots(offer: Offer, contrasts: EffectContrasts, lots: Sequence[str]) -> float | None:
     """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
-    names, of_unit = sorted(set(lots)), np.array(lots)
-    if len(names) < 2:
+    if len(set(lots)) < 2:
         return None
-    folds = ((np.flatnonzero(of_unit != name), np.flatnonzero(of_unit == name)) for name in names)
-    return float(np.sum([_gains([offer], contrasts, *fold)[:, 0].sum() for fold in folds])) / len(lots)
+    return float(_left_out([offer], contrasts, np.arange(len(lots)), np.array(lots)).sum()) / len(lots)
 
 
 def refine(
@@ -308,11 +308,13 @@ def _part(offers: Sequence[Offer], contrasts: EffectContrasts, k: int) -> Effect
     return contrasts.of(_columns(offers)[k])
 
 
-def _left_out(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> Array:
-    """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
-    folds = np.arange(len(units)) % FOLDS
+def _left_out(
+    offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices, folds: NDArray[Any] | None = None
+) -> Array:
+    """Return the gains (n, offers) of each of some units, predicted from the other folds (n,) of these."""
+    folds = np.arange(len(units)) % FOLDS if folds is None else folds
     total = np.zeros((len(units), len(offers)))
-    for fold in range(FOLDS):
+    for fold in np.unique(folds):
         total[folds == fold] = _gains(offers, contrasts, units[folds != fold], units[folds == fold])
     return total
 

@@ -184,24 +184,7 @@ class EffectColumns:
 
 
 class EffectRegressors:
-    """Columns over the n rows of one evidence.
-
-    Attributes
-    ----------
-    W : (n, K) array
-        The columns.
-    means : (R, K) array
-        Means that were subtracted in each recording, in the columns' scaled unit.
-    scale : (K,) array
-        Divisor of each column.
-    y : (d,) array of int
-        Columns of the measured bias.
-    levels : (R,) array of int
-        Columns of the recordings' levels.
-    segments : tuple of Segment
-    declared_white : (d,) array
-        Variance of the declared white noise of a row, in the scaled unit; NaN where none is declared.
-    """
+    """Columns over the n rows of one evidence."""
 
     def __init__(self, evidence: Evidence, basis: Basis | None) -> None:
         self.evidence, self.basis = evidence, basis
@@ -211,15 +194,15 @@ class EffectRegressors:
         self.segments = _segments(evidence)
         self._gram = np.zeros((len(self.segments), 0, 0))
         self._sums: dict[tuple[int, ...], Array] = {}
-        self._effects: dict[str, EffectColumns] = {}
-        self._same: dict[int, tuple[Effect, EffectColumns]] = {}  # an object is found sooner than what it says
-        self._maps: dict[str, Indices] = {}
+        self._effects: dict[Effect, EffectColumns] = {}
+        self._maps: dict[tuple[Effect, ...], Indices] = {}
         levels = np.zeros((n, R))
         for r, rows in enumerate(evidence.slices):
             levels[rows, r] = 1.0
-        self.levels = self._add(levels, centred=False)
-        self.y = self._add(evidence.rate)
+        self.levels = self._add(levels, centred=False)  # (R,) columns of the recordings' levels
+        self.y = self._add(evidence.rate)  # (d,) columns of the measured bias
         noise = np.full(len(self.y), np.nan) if evidence.noise is None else evidence.noise
+        # variance (d,) of the declared white noise of a row, in the scaled unit; NaN where none is declared
         self.declared_white = (noise / self._scale[self.y]) ** 2 / evidence.interval
         self.penalty = np.zeros((0, 0)) if basis is None else basis.penalty
 
@@ -230,7 +213,7 @@ class EffectRegressors:
 
     @property
     def means(self) -> Array:
-        """Mean of each column in each recording (R, K), which was subtracted."""
+        """Mean of each column in each recording (R, K), which was subtracted, in the scaled unit."""
         return self._means[: self._size].T
 
     @property
@@ -282,19 +265,15 @@ class EffectRegressors:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""
         if self.basis is None:
             return np.zeros(0, dtype=np.intp)
-        acting = [effect for effect in effects if effect.acts_on_input]
-        key = repr(acting)
-        if key not in self._maps:
+        acting = tuple(effect for effect in effects if effect.acts_on_input)
+        if acting not in self._maps:
             curves = [self.basis.values(T) for T in self.evidence.map_inputs(acting)]
-            self._maps[key] = self._add(self.evidence.rows(curves))
-        return self._maps[key]
+            self._maps[acting] = self._add(self.evidence.rows(curves))
+        return self._maps[acting]
 
     def of(self, effect: Effect) -> EffectColumns:
         """Return the columns of an effect."""
-        if id(effect) in self._same:
-            return self._same[id(effect)][1]
-        key = repr(effect)
-        if key not in self._effects:
+        if effect not in self._effects:
             whole = self.evidence.rows([effect.signature(chunk, None)[0] for chunk in self.evidence.chunks])
             columns: list[Indices] = []
             places: list[Indices] = []
@@ -305,9 +284,8 @@ class EffectRegressors:
                 else:
                     columns.append(self._add(own[:, place]))
                 places.append(place)
-            self._effects[key] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
-        self._same[id(effect)] = effect, self._effects[key]
-        return self._effects[key]
+            self._effects[effect] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
+        return self._effects[effect]
 
     def _starts(self, effect: Effect) -> Indices | None:
         """Return a column for each recording: the response to a start of 1, row by row."""
