@@ -100,7 +100,7 @@ class Candidate:
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 
-def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
+def offers_for(sample: Sequence[UnitInformation]) -> tuple[list[Offer], dict[str, str]]:
     """Return the offers of the installed effects, and why kinds of effects have none.
 
     Lines have none: their phase is the chamber's at the time, and no unit's.
@@ -109,7 +109,7 @@ def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> t
     alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
     chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
     lines = [kind_of(cls) for cls in installed() if cls.course == "line"]
-    refused = {**dict.fromkeys(lines, "its phase is no property of a unit"), **dict.fromkeys(without, "not wanted")}
+    refused = dict.fromkeys(lines, "its phase is no property of a unit")
     broken: dict[str, str] = {}
     kinds = offers_by_kind(partial(_offers_of, sample[0].axes, chunks), refused, broken)
     offers = [offer for _, of_kind in kinds for offer in of_kind]

@@ -8,7 +8,7 @@ n units, d axes, q coefficients an axis of an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,10 +81,13 @@ class SharedEffects(BaseModel):
 
 
 def find_common(
-    units: Iterable[tuple[UnitInformation, str]], *, bias_unit: str = "rad/s", without: Collection[str] = (),
-    seed: int = 0, sample: int = SAMPLE, each: ParallelMap = serial,
-) -> SharedEffects:  # fmt: skip
-    """Return the effects that units share.
+    units: Iterable[tuple[UnitInformation, str]],
+    *,
+    bias_unit: str = "rad/s",
+    sample: int = SAMPLE,
+    each: ParallelMap = serial,
+) -> SharedEffects:
+    """Return the effects that units share; `sample` of them at most are searched.
 
     Parameters
     ----------
@@ -92,17 +95,14 @@ def find_common(
         Units and their lots; gone through more than once, each time in the same order.
     bias_unit : str
         SI unit of the bias.
-    without : kinds of effects that are not tried
-    seed : int
-        Of the sample, where there are more units than `sample`.
     each : ParallelMap, optional
         Goes through the units.
     """
-    drawn, count = _drawn(units, sample, seed)
+    drawn, count = _drawn(units, sample)
     if len(drawn) < MIN_UNITS:
         why = f"{len(drawn)} units; {MIN_UNITS} are needed to tell what they have in common"
         return SharedEffects(rejected=(RejectedEffect(effect="all", reason=why),), units=count, searched=len(drawn))
-    search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], without, each)
+    search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], each)
     search.run()
     effects = search.measured(units, bias_unit)
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
@@ -112,11 +112,9 @@ def find_common(
     )  # fmt: skip
 
 
-def _drawn(
-    units: Iterable[tuple[UnitInformation, str]], most: int, seed: int
-) -> tuple[list[tuple[UnitInformation, str]], int]:
+def _drawn(units: Iterable[tuple[UnitInformation, str]], most: int) -> tuple[list[tuple[UnitInformation, str]], int]:
     """Return at most some units at random, in their order, and how many there are; that many are ever held."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     reservoir: dict[int, tuple[UnitInformation, str]] = {}
     count = 0
     for number, unit in enumerate(units):  # reservoir sampling
@@ -132,13 +130,11 @@ def _drawn(
 class _Search:
     """Effects added one by one to the model of the sampled units: of each the candidate as chosen, and its rivals."""
 
-    def __init__(
-        self, sample: list[UnitInformation], lots: list[str], without: Collection[str], each: ParallelMap
-    ) -> None:
+    def __init__(self, sample: list[UnitInformation], lots: list[str], each: ParallelMap) -> None:
         self.sample, self.lots, self.each = sample, lots, each
         self.taken: list[tuple[Candidate, Effect, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
-        self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)], without)
+        self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)])
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
         self.noise: dict[str, UnitDensities] = {}
 

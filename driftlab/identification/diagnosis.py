@@ -209,12 +209,12 @@ SETTLE = 3  # rows of a recording whose average is not yet of many
 
 @dataclass(frozen=True)
 class Structure:
-    """Something significant that is left: on which channel, at which time scale (s), and how sure (nats)."""
+    """Something significant that is left, as `loop.json` has it: on which channel, at which time scale, how sure."""
 
     channel: str
-    time_scale: float
+    time_scale_s: float
     description: str
-    gain: float
+    log_likelihood_gain: float
     threshold: float
 
 
@@ -243,8 +243,8 @@ def structures(search: Search, error: Array) -> list[Structure]:
         p = float(log_ndtr(-largest)) + float(np.log(2 * z.size))
         text = f"what is left jumps within {span(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
-    worst = [max(each, key=lambda s: s.gain) for each in (varying, outlying)]
-    return [s for s in worst if s.gain > s.threshold]
+    worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
+    return [s for s in worst if s.log_likelihood_gain > s.threshold]
 
 
 def _white(search: Search, parts: list[Array]) -> list[Array]:
@@ -294,11 +294,11 @@ RAMP = 1.0 / 60.0  # K/s of the chamber
 
 @dataclass(frozen=True)
 class Experiment:
-    """A recording to make: what it tells apart, and the expected gain in nats."""
+    """A recording to make, as `loop.json` has it: what it tells apart, and the expected gain."""
 
     description: str
     separates: tuple[str, str]
-    gain: float
+    expected_gain_nats: float
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Evidence:
 
     def ends(self, channel: str) -> Array:
         """Return the range (columns, 2) of a channel in all recordings, SI."""
-        return _union([record.ends(channel) for record in self.records])
+        return _ends(np.hstack([record.ends(channel) for record in self.records]).T)
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -192,7 +192,8 @@ def _at_rest(segments: Iterable[RunSegment], channel: str, ends: dict[str, Array
         if "temperature_raw" in channels:
             channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
         for name, values in {"temperature": np.zeros(1), **channels}.items():
-            ends[name] = _union([ends.get(name, _ends(values)), _ends(values)])
+            own = _ends(values)
+            ends[name] = _ends(np.hstack([ends.get(name, own), own]).T)
         channels = {k: v for k, v in channels.items() if k not in ("dt", "tau", "temperature_raw")}
         channels[channel] = segment.rate
         still = Chunk(rows.t, channels, previous, rows.sensors).where(segment.still)
@@ -205,12 +206,6 @@ def _ends(values: Array) -> Array:
     """Return the smallest and the largest value of each column (columns, 2)."""
     columns = values.reshape(len(values), -1)
     return np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
-
-
-def _union(ranges: Sequence[Array]) -> Array:
-    """Return the range (columns, 2) that holds all of some."""
-    each = np.stack(ranges)
-    return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=1)
 
 
 def _without(chunk: Chunk, name: str) -> Chunk:

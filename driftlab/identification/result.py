@@ -221,16 +221,9 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
             *({"kind": kind, "reason": f"broken: {reason}"} for kind, reason in state.broken.items()),
             *({"kind": kind, "reason": "not wanted"} for kind in sorted(state.without)),
         ],
-        "unexplained": [
-            {"channel": s.channel, "time_scale_s": s.time_scale, "description": s.description,
-             "log_likelihood_gain": s.gain, "threshold": s.threshold}
-            for s in verdict.left
-        ],
+        "unexplained": list(map(asdict, verdict.left)),
         "hidden": {},
-        "experiments": [
-            {"description": e.description, "separates": list(e.separates), "expected_gain_nats": e.gain}
-            for e in verdict.experiments
-        ],
+        "experiments": list(map(asdict, verdict.experiments)),
         "candidates_tried": state.tried,
         "left_out": {"before": before, "after": after},
         **{
@@ -329,7 +322,7 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
+        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.expected_gain_nats)})")
     named = {name_of(finding.effect) for finding in verdict.findings}
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]

@@ -41,7 +41,7 @@ REACH = 0.45  # of an averaging time: differences nearer than that tell the same
 Sums = tuple[Array, Index, Index, Index]
 
 
-def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
+def factors(lengths: int | Index) -> Index:
     """Return the numbers m of samples to average over, evenly spread on a logarithmic scale.
 
     They go from 1 to a fifth of a single stretch; of several, `lengths` (S,), to the longest averaging time whose
@@ -54,7 +54,7 @@ def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
         long = ORDER * m <= N
         enough = int(n[long] @ (N[long] - 2 * m)) >= COVERED * m
         low, high = (m, high) if enough else (low, m - 1)
-    count = int(np.ceil(np.log10(low) * per_decade)) + 1
+    count = int(np.ceil(np.log10(low) * PER_DECADE)) + 1
     return np.unique(np.rint(np.geomspace(1, low, count)).astype(np.int64))
 
 

@@ -238,8 +238,7 @@ def test_more_units_than_the_sample_all_have_their_sizes() -> None:
     assert (found.units, found.searched) == (40, 20)
     assert set(found.of_units) == {own.unit for own, _ in units}
     assert "drawn at random" in sentences(found, UNIT, AXES)[-1]
-    without = find_common(units, without=("hysteresis",), sample=20)
-    assert ("hysteresis", "not wanted") in [(one.effect, one.reason) for one in without.rejected]
+    assert "its phase is no property of a unit" in [one.reason for one in found.rejected]
 
 
 def test_a_unit_that_lacks_what_an_effect_reads_has_none_of_it() -> None:

@@ -144,11 +144,14 @@ def test_a_page_shows_charts_and_bars_on_a_phone(tmp_path, opened):
     row = ("coast, to the end", ["3"] * 3, ["1"] * 3, "-67")
     held = Holdout("day.h5", "it falls", [row], prediction_chart(shown, AXES), loop_chart(shown, AXES))
     found = verdict(20)
+    evidence = SimpleNamespace(axes=AXES, channel="gyro")
+    search = SimpleNamespace(tried=20, evidence=evidence)
+    closed = SimpleNamespace(lines=[], search=search, verdict=SimpleNamespace(left=[], experiments=[]))
     write_page(
-        tmp_path / "report.html", "explain", word="explained", outcome="pass", meaning="", lines=[], axes=AXES,
-        unit="deg/h", channel="gyro", known="Earth rate", effects=[], holdouts=[held], taught=[], bars=bars(found),
-        needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], left=[], experiments=[],
-        tried=20, sheet=sheet, config="a: b",
+        tmp_path / "report.html", "explain", closed=closed, word="explained", outcome="pass", meaning="",
+        unit="deg/h", known="Earth rate", effects=[], holdouts=[held], taught=[], bars=bars(found),
+        needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], sheet=sheet,
+        config="a: b",
     )  # fmt: skip
     for dark in (False, True):
         page = opened(tmp_path / "report.html", width=390, dark=dark)
