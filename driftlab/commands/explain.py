@@ -358,32 +358,26 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
         If a part has no recording, samples are in one twice, or some that teach are to judge.
     """
     calibration, train, holdout = (recordings[role] for role in ("calibration", "train", "holdout"))
-    contents: dict[str, Content] = {}
-
-    def check(role: str, name: str, others: Sequence[str], problem: str, same: float = np.inf) -> None:
-        for other in others:
-            if SMALL < _share(config, name, other, contents) < same:
-                raise ConfigError(f"--{role} {name}: {problem.format(other)}")
-
     for role, names in recordings.items():
         if not names:
             raise ConfigError(f"--{role} is missing; name at least one recording")
-        for k, name in enumerate(names):
-            check(role, name, names[:k], "has samples in common with {}, and would count twice; name it once")
-    for name in train:
-        check(
-            "train", name, calibration,
-            "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
-            "that do not overlap",
-            SAME,
-        )  # fmt: skip
-    for name in holdout:
-        check(
-            "holdout", name, [*calibration, *train],
-            "overlaps {}, which was given for fitting, and cannot judge it; name another recording",
-        )  # fmt: skip
-    alike = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
-    return list(calibration), alike
+    once = "has samples in common with {}, and would count twice; name it once"
+    alike = "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
+    alike += "that do not overlap"
+    fresh = "overlaps {}, which was given for fitting, and cannot judge it; name another recording"
+    pairs = [
+        *((role, k, names[:k], once, np.inf) for role, names in recordings.items() for k in range(len(names))),
+        *(("train", k, calibration, alike, SAME) for k in range(len(train))),
+        *(("holdout", k, [*calibration, *train], fresh, np.inf) for k in range(len(holdout))),
+    ]
+    contents: dict[str, Content] = {}
+    for role, k, others, problem, same in pairs:
+        name = recordings[role][k]
+        for other in others:
+            if SMALL < _share(config, name, other, contents) < same:
+                raise ConfigError(f"--{role} {name}: {problem.format(other)}")
+    names = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
+    return list(calibration), names
 
 
 def _share(config: Config, name: str, other: str, contents: dict[str, Content]) -> float:

@@ -23,7 +23,7 @@ from driftlab.recordings.prefetch import prefetch
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
-    from driftlab.evaluation.run_limits import Averages
+    from driftlab.evaluation.measurements import Averages
     from fusion_core.chunk import Array
     from fusion_core.contracts import Alignment, MeasurementModel
     from fusion_core.model import Flags
