@@ -15,15 +15,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from driftlab.config import Limits
 from driftlab.units import BiasUnit, with_uncertainty
-
-if TYPE_CHECKING:
-    from driftlab.config import Limits
-    from fusion_core.chunk import Array
+from fusion_core.chunk import Array
 
 Decision = Literal["pass", "fail", "undecided"]
 RISK = 0.05  # of the units beyond a limit, that may pass
@@ -44,7 +42,8 @@ NAMES = {
     "noise": "white noise",
     "hysteresis": "hysteresis",
 }
-MEASURED_BY = {"bias_instability": "allan", "noise": "allan", "coast": "run"}  # others: `driftlab fit-map`
+MEASURED_BY = {"bias_instability": "driftlab allan", "noise": "driftlab allan", "coast": "driftlab run"}
+MEASURED_BY |= dict.fromkeys(("residual", "swing", "hysteresis"), "driftlab fit-map")
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,7 @@ def outcome(line: str) -> str:
 
 def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
     if measured is None:
-        return _missing(name, limit, f"`driftlab {MEASURED_BY.get(name, 'fit-map')}` measures it")
+        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
     if measured.missing:
         return _missing(name, limit, measured.missing)
     values, axes = np.asarray(measured.values, dtype=np.float64), list(measured.axes)

@@ -7,29 +7,22 @@ where the unit did not move. It takes 86,400 averages a day, whatever the rate. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab.evaluation.limits import SIDE, Measured
-from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW
+from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW, Scores
 from driftlab.maps.fit import axes_of
 from driftlab.noise.allan import curve
-from driftlab.noise.allan_fit import fit
+from driftlab.noise.allan_fit import Coefficients, fit
 from driftlab.noise.allan_model import KEYS
 from driftlab.noise.recording import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+from fusion_core.contracts import Alignment, FittedMap, Sensor
 from fusion_core.wandering import bounds, contrasts, rows_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from driftlab.evaluation.scores import Scores
-    from driftlab.noise.allan_fit import Coefficients
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Alignment, FittedMap, Sensor
 
 COAST = "10 min"  # the horizon that a limit is about
 MIN_SHARE = 0.9  # of it that must have been measured at rest
@@ -42,7 +35,7 @@ NOT_SURE = "its kind of map does not say how sure the curve is; take one that do
 WHOLE = "`driftlab allan` measures it over the whole of a recording"
 SHORTEST = 1.0  # s, of an average
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
-Less = Callable[[Mapping[str, "Array"]], "Array"]
+Less = Callable[[Mapping[str, Array]], Array]
 
 
 def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:

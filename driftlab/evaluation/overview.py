@@ -13,21 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
+from driftlab.evaluation.measurements import Averages
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
+from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
-
-if TYPE_CHECKING:
-    from driftlab.evaluation.measurements import Averages
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Alignment, MeasurementModel
-    from fusion_core.model import Flags
-
+from fusion_core.contracts import Alignment, MeasurementModel
+from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
@@ -40,7 +36,7 @@ NAMES = (
 DRAWN = (
     "t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "temperature_raw", "reference", SMOOTHED,
 )  # fmt: skip
-Columns = dict[str, "Array"]
+Columns = dict[str, Array]
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from driftlab.config import Config
 from driftlab.evaluation.limits import LimitResult, check_limits
 from driftlab.evaluation.measurements import Averages, of_coast, of_map
+from driftlab.evaluation.overview import Overview
 from driftlab.units import tracked_unit
-from fusion_core.contracts import ThermalBias
-
-if TYPE_CHECKING:
-    from driftlab.config import Config
-    from driftlab.evaluation.overview import Overview
-    from fusion_core.contracts import Alignment, FittedMap
+from fusion_core.contracts import Alignment, FittedMap, ThermalBias
 
 
 def map_of(config: Config) -> FittedMap | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import (
@@ -29,13 +29,11 @@ from driftlab.family.shared_effect_search import Indices, Offer, between, chance
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.result import described, parameters
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
-
-if TYPE_CHECKING:
-    from driftlab.units import BiasUnit
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished
 HAS = 5.0  # nats beyond log of the number of lots, that a lot has it

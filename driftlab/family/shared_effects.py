@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf
@@ -32,10 +32,8 @@ from driftlab.family.shared_effect_search import (
 )
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.result import described
+from driftlab.units import BiasUnit
 from fusion_core.contracts import Effect
-
-if TYPE_CHECKING:
-    from driftlab.units import BiasUnit
 
 SAMPLE = 400  # units that are searched
 PROPOSING = 12  # of these, whose recordings say which hyper-parameters are worth trying

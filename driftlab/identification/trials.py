@@ -1,8 +1,5 @@
 """Each family at its best beside the model so far: hyper-parameters, left-out errors, evidence.
 
-Those of a family are chosen by training error, anew for each part that is left out; with a memory, those of the
-memories in the model are chosen with it, since two memories found one after the other are not the best two.
-
 Hyper-parameters by training error: which of a family's candidates fits some segments best beside a base.
 
 With base columns B (map, levels, effects that stay) taken out once, the sum of squares that any candidate leaves is a

@@ -6,15 +6,16 @@ rest. N samples, S stretches, n windows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.config import Config
 from driftlab.noise.allan import bridgeable, curve
 from driftlab.noise.allan_fit import Coefficients, fit
 from driftlab.noise.allan_model import PRESENT, AllanCurve
@@ -22,18 +23,11 @@ from driftlab.recordings.epochs import GAP, epochs
 from driftlab.recordings.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import FileSource
+from fusion_core.contracts import FileSource, MeasurementModel, Sensor
 from fusion_core.errors import DataError
+from fusion_core.faults import Faults
 from fusion_core.host.provenance import Participant, participants
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from driftlab.config import Config
-    from fusion_core.contracts import MeasurementModel, Sensor
-    from fusion_core.faults import Faults
-    from fusion_core.model import Flags
-
+from fusion_core.model import Flags
 
 Index = NDArray[np.int64]
 
