@@ -355,14 +355,7 @@ def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
 def coast_verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
     """Return the config that coasts best, by how much, and whether it is more than the sigma.
 
-    Parameters
-    ----------
-    runs : mapping of str to Scores
-        By name, of one recording.
-    unit : BiasUnit
-        Of the errors in the text.
-    span : float
-        From the end of the alignment to the end of the recording, s.
+    All are of one recording; `span` is from the end of the alignment to its end, s.
     """
     ranked = ranking(runs)
     if ranked is None:

@@ -217,14 +217,7 @@ def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured
 class Averages:
     """Averages of the rate less what a map explains of it, block after block of a run.
 
-    Parameters
-    ----------
-    interval : float
-        Of the updates, s.
-    axes : sequence of str
-        Of the sensor.
-    less : callable, optional
-        Returns, of a block of N rows, the map's part (N, d) of its rate, in SI.
+    The interval is that of the updates, s; `less` returns, of a block of N rows, the map's part (N, d) of its rate, SI.
     """
 
     def __init__(self, interval: float, axes: Sequence[str], less: Less | None = None) -> None:

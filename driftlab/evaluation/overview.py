@@ -64,15 +64,7 @@ class Overview:
 class OverviewAccumulator:
     """The sums and rows behind an overview, taken while a run goes by: any split of it gives the same.
 
-    Parameters
-    ----------
-    model : MeasurementModel
-    alignment : Alignment
-        The first of the run.
-    averages : Averages, optional
-        They are given every block.
-    rows : int
-        Of a block, which is gathered before it is looked at.
+    The alignment is the run's first; `averages` are given every block, which is gathered up to so many rows.
     """
 
     def __init__(

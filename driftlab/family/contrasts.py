@@ -73,12 +73,8 @@ def signatures(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk])
     """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
 
     A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's, with
-    the unit's own curve. That curve's error is independent of the residual beside it.
-
-    Raises
-    ------
-    MissingChannel
-        If the unit's recordings lack a channel of the effect.
+    the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if the
+    unit's recordings lack a channel of the effect.
     """
     if not effect.acts_on_input:
         return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks]
@@ -125,11 +121,7 @@ def own_curve(soaked: UnitInformation) -> Array:
 class UnitRows:
     """Rows of a unit under its own noise, and effects in them.
 
-    Parameters
-    ----------
-    soaked : UnitInformation
-    beside : effects
-        Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
+    Effects `beside` are named already: a free coefficient each; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
@@ -162,10 +154,7 @@ class UnitRows:
     def estimates(self, effect: Effect) -> tuple[Array, Array]:
         """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
 
-        Raises
-        ------
-        MissingChannel
-            If the unit's recordings lack a channel of the effect.
+        Raises MissingChannel if the unit's recordings lack a channel of the effect.
         """
         signature = self._white(signatures(effect, self.soaked, self.chunks))
         estimates = [_least_squares(Q, r, Z) for Q, r, Z in zip(self.Q, self.r, signature, strict=True)]

@@ -197,7 +197,7 @@ class _UnitContrast(NamedTuple):
 
 
 def sizes(
-    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[tuple[Offer, Effect]], each: ParallelMap = serial
+    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[Offer], each: ParallelMap = serial
 ) -> tuple[list[LotEffects], dict[str, tuple[OfUnit, ...]], dict[str, UnitDensities]]:
     """Return the laws of effects over all units, the effects in each unit, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -205,10 +205,10 @@ def sizes(
     with threadpool_limits(1):
         names, lots, densities, rows = zip(*each(partial(_effects_of_unit, taken), units), strict=True)
     laws, of_units = [], []
-    for (_, effect), column in zip(taken, zip(*rows, strict=True), strict=True):
+    for offer, column in zip(taken, zip(*rows, strict=True), strict=True):
         contrasts = together([one.contrasts for one in column])
         c, v = np.stack([one.c for one in column]), np.stack([one.v for one in column]) * _excess_noise(contrasts)
-        law = _laws(effect, c, v, contrasts, lots)
+        law = _laws(offer.effect, c, v, contrasts, lots)
         laws.append(law)
         of_units.append([
             OfUnit(*law.law_of(lot).shrunken(one, variance), one, np.sqrt(variance))
@@ -218,11 +218,11 @@ def sizes(
 
 
 def _effects_of_unit(
-    taken: Sequence[tuple[Offer, Effect]], unit: tuple[UnitInformation, str]
+    taken: Sequence[Offer], unit: tuple[UnitInformation, str]
 ) -> tuple[str, str, UnitDensities, list[_UnitContrast]]:
     """Return the name of a unit, its lot, its noise beside the effects, and its contrast of each."""
     soaked, lot = unit
-    quiet = _with_noise_beside(soaked, [effect for _, effect in taken])
+    quiet = _with_noise_beside(soaked, [offer.effect for offer in taken])
     contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]
     return soaked.unit, lot, UnitDensities(quiet.white, quiet.walk), contrasts
 
@@ -246,12 +246,11 @@ def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> Un
     return replace(soaked, white=densities.white, walk=densities.likely)
 
 
-def _contrast(soaked: UnitInformation, taken: Sequence[tuple[Offer, Effect]], k: int) -> _UnitContrast:
-    offer, effect = taken[k]
-    columns = UnitRows(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
-    contrasts = columns.contrasts([effect], [offer.size])
+def _contrast(soaked: UnitInformation, taken: Sequence[Offer], k: int) -> _UnitContrast:
+    columns = UnitRows(soaked, [offer.effect for place, offer in enumerate(taken) if place != k])
+    contrasts = columns.contrasts([taken[k].effect], [taken[k].size])
     try:
-        c, covariance = columns.estimates(effect)
+        c, covariance = columns.estimates(taken[k].effect)
     except MissingChannel:
         return _UnitContrast(np.zeros_like(contrasts.c), np.full_like(contrasts.c, np.inf), contrasts)
     return _UnitContrast(c, np.diagonal(covariance, axis1=1, axis2=2), contrasts)

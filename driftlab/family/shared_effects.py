@@ -126,11 +126,11 @@ def _drawn(units: Iterable[tuple[UnitInformation, str]], most: int) -> tuple[lis
 
 
 class _Search:
-    """Effects added one by one to the model of the sampled units: of each the candidate as chosen, and its rivals."""
+    """Effects added one by one to the model of the sampled units: of each the candidate, refined, and its rivals."""
 
     def __init__(self, sample: list[UnitInformation], lots: list[str], each: ParallelMap) -> None:
         self.sample, self.lots, self.each = sample, lots, each
-        self.taken: list[tuple[Candidate, Effect, tuple[str, ...]]] = []
+        self.taken: list[tuple[Candidate, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
         self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)])
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
@@ -141,14 +141,13 @@ class _Search:
         while self.offers and len(self.taken) < MAX_EFFECTS and self._add():
             pass
         for k in reversed(range(len(self.taken) - 1)):
-            old, effect, rivals = self.taken[k]
-            offer = replace(old.offer, effect=effect)
-            new = evaluate([offer], self._contrasts([offer], self._others(k)), self.lots)[0]
+            old, rivals = self.taken[k]
+            new = evaluate([old.offer], self._contrasts([old.offer], self._others(k)), self.lots)[0]
             price = float(np.log(len(self.offers))) if not old.lot else old.price
             if new.chance <= price + CHANCE or new.total <= 0:
                 del self.taken[k]
             else:
-                self.taken[k] = (replace(new, price=price), effect, rivals)
+                self.taken[k] = (replace(new, price=price), rivals)
 
     def _add(self) -> bool:
         """Add the best candidate; return whether one pays."""
@@ -171,13 +170,13 @@ class _Search:
         if nested(offers, contrasts, taken, where) <= 0:
             return False
         tuned = [self.sample[k] for k in where[:: max(1, len(where) // TUNING)]]
-        effect = refine(tuned, taken, offers, effects, self.each)
-        self.taken.append((taken, effect, tuple(described(rival.effect) for rival in rivals)))
+        refined = replace(taken.offer, effect=refine(tuned, taken, offers, effects, self.each))
+        self.taken.append((replace(taken, offer=refined), tuple(described(rival.effect) for rival in rivals)))
         return True
 
     def _others(self, k: int | None) -> list[Effect]:
         """Return the effects in the model, all but the k-th."""
-        return [effect for place, (_, effect, _) in enumerate(self.taken) if place != k]
+        return [taken.effect for place, (taken, _) in enumerate(self.taken) if place != k]
 
     def _contrasts(self, offers: list[Offer], beside: list[Effect]) -> EffectContrasts:
         return contrasts_of(self.sample, offers, beside, self.each)
@@ -202,19 +201,18 @@ class _Search:
         """Return the effects with their sizes in all units."""
         if not self.taken:
             return ()
-        effects, offered = [], [(taken.offer, effect) for taken, effect, _ in self.taken]
-        laws, self.of_units, self.noise = sizes(units, offered, self.each)
-        for k, ((taken, effect, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
-            offer = replace(taken.offer, effect=effect)
-            contrasts = self._contrasts([offer], self._others(k))
+        effects = []
+        laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken], self.each)
+        for k, ((taken, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
+            contrasts = self._contrasts([taken.offer], self._others(k))
             where = np.flatnonzero([law.has(lot) for lot in self.lots])
             effects.append(
                 SharedEffect(
-                    **dict(law), effect=effect,
-                    unit=", ".join(dict.fromkeys(effect.units_of(bias_unit))) or bias_unit,
+                    **dict(law), effect=taken.effect,
+                    unit=", ".join(dict.fromkeys(taken.effect.units_of(bias_unit))) or bias_unit,
                     evidence=taken.chance, of_mean=taken.mean, of_size=taken.size, price=taken.price + CHANCE,
-                    left_out=nested([offer], contrasts, taken, where) / max(len(where), 1),
-                    in_other_lots=between_lots(offer, contrasts, self.lots) if law.others is None else None,
+                    left_out=nested([taken.offer], contrasts, taken, where) / max(len(where), 1),
+                    in_other_lots=between_lots(taken.offer, contrasts, self.lots) if law.others is None else None,
                     indistinguishable_from=rivals,
                 )
             )  # fmt: skip

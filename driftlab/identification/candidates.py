@@ -75,10 +75,7 @@ def offers_by_kind(
 def proposals(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
     """Return the proposals of a class for recordings, beside a map with powers of temperature up to `degree`.
 
-    Raises
-    ------
-    PluginError
-        If the class has settings without a default.
+    Raises PluginError if the class has settings without a default.
     """
     try:
         blank = cls(axes=axes)  # type: ignore[call-arg]

@@ -122,13 +122,7 @@ class Evidence:
 
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:
-    """Run the declared model over the recordings, and return the readings at rest.
-
-    Raises
-    ------
-    DataError, ConfigError
-        If a recording cannot be used.
-    """
+    """Return readings at rest by the declared model; raises DataError or ConfigError if a recording cannot be used."""
     config = clamped(config)
     settings = config.filter
     assert settings is not None

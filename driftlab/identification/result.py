@@ -72,12 +72,8 @@ def investigate(
 ) -> Identification:
     """Find the effects that a model with this map (or none) and declared effects lacks on recordings.
 
-    Effects of the kinds `without` are not tried.
-
-    Raises
-    ------
-    EmptyRecording
-        If the recordings are too short to leave anything out.
+    Effects of the kinds `without` are not tried. Raises EmptyRecording if the recordings are too short to leave
+    anything out.
     """
     check_length(evidence)
     basis = None
