@@ -19,6 +19,7 @@ from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
 from driftlab.identification.state import Search, name_of
+from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.table import auxiliary
@@ -236,7 +237,7 @@ class Probe(Effect):
         return {
             "function": f"a smooth function of {self.channel}",
             "with temperature": f"{self.channel}, with an influence that changes with temperature",
-            "late": f"{self.channel}, late by about {span(self.tau)}",
+            "late": f"{self.channel}, late by about {duration(self.tau)}",
         }[self.form]
 
 
@@ -260,10 +261,3 @@ def _knots(parts: list[Array]) -> tuple[float, ...] | None:
     values = np.concatenate(parts)
     low, high = (float(v) for v in np.quantile(values, [0.005, 0.995]))
     return tuple(float(v) for v in np.linspace(low, high, PROBE_INTERVALS + 1)) if low < high else None
-
-
-def span(seconds: float) -> str:
-    """Return a time span as one says it."""
-    if seconds < 600:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

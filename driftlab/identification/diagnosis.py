@@ -20,13 +20,14 @@ from typing import Literal
 import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
-from driftlab.identification.candidates import Family, Probe, candidates_of, probes, span, with_residual
+from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
 from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.records import Evidence, Progress, Record, row_starts
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, contains, tried
 from driftlab.noise.local_level import LocalLevel, one_step
+from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.contracts.table import auxiliary
@@ -234,14 +235,14 @@ def structures(search: Search, error: Array) -> list[Structure]:
     limit = -float(np.log(SIGNIFICANT / len(scales)))
     unit, stays = evidence.unit, _stays(evidence.interval, parts)
     size = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * unit.factor
-    wanders = f"what is left, {size:.3g} {unit.shown} rms, stays for about {span(stays)}, and not as noise does"
+    wanders = f"what is left, {size:.3g} {unit.shown} rms, stays for about {duration(stays)}, and not as noise does"
     varying, outlying = [], []
     for W, z in scales:
         nats = nats_of(float(np.sum(z**2)), z.size)
         varying.append(Structure("time", stays, wanders, min(nats, MAX_NATS), limit))
         largest, length = float(np.max(np.abs(z))), W * evidence.interval
         p = float(log_ndtr(-largest)) + float(np.log(2 * z.size))
-        text = f"what is left jumps within {span(length)}, at most by {largest:.1f} deviations of its noise"
+        text = f"what is left jumps within {duration(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
     return [s for s in worst if s.log_likelihood_gain > s.threshold]
