@@ -67,10 +67,10 @@ class LimitResult:
 
     name: str  # of the limit, as the config has it
     limit: float
-    value: float  # of the axis that decides; NaN where there is none
-    guard: float  # what is added to it or taken off; NaN where that is not known
-    axis: str  # that decides
-    decision: Decision  # `pass`, `fail` or `undecided`
+    value: float = float("nan")  # of the axis that decides; NaN where there is none
+    guard: float = float("nan")  # what is added to it or taken off; NaN where that is not known
+    axis: str = ""  # that decides
+    decision: Decision = "undecided"  # `pass`, `fail` or `undecided`
     measured: bool = True  # whether there is a value that may be judged
     note: str = ""  # what the value stands on, or why there is none
     needs: str = ""  # what would decide it; empty where it is decided
@@ -192,17 +192,17 @@ def outcome(line: str) -> str:
 
 def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
     if measured is None:
-        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
+        return LimitResult(name, limit, measured=False, note=f"`{MEASURED_BY[name]}` measures it")
     if measured.missing:
-        return _missing(name, limit, measured.missing)
+        return LimitResult(name, limit, measured=False, note=measured.missing)
     values, axes = np.asarray(measured.values, dtype=np.float64), list(measured.axes)
-    blank = LimitResult(name, limit, np.nan, np.nan, "", "undecided", note=measured.stands_on)
+    blank = LimitResult(name, limit, note=measured.stands_on)
     if measured.otherwise and np.all(np.isnan(values)):
         return replace(blank, needs=measured.otherwise)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
         whose = f" of {', '.join(unknown)}" if unknown else ""
-        return _missing(name, limit, f"has no value{whose}")
+        return LimitResult(name, limit, measured=False, note=f"has no value{whose}")
     if measured.low is None or measured.high is None:
         k = int(np.argmax(values))
         why = measured.otherwise or "its uncertainty is not known"
@@ -242,7 +242,3 @@ def _undecided(row: LimitResult, measured: Measured) -> LimitResult:
         size = f"{more / 3600:.2g} h" if more >= 0.95 * 3600 else f"{max(more / 60, 1):.2g} min"
         needs = f"about {size} more would decide it, if {row.axis} stays {beyond} the limit by as much"
     return replace(row, needs=needs, more=float(more))
-
-
-def _missing(name: str, limit: float, note: str) -> LimitResult:
-    return LimitResult(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)
