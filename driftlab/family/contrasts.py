@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.unit_information import UnitInformation
+from driftlab.identification.records import map_inputs
 from driftlab.soak.blocks import SoakRows, means, runs
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
@@ -92,14 +93,8 @@ def columns_of(effects: Sequence[Effect], soaked: UnitInformation, chunks: Seque
 
 def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
     """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
-    temperatures = []
-    for rows in soaked.recordings:
-        chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
-        for effect in effects:
-            if effect.acts_on_input:
-                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-        temperatures.append(chunk["temperature"])
-    return temperatures
+    chunks = (Chunk(rows.t, {**rows.channels, "temperature": rows.T}) for rows in soaked.recordings)
+    return map_inputs(chunks, effects)
 
 
 def of_each_axis(signature: Array) -> Array:

@@ -36,6 +36,7 @@ from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_e
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
+from driftlab.identification.records import with_residuals
 from driftlab.identification.state import name_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
@@ -135,8 +136,7 @@ def _coefficients(effect: Effect, chunk: Chunk) -> int:
 def _with_residual(soaked: UnitInformation) -> list[Chunk]:
     curve = own_curve(soaked)
     parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
-    spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)
-    return [chunk.having(residual=part / spread) for chunk, part in zip(chunks_of(soaked), parts, strict=True)]
+    return with_residuals(chunks_of(soaked), parts)
 
 
 def contrasts_of(

@@ -18,6 +18,7 @@ from pydantic import Field, ValidationError
 from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
+from driftlab.identification.records import with_residuals
 from driftlab.identification.state import Search, name_of
 from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
@@ -180,12 +181,11 @@ def with_residual(search: Search) -> list[Chunk]:
     """
     evidence, columns = search.evidence, search.columns
     left = np.stack(search.residuals(search.model), axis=1) * columns.scale[columns.y]
-    chunks = []
+    residuals = []
     for record, predicted in zip(evidence.records, evidence.split(evidence.rate - left), strict=True):
         of_model = np.stack([np.interp(record.chunk.t, record.t, column) for column in predicted.T], axis=1)
-        chunks.append(record.chunk.having(residual=record.chunk[evidence.channel] - of_model))
-    spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
-    return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]
+        residuals.append(record.chunk[evidence.channel] - of_model)
+    return with_residuals(evidence.chunks, residuals)
 
 
 PROBE_INTERVALS = 12  # of a probe's smooth function

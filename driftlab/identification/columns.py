@@ -25,7 +25,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from driftlab.identification.records import Evidence
+from driftlab.identification.records import Evidence, map_inputs
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
 
@@ -267,7 +267,7 @@ class EffectRegressors:
             return np.zeros(0, dtype=np.intp)
         acting = tuple(effect for effect in effects if effect.acts_on_input)
         if acting not in self._maps:
-            curves = [self.basis.values(T) for T in self.evidence.map_inputs(acting)]
+            curves = [self.basis.values(T) for T in map_inputs(self.evidence.chunks, acting)]
             self._maps[acting] = self._add(self.evidence.rows(curves))
         return self._maps[acting]
 

@@ -15,7 +15,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.identification.config_edit import the_map, with_host
 from driftlab.identification.cross_validation import level_prior
-from driftlab.identification.records import Evidence
+from driftlab.identification.records import Evidence, map_inputs
 from driftlab.identification.state import Search
 from driftlab.maps.fit import provenance
 from driftlab.soak.temperature import of_thermometer
@@ -157,7 +157,7 @@ def explained_map(search: Search, fit: Joint, declared: FittedMap, settings: The
     then. Those of the training alone are shifted to the level of the calibration.
     """
     evidence = search.evidence
-    T = evidence.rows(evidence.map_inputs([effect for effect in fit.effects if effect.acts_on_input]))
+    T = evidence.rows(map_inputs(evidence.chunks, fit.effects))
     bias = fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
         bias[rows] += level if record.calibration else fit.common

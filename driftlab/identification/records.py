@@ -111,14 +111,21 @@ class Evidence:
         """Return the part of rows (n, ...) that is each recording's."""
         return [values[rows] for rows in self.slices]
 
-    def map_inputs(self, acting: Sequence[Effect]) -> list[Array]:
-        """Return the temperature that the map sees behind effects that act on its input, of each recording's means."""
-        inputs = []
-        for chunk in self.chunks:
-            for effect in acting:
-                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-            inputs.append(chunk["temperature"])
-        return inputs
+
+def map_inputs(chunks: Iterable[Chunk], effects: Iterable[Effect]) -> list[Array]:
+    """Return the temperature that the map sees of each recording behind effects, some of which act on its input."""
+    acting, inputs = [effect for effect in effects if effect.acts_on_input], []
+    for chunk in chunks:
+        for effect in acting:
+            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        inputs.append(chunk["temperature"])
+    return inputs
+
+
+def with_residuals(chunks: Sequence[Chunk], residuals: Sequence[Array]) -> list[Chunk]:
+    """Return recordings with their residuals (N, d) as channel `residual`, in its own deviation."""
+    spread = np.maximum(np.std(np.concatenate(residuals), axis=0), 1e-300)
+    return [chunk.having(residual=one / spread) for chunk, one in zip(chunks, residuals, strict=True)]
 
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:

@@ -60,17 +60,6 @@ def _rows(outcome: Outcome) -> Rows:
     return error_rows([overview.yardsticks for overview in outcome.overviews])
 
 
-@dataclass(frozen=True)
-class Holdout:
-    """The part of the page on one holdout recording."""
-
-    name: str
-    decisive: str
-    rows: list[tuple[str, list[str], list[str], str]]
-    prediction: Chart
-    loop: Chart | None
-
-
 def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, evidence = closed.verdict, closed.search.columns.evidence
@@ -89,7 +78,11 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         effects=[(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
         parameters=parameters,
         name_of=name_of,
-        holdouts=[_holdout(o, axes) for o in closed.outcomes],
+        holdouts=[(Path(outcome.name).name, outcome) for outcome in closed.outcomes],
+        decisive=_decisive,
+        cells=_cells,
+        prediction_chart=prediction_chart,
+        loop_chart=loop_chart,
         taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
         bars=bars(verdict),
         needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
@@ -99,11 +92,6 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         sheet=sheet,
         config=config,
     )
-
-
-def _holdout(outcome: Outcome, axes: Sequence[str]) -> Holdout:
-    loop = None if outcome.temperature is None else loop_chart(outcome, axes)
-    return Holdout(Path(outcome.name).name, _decisive(outcome), _cells(outcome), prediction_chart(outcome, axes), loop)
 
 
 def _decisive(outcome: Outcome) -> str:

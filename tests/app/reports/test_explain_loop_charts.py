@@ -135,23 +135,22 @@ def test_the_errors_of_what_was_left_out_are_drawn(parts):
 
 
 def test_a_page_shows_charts_and_bars_on_a_phone(tmp_path, opened):
-    from driftlab.reports.explain import Holdout
     from driftlab.reports.pages import write_page
     from driftlab.reports.provenance import Sheet
 
     shown = outcome()
     sheet = Sheet("SN 7", "2026-11-22", "page", "c.yaml", "0" * 64, [], {}, [], [], [], "")
     row = ("coast, to the end", ["3"] * 3, ["1"] * 3, "-67")
-    held = Holdout("day.h5", "it falls", [row], prediction_chart(shown, AXES), loop_chart(shown, AXES))
     found = verdict(20)
     evidence = SimpleNamespace(axes=AXES, channel="gyro")
     search = SimpleNamespace(tried=20, evidence=evidence)
     closed = SimpleNamespace(lines=[], search=search, verdict=SimpleNamespace(left=[], experiments=[]))
     write_page(
         tmp_path / "report.html", "explain", closed=closed, word="explained", outcome="pass", meaning="",
-        unit="deg/h", known="Earth rate", effects=[], holdouts=[held], taught=[], bars=bars(found),
+        unit="deg/h", known="Earth rate", effects=[], holdouts=[("day.h5", shown)], taught=[], bars=bars(found),
         needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], sheet=sheet,
-        config="a: b",
+        config="a: b", decisive=lambda outcome: "it falls", cells=lambda outcome: [row],
+        prediction_chart=prediction_chart, loop_chart=loop_chart,
     )  # fmt: skip
     for dark in (False, True):
         page = opened(tmp_path / "report.html", width=390, dark=dark)
