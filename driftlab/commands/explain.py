@@ -198,7 +198,11 @@ def _closed(
     limits = _limit_results(both[chosen], [(outcome.overviews[chosen], runs[chosen]) for outcome, runs in outcomes])
     rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
     whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
-    _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
+    write_prediction(folder / "prediction.h5", whole.outcomes)
+    write_json(folder / "loop.json", whole.content)
+    progress("drawing the report")
+    text = (folder / "explained.yaml").read_text(encoding="utf-8")
+    write_report(folder / "report.html", whole, text, _sheet(both[chosen], whole, limits))
     return whole
 
 
@@ -279,14 +283,6 @@ def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult])
     recordings = [{**one, "name": f"{one['name']} ({role})"} for role, identities in roles for one in identities]
     maps = [{**one, "file": Path(one["file"]).name} for one in sheet.maps]
     return replace(sheet, recordings=recordings, maps=maps)
-
-
-def _write(folder: Path, whole: Identification, sheet: Sheet, progress: Progress) -> None:
-    """Write the files for programs, and the report; `explained.yaml` is there already."""
-    write_prediction(folder / "prediction.h5", whole.outcomes)
-    write_json(folder / "loop.json", whole.content)
-    progress("drawing the report")
-    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"), sheet)
 
 
 def outcome_of(
