@@ -19,8 +19,7 @@ from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
 from driftlab.evaluation.limits import LimitResult, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import Overview, OverviewAccumulator
-from driftlab.evaluation.run_limits import map_of
+from driftlab.evaluation.overview import Overview, OverviewAccumulator, map_of
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import remarks
 from driftlab.filtering.run import Run

@@ -29,8 +29,7 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation import limits
 from driftlab.evaluation.limits import LimitResult
-from driftlab.evaluation.overview import Overview, OverviewAccumulator
-from driftlab.evaluation.run_limits import averages_of, check_run_limits
+from driftlab.evaluation.overview import Overview, OverviewAccumulator, averages_of, check_run_limits
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, over_axes, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
