@@ -62,7 +62,7 @@ def _ranked(key: Callable[[Any], float]) -> None:
 def _no_parts() -> None:
     from driftlab.identification.acceptance import CandidateEvidence
 
-    CandidateEvidence._better = lambda self, sure: self.ratio < self.needed and self.left_out > 0
+    CandidateEvidence.better = lambda self, sure=0.0: self.ratio < self.needed and self.left_out > 0
 
 
 def _no_rule(name: str) -> None:

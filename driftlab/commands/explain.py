@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import nullcontext
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,14 +15,13 @@ import numpy as np
 from driftlab import __version__
 from driftlab.commands.console import print_verdict, say, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
-from driftlab.commands.result import Result
+from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
-from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
+from driftlab.evaluation.limits import LimitResult, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import OverviewAccumulator
-from driftlab.evaluation.run_limits import map_of
+from driftlab.evaluation.overview import Overview, OverviewAccumulator, map_of
 from driftlab.evaluation.scores import moving_average
-from driftlab.evaluation.summary import remarks, summarise
+from driftlab.evaluation.summary import remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.identification.candidates import check_kinds
@@ -31,16 +30,17 @@ from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
+from driftlab.recordings.epochs import epochs
 from driftlab.recordings.identity import identity
 from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
 from driftlab.reports.figures import figure_of
 from driftlab.reports.provenance import Sheet, sheet_of
-from driftlab.storage.folders import output_folder
 from driftlab.storage.in_memory import InMemoryName
 from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import comment
@@ -149,52 +149,60 @@ def explain(
     DataError, ConfigError, UnitError
         If the config or a recording cannot be used.
     """
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
     given = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in given.items()}
     understood = config_of(config).tracking(channel)
     used = [*understood.files(), *paths_of(name for names in recordings.values() for name in names)]
-    with TemporaryDirectory(prefix="driftlab-") if out is None else nullcontext(out) as place:
-        folder = Path(place) / "explained" if out is None else Path(place)
-        return _closed(understood, recordings, folder, used, progress or (lambda text: None), estimate, without)
+
+    def explained() -> ExplainResult:
+        # the matrices are small: fits side by side are faster than divided matrices
+        with TemporaryDirectory(prefix="driftlab-") as folder, threadpool_limits(1):
+            told = progress or (lambda text: None)
+            whole = _closed(understood, recordings, Path(folder), told, without, estimate=estimate)
+            return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}, used)
+
+    return in_folder(out, "explain", used, explained)
 
 
 def _closed(
     config: Config,
     recordings: Mapping[str, Sequence[str]],
-    out: Path,
-    used: Collection[Path],
+    folder: Path,
     progress: Progress,
-    estimate: bool,
     without: Collection[str],
-) -> ExplainResult:
-    """Close the loop, and write its files into the folder `out`; it appears when all are whole."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
+    *,
+    estimate: bool,
+) -> Identification:
+    """Close the loop, and write its files into a folder."""
     settings = the_map(config)
     check_kinds(without)
     calibration, train = distinct(config, recordings)
-    # the matrices are small: fits side by side are faster than divided matrices
-    with output_folder(out, "explain", used) as folder, threadpool_limits(1):
-        declared, fitted = _declared(config, settings, calibration, folder, progress)
-        evidence = gather(calibrated(declared), calibration, train, progress)
-        explanation = investigate(evidence, settings, declared_effects(config), progress, without)
-        new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
-        _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
-        progress("opening the holdout")
-        # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
-        both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
-        outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
-        identities = {role: list(map(identity, names)) for role, names in recordings.items()}
-        whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
-        if whole.refuted:
-            _refute(folder, config, new, whole)
-        chosen = 0 if whole.refuted else 1
-        whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-        limits = _limit_results(both[chosen], [measured[chosen] for _, measured in outcomes])
-        rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
-        whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
-        _write(folder, whole, _sheet(both[chosen], whole, limits), progress)
-        return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, used)
+    declared, fitted = _declared(config, settings, calibration, folder, progress)
+    evidence = gather(calibrated(declared), calibration, train, progress)
+    explanation = investigate(evidence, settings, declared_effects(config), progress, without)
+    new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
+    _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
+    progress("opening the holdout")
+    # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
+    both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
+    outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
+    identities = {role: list(map(identity, names)) for role, names in recordings.items()}
+    whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
+    if whole.refuted:
+        _refute(folder, config, new, whole)
+    chosen = 0 if whole.refuted else 1
+    whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
+    limits = _limit_results(both[chosen], [(outcome.overviews[chosen], runs[chosen]) for outcome, runs in outcomes])
+    rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
+    whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
+    write_prediction(folder / "prediction.h5", whole.outcomes)
+    write_json(folder / "loop.json", whole.content)
+    progress("drawing the report")
+    text = (folder / "explained.yaml").read_text(encoding="utf-8")
+    write_report(folder / "report.html", whole, text, _sheet(both[chosen], whole, limits))
+    return whole
 
 
 def _declared(
@@ -251,12 +259,17 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
     path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
-def _limit_results(config: Config, measured: Sequence[dict[str, Measured]]) -> list[LimitResult]:
+def _limit_results(config: Config, runs: Sequence[tuple[Overview, Run]]) -> list[LimitResult]:
     """Hold the worst holdout, and the map, against the limits of the config."""
     if config.limits is None:
         return []
-    worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
-    fitted = map_of(config)
+    measured = []
+    for overview, run in runs:
+        model, alignment = run.model, run.journal.alignments[0]
+        noise = of_alignment(model.tracked, alignment, model.align)
+        coast = of_coast(overview.yardsticks, overview.end - alignment.t, model.align)
+        measured.append({"noise": noise, "coast": coast})
+    worst, fitted = max(measured, key=lambda one: float(np.max(one["coast"].values))), map_of(config)
     return check_limits(
         config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))}
     )
@@ -271,23 +284,16 @@ def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult])
     return replace(sheet, recordings=recordings, maps=maps)
 
 
-def _write(folder: Path, whole: Identification, sheet: Sheet, progress: Progress) -> None:
-    """Write the files for programs, and the report; `explained.yaml` is there already."""
-    write_prediction(folder / "prediction.h5", whole.outcomes)
-    write_json(folder / "loop.json", whole.content)
-    progress("drawing the report")
-    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"), sheet)
-
-
 def outcome_of(
     declared: Config, explained: Config, recording: str, progress: Progress
-) -> tuple[Outcome, tuple[dict[str, Measured], dict[str, Measured]]]:
-    """Run one holdout recording through both configs; return what they predict, and what of each is limited."""
-    runs = []
-    for what, config in (("declared", declared), ("explained", explained)):
-        progress(f"running {recording} through the {what} config")
-        runs.append(_run(with_recording(config, recording)))
-    (first, before, _, limited), (second, after, notes, limited_after) = runs
+) -> tuple[Outcome, tuple[Run, Run]]:
+    """Run one holdout recording, which is read once, through both configs; return what they predict, and the runs."""
+    config, faults = with_recording(declared, recording), Faults()
+    stream = list(epochs(read(config, faults), config.filter.update_interval if config.filter else 1.0))
+    progress(f"running {recording} through the declared config")
+    first, before, run_before = _run(config, stream, deepcopy(faults))
+    progress(f"running {recording} through the explained config")
+    second, after, run = _run(with_recording(explained, recording), stream, faults)
     coasting = np.isfinite(first["coast"][:, 0])
     outcome = Outcome(
         name=recording,
@@ -299,24 +305,19 @@ def outcome_of(
         after=second["coast"][coasting],
         before_sigma=first["coast_sigma"][coasting],
         after_sigma=second["coast_sigma"][coasting],
-        summaries=(before, after),
-        remarks=tuple(notes),
+        overviews=(before, after),
+        journal=run.journal,
+        remarks=tuple(remarks(after, run.model, run.journal)),
     )
-    return outcome, (limited, limited_after)
+    return outcome, (run_before, run)
 
 
-def _run(config: Config) -> tuple[dict[str, Any], dict[str, Any], list[str], dict[str, Measured]]:
-    """Return the columns of a run, its summary, the notes on it, and the quantities that limits may be set for."""
-    journal = RunLog()
-    run = Run(config, journal)
-    columns, model = joined(run), run.model
-    alignment = journal.alignments[0]
-    overview = OverviewAccumulator(model, alignment).read(columns).overview()
-    limited = {
-        "noise": of_alignment(model.tracked, alignment, model.align),
-        "coast": of_coast(overview.yardsticks, overview.end - alignment.t, model.align),
-    }
-    return columns, summarise(overview, model, journal), remarks(overview, model, journal), limited
+def _run(config: Config, stream: Sequence[Chunk], faults: Faults) -> tuple[dict[str, Any], Overview, Run]:
+    """Return the columns of a run over epochs, its overview, and itself."""
+    run = Run(config, RunLog(faults))
+    columns = joined(run.over(stream))
+    overview = OverviewAccumulator(run.model, run.journal.alignments[0]).read(columns).overview(faults.first_row)
+    return columns, overview, run
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -334,7 +335,7 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             group = file.create_group(name)
             group.attrs["recording"] = Path(outcome.name).name
             group.create_dataset("t", data=outcome.t).attrs["unit"] = "s"
-            group["t"].attrs["first_row"] = outcome.summaries[0]["t"]["first_row_s"]
+            group["t"].attrs["first_row"] = outcome.overviews[0].first_row
             for column in PREDICTED:
                 group.create_dataset(column, data=getattr(outcome, column)).attrs["unit"] = outcome.unit.si
     path.write_bytes(whole.getbuffer())
@@ -352,32 +353,26 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
         If a part has no recording, samples are in one twice, or some that teach are to judge.
     """
     calibration, train, holdout = (recordings[role] for role in ("calibration", "train", "holdout"))
-    contents: dict[str, Content] = {}
-
-    def check(role: str, name: str, others: Sequence[str], problem: str, same: float = np.inf) -> None:
-        for other in others:
-            if SMALL < _share(config, name, other, contents) < same:
-                raise ConfigError(f"--{role} {name}: {problem.format(other)}")
-
     for role, names in recordings.items():
         if not names:
             raise ConfigError(f"--{role} is missing; name at least one recording")
-        for k, name in enumerate(names):
-            check(role, name, names[:k], "has samples in common with {}, and would count twice; name it once")
-    for name in train:
-        check(
-            "train", name, calibration,
-            "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
-            "that do not overlap",
-            SAME,
-        )  # fmt: skip
-    for name in holdout:
-        check(
-            "holdout", name, [*calibration, *train],
-            "overlaps {}, which was given for fitting, and cannot judge it; name another recording",
-        )  # fmt: skip
-    alike = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
-    return list(calibration), alike
+    once = "has samples in common with {}, and would count twice; name it once"
+    alike = "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
+    alike += "that do not overlap"
+    fresh = "overlaps {}, which was given for fitting, and cannot judge it; name another recording"
+    pairs = [
+        *((role, k, names[:k], once, np.inf) for role, names in recordings.items() for k in range(len(names))),
+        *(("train", k, calibration, alike, SAME) for k in range(len(train))),
+        *(("holdout", k, [*calibration, *train], fresh, np.inf) for k in range(len(holdout))),
+    ]
+    contents: dict[str, Content] = {}
+    for role, k, others, problem, same in pairs:
+        name = recordings[role][k]
+        for other in others:
+            if SMALL < _share(config, name, other, contents) < same:
+                raise ConfigError(f"--{role} {name}: {problem.format(other)}")
+    names = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
+    return list(calibration), names
 
 
 def _share(config: Config, name: str, other: str, contents: dict[str, Content]) -> float:

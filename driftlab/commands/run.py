@@ -26,8 +26,7 @@ from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Unit
 from driftlab.commands.result import Result
 from driftlab.config import Config
 from driftlab.evaluation.limits import verdict
-from driftlab.evaluation.overview import OverviewAccumulator
-from driftlab.evaluation.run_limits import averages_of, check_run_limits, map_of
+from driftlab.evaluation.overview import OverviewAccumulator, averages_of, check_run_limits, map_of
 from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined

@@ -4,11 +4,19 @@ Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an
 of the sensor that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
 added to every axis of the bias at the end of the alignment, and the filter is not told of it: the paper's 15 deg/h of a
 gyro, of another sensor about five deviations of what it reads on average over one second.
+
+Ranking: the bias wanders from one recording to the next by about the sigma that a coast says it has, and all configs
+meet the same wandering: another recording may move any error by that much. So two configs differ where ::
+
+    |e_a - e_b| > max(sigma_a, sigma_b)
+
+with e the rms error and sigma the rms deviation of their coasts over the same horizon: over all axes, and axis by axis.
+Judged is the longest horizon that is known of all configs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -19,17 +27,16 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.evaluation import limits, ranking
+from driftlab.evaluation import limits
 from driftlab.evaluation.limits import LimitResult
-from driftlab.evaluation.overview import Overview, OverviewAccumulator
-from driftlab.evaluation.run_limits import averages_of, check_run_limits
-from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, rms_over_time
+from driftlab.evaluation.overview import Overview, OverviewAccumulator, averages_of, check_run_limits
+from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, over_axes, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
-from driftlab.units import BiasUnit, unit_of
+from driftlab.units import BiasUnit, duration, listed, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import MeasurementModel, Sensor
 from fusion_core.errors import ConfigError, NotAtRest
@@ -38,6 +45,9 @@ OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7
 THRESHOLD = 1e-5  # rad/s: converged, in table 12
 SPREAD = 5.0  # of the noise at 1 Hz: the initial error of another sensor than a gyro; the paper's is 4.7 of its own
 SEGMENTS = 5  # tables 8 to 11
+TO_THE_END = LONGEST_FIRST[0]
+OFTEN = "10 min"  # said beside the longest, where there is more
+REFUTED = 2.0  # sigma: what is off by more says too little of itself
 
 Columns = dict[str, NDArray[Any]]
 
@@ -70,26 +80,15 @@ def initial_error(sensor: Sensor) -> InitialError:
 
 @dataclass(frozen=True)
 class Condition:
-    """Errors of one config in one condition, in SI, one value an axis.
+    """Errors of one config in one condition, in SI, one value an axis."""
 
-    Attributes
-    ----------
-    first, whole : (d,) arrays
-        Rms over the first 30 s after the alignment, and the whole interval (tables 6 and 7).
-    segments : (SEGMENTS, d) array
-        Rms over each of five equal parts of the recording, each run on its own (tables 8 and 10); NaN where a part
-        is too short to align in.
-    convergence : (d,) array
-        Time after the alignment at which the error is first below the threshold, s; NaN where it never is (table 12).
-    estimates : dict of str to array
-        The run (`RunSegment.columns`).
-    """
-
-    first: Array
-    whole: Array
+    first: Array  # (d,) rms over the first 30 s after the alignment (tables 6 and 7)
+    whole: Array  # (d,) rms over the whole interval
+    # (SEGMENTS, d) rms over equal parts, each run on its own; NaN: too short to align in (tables 8 and 10)
     segments: Array
+    # (d,) time after the alignment at which the error falls below the threshold, s; NaN: never (table 12)
     convergence: Array
-    estimates: Columns
+    estimates: Columns  # the run (`RunSegment.columns`)
 
 
 @dataclass(frozen=True)
@@ -250,7 +249,7 @@ def verdict(runs: Mapping[str, Comparison]) -> str:
     """Return the config that coasts best, and whether that is more than chance."""
     unit = next(iter(runs.values())).initial.unit
     scores = {name: run.yardsticks for name, run in runs.items()}
-    return ranking.verdict(scores, unit, min(run.span for run in runs.values()))
+    return coast_verdict(scores, unit, min(run.span for run in runs.values()))
 
 
 def limit_lines(runs: Mapping[str, Comparison]) -> list[str]:
@@ -303,3 +302,130 @@ def _condition_document(condition: Condition, unit: BiasUnit) -> dict[str, Any]:
         unit.key("segments"): condition.segments,
         "convergence_s": condition.convergence,
     }
+
+
+@dataclass(frozen=True)
+class Axes:
+    """The best config and the next compared axis by axis: names of axes."""
+
+    better: tuple[str, ...]
+    alike: tuple[str, ...]
+    worse: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The configs by what their coasts are off by over one horizon."""
+
+    horizon: str  # its name
+    errors: dict[str, float]  # of each config, the smallest first: rms over the axes, SI
+    sigmas: dict[str, float]  # rms over the axes of the deviation, SI
+    best: tuple[str, ...]  # the config of the smallest error, and those that do not differ from it
+    axes: Axes | None  # the first of `errors` against the next one; None without one, and of a single axis
+
+
+def ranking(runs: Mapping[str, Scores], horizons: Sequence[str] = LONGEST_FIRST) -> Ranking | None:
+    """Rank runs over the first of the horizons that is known of all; None where there is none."""
+    for horizon in horizons:
+        errors = {name: over_axes(y.coast[horizon]) for name, y in runs.items()}
+        if np.all(np.isfinite(list(errors.values()))):
+            break
+    else:
+        return None
+    order = sorted(errors, key=errors.__getitem__)
+    sigmas = {name: over_axes(runs[name].coast_sigma[horizon]) for name in order}
+    first = order[0]
+    best = [n for n in order if errors[n] - errors[first] <= max(sigmas[n], sigmas[first])]
+    axes = _axes(runs[first], runs[order[1]], horizon) if len(order) > 1 and len(runs[first].axes) > 1 else None
+    return Ranking(horizon, {name: errors[name] for name in order}, sigmas, tuple(best), axes)
+
+
+def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
+    """Return the axes on which a is better than b, not different, and worse."""
+    gain = b.coast[horizon] - a.coast[horizon]
+    bound = np.maximum(a.coast_sigma[horizon], b.coast_sigma[horizon])
+    better, alike, worse = (
+        tuple(axis for axis, yes in zip(a.axes, which, strict=True) if yes)
+        for which in (gain > bound, np.abs(gain) <= bound, gain < -bound)
+    )
+    return Axes(better, alike, worse)
+
+
+def coast_verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
+    """Return the config that coasts best, by how much, and whether it is more than the sigma.
+
+    All are of one recording; `span` is from the end of the alignment to its end, s.
+    """
+    ranked = ranking(runs)
+    if ranked is None:
+        return "The config that coasts best is not known: too little of the recording is at rest after the alignment."
+    text = _single(ranked, unit) if len(runs) == 1 else _several(ranked, unit)
+    text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
+    return text + _shorter(runs, ranked, span)
+
+
+def _single(ranked: Ranking, unit: BiasUnit) -> str:
+    ((name, error),) = ranked.errors.items()
+    size = f"{unit.number(error)} {unit.shown}"
+    return f"{name} coasts {size} off, {ranked.horizon}; there is nothing to compare it with."
+
+
+def _several(ranked: Ranking, unit: BiasUnit) -> str:
+    """Return a sentence on several configs over the horizon of a ranking."""
+    best = ranked.best
+    over = "" if ranked.axes is None else " rms over the axes"
+    values = {name: unit.number(value) for name, value in ranked.errors.items()}
+    others = ", ".join(f"{name} {value}" for name, value in values.items() if name not in best) + f" {unit.shown}"
+    if len(best) == 1:
+        return (
+            f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
+            f"{others}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
+        )
+    worse = f"; worse: {others}" if len(best) < len(values) else ""
+    return (
+        f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
+        f"{listed([values[n] for n in best])} {unit.shown}{over}, "
+        f"within {_sigma(ranked, best, unit)}{_disagree(ranked)}{worse}."
+    )
+
+
+def _sigma(ranked: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
+    """Return the sigma that the configs of these names differ by less or more than."""
+    largest = max(names, key=ranked.sigmas.__getitem__)
+    whose = f" of {largest}" if len({unit.number(ranked.sigmas[name]) for name in names}) > 1 else ""
+    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])} {unit.shown})"
+
+
+def _agree(ranked: Ranking) -> str:
+    """Return the remarks on axes that rank the best otherwise than their rms, and on its sigma."""
+    first, rival = list(ranked.errors)[:2]
+    parts, axes = [], ranked.axes
+    if axes is not None:
+        parts = [f"not on {listed(axes.alike)}"] if axes.alike else []
+        parts += [f"on {listed(axes.worse)} {rival} is better"] if axes.worse else []
+    text = f", but {' and '.join(parts)}" if parts else "" if axes is None else ", and all axes agree"
+    error, sigma = ranked.errors[first], ranked.sigmas[first]
+    if error > REFUTED * sigma:
+        text += f". Itself it is off by {error / sigma:.1f} times its sigma, which is too small to tell chance by"
+    return text
+
+
+def _disagree(ranked: Ranking) -> str:
+    """Return on which axes the two smallest differ although their rms does not."""
+    axes = ranked.axes
+    if axes is None or not (axes.better or axes.worse):
+        return ""
+    pairs = zip(ranked.errors, (axes.better, axes.worse), strict=False)
+    return f", but {' and '.join(f'{name} is better on {listed(on)}' for name, on in pairs if on)}"
+
+
+def _shorter(runs: Mapping[str, Scores], ranked: Ranking, span: float) -> str:
+    """Return the ranking over ten minutes beside that over the whole; empty where they are the whole."""
+    short = ranking(runs, [OFTEN]) if ranked.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
+    if short is None:
+        return ""
+    if set(short.best) == set(ranked.best):
+        return f" Over {OFTEN} the same."
+    if len(short.best) == 1:
+        return f" Over {OFTEN} {short.best[0]} coasts best."
+    return f" Over {OFTEN} there is no difference between {listed(short.best)}."

@@ -15,15 +15,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from driftlab.config import Limits
 from driftlab.units import BiasUnit, with_uncertainty
-
-if TYPE_CHECKING:
-    from driftlab.config import Limits
-    from fusion_core.chunk import Array
+from fusion_core.chunk import Array
 
 Decision = Literal["pass", "fail", "undecided"]
 RISK = 0.05  # of the units beyond a limit, that may pass
@@ -36,14 +34,6 @@ RULE = (
 )
 EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
 VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit
-MEASURED_BY = {
-    "bias_instability": "driftlab allan",
-    "residual": "driftlab fit-map",
-    "coast": "driftlab run",
-    "swing": "driftlab fit-map",
-    "noise": "driftlab allan",
-    "hysteresis": "driftlab fit-map",
-}
 NAMES = {
     "bias_instability": "bias instability",
     "residual": "residual of the map",
@@ -52,82 +42,41 @@ NAMES = {
     "noise": "white noise",
     "hysteresis": "hysteresis",
 }
+MEASURED_BY = {"bias_instability": "driftlab allan", "noise": "driftlab allan", "coast": "driftlab run"}
+MEASURED_BY |= dict.fromkeys(("residual", "swing", "hysteresis"), "driftlab fit-map")
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement of a limited quantity.
+    """A measurement of a limited quantity, a value an axis; one of zero does not show, and is judged by `high`."""
 
-    Attributes
-    ----------
-    values : (d,) array
-        One value an axis.
-    axes : tuple of str
-        Their names.
-    low, high : (d,) arrays or None
-        The true value is above `low` with 95 %, and below `high` with 95 %; None where the uncertainty is not known.
-        A value of zero is one that does not show, and is judged by `high`.
-    stands_on : str
-        What the values were measured on, for the table.
-    missing : str
-        Why they must not be judged; empty where they may.
-    seconds : float
-        Time they stand on, s; NaN where more of it would not tell more.
-    otherwise : str
-        What would decide where time does not.
-    beside : str
-        Remark beside the verdict where no limit is set for it.
-    """
-
-    values: Array
-    axes: Sequence[str]
-    low: Array | None = None
-    high: Array | None = None
-    stands_on: str = ""
-    missing: str = ""
-    seconds: float = float("nan")
-    otherwise: str = ""
-    beside: str = ""
+    values: Array  # (d,), SI
+    axes: Sequence[str]  # their names
+    low: Array | None = None  # (d,) the true value is above it with 95 %; None where the uncertainty is not known
+    high: Array | None = None  # (d,) the true value is below it with 95 %
+    stands_on: str = ""  # what the values were measured on, for the table
+    missing: str = ""  # why they must not be judged; empty where they may
+    seconds: float = float("nan")  # time they stand on, s; NaN where more of it would not tell more
+    otherwise: str = ""  # what would decide where time does not
+    beside: str = ""  # remark beside the verdict where no limit is set for it
 
 
 @dataclass(frozen=True)
 class LimitResult:
-    """One limit, what was measured, and the decision.
+    """One limit, what was measured, and the decision; in SI."""
 
-    Attributes
-    ----------
-    name : str
-        Of the limit, as the config has it.
-    limit, value, guard : float
-        In SI; `value` is of the axis that decides, NaN where there is none, `guard` what is added to it or taken off;
-        NaN where that is not known.
-    axis : str
-        The axis that decides.
-    decision : str
-        `pass`, `fail` or `undecided`.
-    measured : bool
-        Whether there is a value that may be judged.
-    note : str
-        What the value stands on, or why there is none.
-    needs : str
-        What would decide it; empty where it is decided.
-    more : float
-        Time that would, beside what was measured, s; NaN where none would, or that is not known.
-    beside : str
-        Remark beside the verdict on all limits, since none is set for it; the first row has it.
-    """
-
-    name: str
+    name: str  # of the limit, as the config has it
     limit: float
-    value: float
-    guard: float
-    axis: str
-    decision: Decision
-    measured: bool = True
-    note: str = ""
-    needs: str = ""
+    value: float = float("nan")  # of the axis that decides; NaN where there is none
+    guard: float = float("nan")  # what is added to it or taken off; NaN where that is not known
+    axis: str = ""  # that decides
+    decision: Decision = "undecided"  # `pass`, `fail` or `undecided`
+    measured: bool = True  # whether there is a value that may be judged
+    note: str = ""  # what the value stands on, or why there is none
+    needs: str = ""  # what would decide it; empty where it is decided
+    # time that would, beside what was measured, s; NaN where none would, or that is not known
     more: float = float("nan")
-    beside: str = ""
+    beside: str = ""  # remark beside the verdict on all limits, since none is set for it; the first row has it
 
     @property
     def verdict(self) -> str:
@@ -243,17 +192,17 @@ def outcome(line: str) -> str:
 
 def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
     if measured is None:
-        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
+        return LimitResult(name, limit, measured=False, note=f"`{MEASURED_BY[name]}` measures it")
     if measured.missing:
-        return _missing(name, limit, measured.missing)
+        return LimitResult(name, limit, measured=False, note=measured.missing)
     values, axes = np.asarray(measured.values, dtype=np.float64), list(measured.axes)
-    blank = LimitResult(name, limit, np.nan, np.nan, "", "undecided", note=measured.stands_on)
+    blank = LimitResult(name, limit, note=measured.stands_on)
     if measured.otherwise and np.all(np.isnan(values)):
         return replace(blank, needs=measured.otherwise)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
         whose = f" of {', '.join(unknown)}" if unknown else ""
-        return _missing(name, limit, f"has no value{whose}")
+        return LimitResult(name, limit, measured=False, note=f"has no value{whose}")
     if measured.low is None or measured.high is None:
         k = int(np.argmax(values))
         why = measured.otherwise or "its uncertainty is not known"
@@ -293,7 +242,3 @@ def _undecided(row: LimitResult, measured: Measured) -> LimitResult:
         size = f"{more / 3600:.2g} h" if more >= 0.95 * 3600 else f"{max(more / 60, 1):.2g} min"
         needs = f"about {size} more would decide it, if {row.axis} stays {beyond} the limit by as much"
     return replace(row, needs=needs, more=float(more))
-
-
-def _missing(name: str, limit: float, note: str) -> LimitResult:
-    return LimitResult(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)

@@ -1,26 +1,28 @@
-"""Measurements of the quantities that a config limits: by a map, an Allan analysis and a run."""
+"""Measurements of the quantities that a config limits: by a map, an Allan analysis and a run.
+
+For the Allan deviation of a run less its map, the input of its filter is averaged over a second or more. An average
+counts where half of it or more was measured at rest; all stretches of such averages are analysed, short gaps bridged
+where the unit did not move. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab.evaluation.limits import SIDE, Measured
-from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW
+from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW, Scores
 from driftlab.maps.fit import axes_of
+from driftlab.noise.allan import curve
+from driftlab.noise.allan_fit import Coefficients, fit
 from driftlab.noise.allan_model import KEYS
+from driftlab.noise.recording import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+from fusion_core.contracts import Alignment, FittedMap, Sensor
 from fusion_core.wandering import bounds, contrasts, rows_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from driftlab.evaluation.scores import Scores
-    from driftlab.noise.allan_fit import Coefficients
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Alignment, FittedMap, Sensor
 
 COAST = "10 min"  # the horizon that a limit is about
 MIN_SHARE = 0.9  # of it that must have been measured at rest
@@ -31,7 +33,9 @@ POINTS = 1000  # temperatures at which a map's largest and smallest bias are loo
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
 NOT_SURE = "its kind of map does not say how sure the curve is; take one that does"
 WHOLE = "`driftlab allan` measures it over the whole of a recording"
+SHORTEST = 1.0  # s, of an average
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
+Less = Callable[[Mapping[str, Array]], Array]
 
 
 def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
@@ -208,3 +212,72 @@ def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured
     n = max(round(align / alignment.dt) - 1, 1)
     measured = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
     return normal(measured, noise * np.sqrt(0.75 / n), np.nan)
+
+
+class Averages:
+    """Averages of the rate less what a map explains of it, block after block of a run.
+
+    The interval is that of the updates, s; `less` returns, of a block of N rows, the map's part (N, d) of its rate, SI.
+    """
+
+    def __init__(self, interval: float, axes: Sequence[str], less: Less | None = None) -> None:
+        self.step, self.axes, self.less = interval * max(1, round(SHORTEST / interval)), list(axes), less
+        self._parts: list[Array] = []  # (3 + d, K): index, time at rest and moving [s], sum of the rate at rest
+
+    def add(self, block: Mapping[str, Array]) -> None:
+        """Take the next rows: `t` and `tau` (N,) s, `still` (N,), `rate` (N, d), and what the map needs."""
+        rate = block["rate"] if self.less is None else block["rate"] - self.less(block)
+        still = block["still"].astype(bool)
+        weight = block["tau"] * still
+        index = np.floor((block["t"] - block["tau"] / 2) / self.step)
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
+        sums = np.add.reduceat(np.column_stack([weight, block["tau"] * ~still, weight[:, None] * rate]), starts)
+        self._parts.append(np.column_stack([index[starts], sums]))
+
+    def measured(self) -> Measured:
+        """Return the bias instability of all stretches at rest without a gap."""
+        cut, values = self._whole()
+        lasted = cut.samples * self.step
+        if not cut.enough:
+            longest, least = np.max(cut.places, initial=0) * self.step, MIN_STRETCH * self.step
+            text = (
+                f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {MIN_SAMPLES * self.step:.4g} s or "
+                f"more, {least:.4g} s of it without a gap"
+            )
+            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
+        fits = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
+        of = "the rest less the map, " if self.less is not None else "the rest, "
+        return of_allan(fits, self.axes, lasted, of=of)["bias_instability"]
+
+    def noise(self) -> Measured:
+        """Return the density of the white noise, from the differences of neighbouring averages.
+
+        Each has the variance `noise^2 (1 / tau_1 + 1 / tau_2)`, of averages over tau; neighbours share one of the two,
+        so `(sigma of noise / noise)^2 = 3 / (4 n)`.
+        """
+        rows = self._rows()
+        counts = rows[:, 1] >= self.step / 2
+        pairs = counts[1:] & counts[:-1] & (np.diff(rows[:, 0]) == 1)
+        n, time = int(np.sum(pairs)), np.maximum(rows[:, 1:2], self.step / 2)
+        if n < MIN_SAMPLES:
+            text = f"{n * self.step:.4g} s at rest in a row; record {MIN_SAMPLES * self.step:.4g} s or more"
+            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
+        variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
+        measured = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
+        return normal(measured, measured.values * np.sqrt(0.75 / n), n * self.step)
+
+    def _rows(self) -> Array:
+        """Return index, time at rest and moving [s] and sum of the rate at rest (K, 3 + d) of all averages."""
+        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, 3 + len(self.axes)))
+        if len(rows):  # an average may begin in one block and end in the next
+            starts = np.concatenate([[0], np.flatnonzero(np.diff(rows[:, 0])) + 1])
+            rows = np.column_stack([rows[starts, 0], np.add.reduceat(rows[:, 1:], starts)])
+        return rows
+
+    def _whole(self) -> tuple[Pieces, Array]:
+        """Return the averages that count in pieces, and all (K, d) that these are rows of."""
+        rows = self._rows()
+        counts = rows[:, 1] >= self.step / 2
+        known = counts | (rows[:, 2] > 0)  # what else was lost is a gap
+        rows, counts = rows[known], counts[known]
+        return pieces(rows[:, 0] * self.step, counts), rows[:, 3:] / np.maximum(rows[:, 1:2], self.step / 2)

@@ -1,4 +1,4 @@
-"""The overview of a run for its summary and its report, from its estimates block by block.
+"""The overview of a run for its summary and its report, from its estimates block by block, and its limits.
 
 Memory does not grow with the recording: sums for the scores and tests, and a few thousand rows for the figures. How
 many rows there will be need not be known: whenever there are too many, every second row of a curve is left out, and two
@@ -12,22 +12,21 @@ middle: a line through them reaches as far as the errors do. N rows, d axes, K s
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 
+from driftlab.config import Config
+from driftlab.evaluation.limits import LimitResult, check_limits
+from driftlab.evaluation.measurements import Averages, of_coast, of_map
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
+from driftlab.units import tracked_unit
+from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
-
-if TYPE_CHECKING:
-    from driftlab.evaluation.bias_instability import Averages
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Alignment, MeasurementModel
-    from fusion_core.model import Flags
-
+from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, ThermalBias
+from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
@@ -40,68 +39,35 @@ NAMES = (
 DRAWN = (
     "t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "temperature_raw", "reference", SMOOTHED,
 )  # fmt: skip
-Columns = dict[str, "Array"]
+Columns = dict[str, Array]
 
 
 @dataclass(frozen=True)
 class Overview:
-    """A run at a glance.
+    """A run at a glance."""
 
-    Attributes
-    ----------
-    count, used : int
-        Updates, and those whose measurement was used.
-    start, end : float
-        Time of the first and the last update, s.
-    first_row : float
-        Time of the recording's first row, s; of the first update where it is not known.
-    bias, sigma : (d,) arrays
-        At the end, in SI.
-    yardsticks : Scores
-    nis : NisTest
-    whiteness_p : (m,) array
-        Of the used updates after the first alignment, as is `nis`.
-    curves : dict of str to array
-        At most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores.
-    errors : dict of str to array
-        `t`, and the error of `bias` and `coast`, with every spike of it.
-    nis_curve : (K, 3) array
-        Time in s, mean nis and number of updates of up to 2 STRETCHES stretches.
-    nis_highest : float
-        Largest nis of one update among them.
-    swing : float
-        Of the temperature, K; 0 where there is none.
-    """
-
-    count: int
-    used: int
-    start: float
-    end: float
-    first_row: float
-    bias: Array
-    sigma: Array
-    yardsticks: Scores
-    nis: NisTest
-    whiteness_p: Array
+    count: int  # updates
+    used: int  # those whose measurement was used
+    start: float  # time of the first update, s
+    end: float  # time of the last one, s
+    first_row: float  # time of the recording's first row, s; of the first update where it is not known
+    bias: Array  # (d,) at the end, SI
+    sigma: Array  # (d,) its deviation
+    yardsticks: Scores  # scores of the run
+    nis: NisTest  # of the used updates after the first alignment
+    whiteness_p: Array  # (m,) of the same
+    # at most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores
     curves: Columns
-    errors: Columns
-    nis_curve: Array
-    nis_highest: float
-    swing: float
+    errors: Columns  # `t`, and the error of `bias` and `coast`, with every spike of it
+    nis_curve: Array  # (K, 3) time in s, mean nis and number of updates of up to 2 STRETCHES stretches
+    nis_highest: float  # largest nis of one update among them
+    swing: float  # of the temperature, K; 0 where there is none
 
 
 class OverviewAccumulator:
     """The sums and rows behind an overview, taken while a run goes by: any split of it gives the same.
 
-    Parameters
-    ----------
-    model : MeasurementModel
-    alignment : Alignment
-        The first of the run.
-    averages : Averages, optional
-        They are given every block.
-    rows : int
-        Of a block, which is gathered before it is looked at.
+    The alignment is the run's first; `averages` are given every block, which is gathered up to so many rows.
     """
 
     def __init__(
@@ -315,3 +281,49 @@ def _take(
 def _in_turn(first: Array, second: Array) -> Array:
     """Return rows of two arrays (K, ...) in turn, (2 K, ...)."""
     return np.stack([first, second], axis=1).reshape(2 * len(first), *first.shape[1:])
+
+
+def map_of(config: Config) -> FittedMap | None:
+    """Return the map of the config's tracked sensor, from memory or its file; None where it has none."""
+    settings = next((settings for settings in config.tracked_maps() if settings.has_map), None)
+    return None if settings is None else settings.load()
+
+
+def averages_of(config: Config, alignment: Alignment) -> Averages | None:
+    """Return the averages that the limits of a config need of a run; None where none of them does.
+
+    They are of the calibrated rate, or of the rate less the map's bias.
+    """
+    limits = config.limits
+    if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
+        return None
+    sensor = config.filter.tracked
+    if sensor.calibration is not None:
+        return Averages(alignment.dt, sensor.axes, lambda block: block["calibration"])
+    fitted = map_of(config) if isinstance(sensor.bias, ThermalBias) else None
+    if fitted is None:
+        return Averages(alignment.dt, sensor.axes)
+    clamped = replace(fitted, outside="clamp")  # the run has refused already what is to be refused
+    return Averages(alignment.dt, sensor.axes, lambda block: clamped.bias(block["temperature"]))
+
+
+def check_run_limits(
+    config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
+) -> list[LimitResult]:
+    """Judge a run by the limits of its config.
+
+    The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
+    survey has filled; residual, swing and hysteresis are of the map.
+    """
+    if config.limits is None or config.filter is None:
+        return []
+    align = config.filter.align
+    fitted = map_of(config)
+    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, align)}
+    if averages is not None and config.limits.noise is not None:
+        measured["noise"] = averages.noise()
+    if averages is not None and config.limits.bias_instability is not None:
+        measured["bias_instability"] = averages.measured()
+    if fitted is not None:
+        measured |= of_map(fitted, tracked_unit(config.filter))
+    return check_limits(config.limits, measured)

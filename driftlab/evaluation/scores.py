@@ -38,39 +38,21 @@ MEASURED = 0.9  # of a coast that begins later than the run's own, at rest: with
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors in the SI unit of the bias, one value an axis; NaN where the recording does not reach.
+    """Errors in the SI unit of the bias, one value an axis; NaN where the recording does not reach."""
 
-    Attributes
-    ----------
-    axes : tuple of str
-        Names of the d axes.
-    filter_first, filter_whole : (d,) arrays
-        Rms of estimate less reference, over the first 30 s after the alignment and the whole interval.
-    coast : dict of str to (d,) array
-        Rms of prediction less reference, for each horizon.
-    coast_sigma : dict of str to (d,) array
-        Rms over the same epochs of the deviation that the prediction says it has.
-    heading : dict of str to float
-        Angle about the vertical that the prediction is wrong by at the end of each horizon, rad; NaN of other sensors.
-    share : dict of str to float
-        Part of each interval that was measured at rest: of `first 30 s`, `whole` and each horizon.
-    moved : float
-        Part of the whole interval in which the unit moved.
-    coasts : (J, d) array
-        Rms of prediction less reference over each 10 minutes of the run, as if it had been aligned right before.
-    errors : (K, 1 + d) array
-        Of each CELL at rest its time from the alignment, s, and the mean of prediction less rate.
-    """
-
-    axes: tuple[str, ...]
-    filter_first: Array
-    filter_whole: Array
-    coast: dict[str, Array]
-    coast_sigma: dict[str, Array]
+    axes: tuple[str, ...]  # names of the d axes
+    filter_first: Array  # (d,) rms of estimate less reference, over the first 30 s after the alignment
+    filter_whole: Array  # (d,) the same over the whole interval
+    coast: dict[str, Array]  # (d,) rms of prediction less reference, for each horizon
+    coast_sigma: dict[str, Array]  # (d,) rms over the same epochs of the deviation that the prediction says it has
+    # angle about the vertical that the prediction is wrong by at its end, rad; NaN of other sensors
     heading: dict[str, float]
+    # part of each interval that was measured at rest: of `first 30 s`, `whole` and each horizon
     share: dict[str, float]
-    moved: float
+    moved: float  # part of the whole interval in which the unit moved
+    # (J, d) rms of prediction less reference over each 10 minutes, as if aligned right before
     coasts: Array = field(default_factory=lambda: np.empty((0, 0)))
+    # (K, 1 + d) of each CELL at rest: time from the alignment, s, and mean of prediction less rate
     errors: Array = field(default_factory=lambda: np.empty((0, 0)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,16 +11,14 @@ from driftlab.evaluation.overview import Overview
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.units import axis_name, unit_of
+from fusion_core.chunk import Array
 from fusion_core.contracts import MeasurementModel, Sensor
 from fusion_core.errors import moment
-
-if TYPE_CHECKING:
-    from fusion_core.chunk import Array
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
 COMPLETE = 0.9  # of the time: a score that stands on less says why
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
-Rows = Sequence[tuple[str, list["Array"]]]  # of a table: a label, and for each run the errors (d,) in SI
+Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
 
 def summarise(overview: Overview, model: MeasurementModel, journal: RunLog) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.unit_information import UnitInformation
+from driftlab.identification.records import map_inputs
 from driftlab.soak.blocks import SoakRows, means, runs
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
@@ -44,21 +45,11 @@ LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and
 
 @dataclass(frozen=True, eq=False)
 class EffectContrasts:
-    """Contrasts of units for effects, a column a coefficient.
+    """Contrasts of units for effects, a column a coefficient."""
 
-    Attributes
-    ----------
-    c : (..., d, K) array
-        Coefficients, SI; 0 where a unit cannot show any.
-    information : (..., d, K) array
-        1 / variance of each under the unit's own noise.
-    placebos : (..., d, K, J) array
-        Noise along each placebo, in its own deviation; 0 where nothing of it is its own.
-    """
-
-    c: Array
-    information: Array
-    placebos: Array
+    c: Array  # (..., d, K) coefficients, SI; 0 where a unit cannot show any
+    information: Array  # (..., d, K) 1 / variance of each under the unit's own noise
+    placebos: Array  # (..., d, K, J) noise along each placebo, in its own deviation; 0 where nothing of it is its own
 
     def of(self, columns: slice) -> EffectContrasts:
         """Return some of the columns."""
@@ -83,12 +74,8 @@ def signatures(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk])
     """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
 
     A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's, with
-    the unit's own curve. That curve's error is independent of the residual beside it.
-
-    Raises
-    ------
-    MissingChannel
-        If the unit's recordings lack a channel of the effect.
+    the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if the
+    unit's recordings lack a channel of the effect.
     """
     if not effect.acts_on_input:
         return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks]
@@ -106,14 +93,8 @@ def columns_of(effects: Sequence[Effect], soaked: UnitInformation, chunks: Seque
 
 def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
     """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
-    temperatures = []
-    for rows in soaked.recordings:
-        chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
-        for effect in effects:
-            if effect.acts_on_input:
-                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-        temperatures.append(chunk["temperature"])
-    return temperatures
+    chunks = (Chunk(rows.t, {**rows.channels, "temperature": rows.T}) for rows in soaked.recordings)
+    return map_inputs(chunks, effects)
 
 
 def of_each_axis(signature: Array) -> Array:
@@ -135,11 +116,7 @@ def own_curve(soaked: UnitInformation) -> Array:
 class UnitRows:
     """Rows of a unit under its own noise, and effects in them.
 
-    Parameters
-    ----------
-    soaked : UnitInformation
-    beside : effects
-        Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
+    Effects `beside` are named already: a free coefficient each; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
@@ -172,10 +149,7 @@ class UnitRows:
     def estimates(self, effect: Effect) -> tuple[Array, Array]:
         """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
 
-        Raises
-        ------
-        MissingChannel
-            If the unit's recordings lack a channel of the effect.
+        Raises MissingChannel if the unit's recordings lack a channel of the effect.
         """
         signature = self._white(signatures(effect, self.soaked, self.chunks))
         estimates = [_least_squares(Q, r, Z) for Q, r, Z in zip(self.Q, self.r, signature, strict=True)]

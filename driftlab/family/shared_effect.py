@@ -5,13 +5,22 @@ n units, d axes, q coefficients an axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    model_serializer,
+)
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, columns_of, seen_temperatures
 from driftlab.family.parallel import ParallelMap, serial
@@ -20,20 +29,17 @@ from driftlab.family.shared_effect_search import Indices, Offer, between, chance
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.result import described, parameters
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
-
-if TYPE_CHECKING:
-    from driftlab.units import BiasUnit
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished
 HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 MIN_UNITS = 2  # of a lot, for a law of its own
 NAMED = 6  # lots that are named one by one
 SIGNS = 2.0  # spread over mean, beyond which signs differ
-GAINS = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")  # of an effect, in the file
 
 
 class UnitDensities(NamedTuple):
@@ -46,7 +52,7 @@ class UnitDensities(NamedTuple):
 class EffectDistribution(BaseModel):
     """Law of the coefficients (d, q) over units: N(mean, spread^2), `sigma` of the mean; SI."""
 
-    model_config = ConfigDict(frozen=True, validate_by_name=True)
+    model_config = ConfigDict(frozen=True, validate_by_name=True, serialize_by_alias=True)
 
     mean: Numbers
     sigma: Annotated[Numbers, Field(alias="mean_sigma")]
@@ -62,7 +68,7 @@ class EffectDistribution(BaseModel):
 class OfLot(BaseModel):
     """An effect in a lot: units, mean and deviation (d, q), evidence (nats), and whether that is enough."""
 
-    model_config = ConfigDict(frozen=True, validate_by_name=True)
+    model_config = EffectDistribution.model_config
 
     lot: str
     units: int
@@ -72,26 +78,13 @@ class OfLot(BaseModel):
     has: bool
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LotEffects:
-    """The laws of an effect.
+class LotEffects(EffectDistribution):
+    """The laws of an effect: of the units that have it, of those that have it not, and of lots."""
 
-    Attributes
-    ----------
-    law : EffectDistribution
-        Of the units that have it.
-    others : EffectDistribution or None
-        Of the units of the lots that have it not; None where every lot is one law's.
-    lots : tuple of OfLot
-        In the order of their names; none where no lots are known.
-    differs : float
-        Probability that lots of one law differ as much.
-    """
-
-    law: EffectDistribution
-    others: EffectDistribution | None = None
-    lots: tuple[OfLot, ...] = ()
-    differs: float = 1.0
+    # of the units of the lots that have it not; None where every lot is one law's
+    others: Annotated[EffectDistribution | None, Field(alias="other_lots")] = None
+    lots: tuple[OfLot, ...] = ()  # in the order of their names; none where no lots are known
+    differs: float = 1.0  # probability that lots of one law differ as much
 
     def has(self, lot: str) -> bool:
         """Return True if the units of a lot have the effect."""
@@ -99,64 +92,36 @@ class LotEffects:
 
     def law_of(self, lot: str) -> EffectDistribution:
         """Return the law of the units of a lot."""
-        return self.law if self.others is None or self.has(lot) else self.others
+        return self if self.others is None or self.has(lot) else self.others
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+def _of_kind(value: Any) -> Effect:
+    return value if isinstance(value, Effect) else TypeAdapter(Annotated[Effect, Installed()]).validate_python(value)
+
+
+def _settings(effect: Effect) -> dict[str, Any]:
+    return effect.model_dump(mode="json", exclude_none=True)
+
+
 class SharedEffect(LotEffects):
-    """One effect with its laws.
+    """One effect with its laws, as `family.json` has it."""
 
-    Attributes
-    ----------
-    effect : Effect
-        With its hyper-parameters.
-    unit : str
-        Of the coefficients.
-    evidence, of_mean, of_size, price : float
-        Nats: that it is there, of the mean of the units' coefficients and of their squares; and the threshold.
-    left_out, in_other_lots : float, float or None
-        Gain on units, mean a unit in nats, that had no part in the law nor in the hyper-parameters; and in lots.
-    indistinguishable_from : tuple of str
-        Effects that predict left-out units as well.
-    """
+    effect: Annotated[Effect, PlainValidator(_of_kind), PlainSerializer(_settings)]  # with its hyper-parameters
+    unit: str  # of the coefficients
+    evidence: float  # that it is there, nats
+    of_mean: float  # the same of the mean of the units' coefficients alone
+    of_size: float  # the same of their squares alone
+    price: float  # threshold of the evidence
+    left_out: float  # mean gain of a unit that had no part in the law nor in the hyper-parameters, nats
+    in_other_lots: float | None  # the same of whole lots
+    indistinguishable_from: tuple[str, ...]  # effects that predict left-out units as well
 
-    effect: Effect
-    unit: str
-    evidence: float
-    of_mean: float
-    of_size: float
-    price: float
-    left_out: float
-    in_other_lots: float | None
-    indistinguishable_from: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the effect as `family.json` has it."""
-        return {
-            "kind": self.effect.kind,
-            "channel": self.effect.subject,
-            "parameters": parameters(self.effect),
-            "effect": self.effect.model_dump(mode="json", exclude_none=True),
-            "unit": self.unit,
-            **self.law.model_dump(mode="json", by_alias=True),
-            "other_lots": self.others and self.others.model_dump(mode="json", by_alias=True),
-            "lots": [lot.model_dump(mode="json", by_alias=True) for lot in self.lots],
-            **{name: getattr(self, name) for name in GAINS},
-            "indistinguishable_from": list(self.indistinguishable_from),
-            "explanation": self.effect.explanation,
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the effect that `as_json` wrote; raises ValidationError where it is not installed."""
-        others = content["other_lots"]
-        return cls(
-            effect=TypeAdapter(Annotated[Effect, Installed()]).validate_python(content["effect"]), unit=content["unit"],
-            law=EffectDistribution.model_validate(content),
-            others=others and EffectDistribution.model_validate(others),
-            lots=tuple(OfLot.model_validate(lot) for lot in content["lots"]), **{name: content[name] for name in GAINS},
-            indistinguishable_from=tuple(content["indistinguishable_from"]),
-        )  # fmt: skip
+    @model_serializer(mode="wrap")
+    def _described(self, inner: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the content of the file: what the effect says of itself stands beside it."""
+        effect = self.effect
+        about = {"kind": effect.kind, "channel": effect.subject, "parameters": parameters(effect)}
+        return {**about, **inner(self), "explanation": effect.explanation}
 
 
 def without_effects(
@@ -232,7 +197,7 @@ class _UnitContrast(NamedTuple):
 
 
 def sizes(
-    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[tuple[Offer, Effect]], each: ParallelMap = serial
+    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[Offer], each: ParallelMap = serial
 ) -> tuple[list[LotEffects], dict[str, tuple[OfUnit, ...]], dict[str, UnitDensities]]:
     """Return the laws of effects over all units, the effects in each unit, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -240,10 +205,10 @@ def sizes(
     with threadpool_limits(1):
         names, lots, densities, rows = zip(*each(partial(_effects_of_unit, taken), units), strict=True)
     laws, of_units = [], []
-    for (_, effect), column in zip(taken, zip(*rows, strict=True), strict=True):
+    for offer, column in zip(taken, zip(*rows, strict=True), strict=True):
         contrasts = together([one.contrasts for one in column])
         c, v = np.stack([one.c for one in column]), np.stack([one.v for one in column]) * _excess_noise(contrasts)
-        law = _laws(effect, c, v, contrasts, lots)
+        law = _laws(offer.effect, c, v, contrasts, lots)
         laws.append(law)
         of_units.append([
             OfUnit(*law.law_of(lot).shrunken(one, variance), one, np.sqrt(variance))
@@ -253,11 +218,11 @@ def sizes(
 
 
 def _effects_of_unit(
-    taken: Sequence[tuple[Offer, Effect]], unit: tuple[UnitInformation, str]
+    taken: Sequence[Offer], unit: tuple[UnitInformation, str]
 ) -> tuple[str, str, UnitDensities, list[_UnitContrast]]:
     """Return the name of a unit, its lot, its noise beside the effects, and its contrast of each."""
     soaked, lot = unit
-    quiet = _with_noise_beside(soaked, [effect for _, effect in taken])
+    quiet = _with_noise_beside(soaked, [offer.effect for offer in taken])
     contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]
     return soaked.unit, lot, UnitDensities(quiet.white, quiet.walk), contrasts
 
@@ -281,12 +246,11 @@ def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> Un
     return replace(soaked, white=densities.white, walk=densities.likely)
 
 
-def _contrast(soaked: UnitInformation, taken: Sequence[tuple[Offer, Effect]], k: int) -> _UnitContrast:
-    offer, effect = taken[k]
-    columns = UnitRows(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
-    contrasts = columns.contrasts([effect], [offer.size])
+def _contrast(soaked: UnitInformation, taken: Sequence[Offer], k: int) -> _UnitContrast:
+    columns = UnitRows(soaked, [offer.effect for place, offer in enumerate(taken) if place != k])
+    contrasts = columns.contrasts([taken[k].effect], [taken[k].size])
     try:
-        c, covariance = columns.estimates(effect)
+        c, covariance = columns.estimates(taken[k].effect)
     except MissingChannel:
         return _UnitContrast(np.zeros_like(contrasts.c), np.full_like(contrasts.c, np.inf), contrasts)
     return _UnitContrast(c, np.diagonal(covariance, axis1=1, axis2=2), contrasts)
@@ -303,7 +267,7 @@ def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: 
     known = {name: units for name, units in members.items() if name and len(units) >= MIN_UNITS}
     whole = _law(effect, c, v, np.arange(len(lots)))
     if len(known) < 2:
-        return LotEffects(law=whole)
+        return LotEffects(**dict(whole))
     differs, of_lots = _differ(c, v, list(known.values())), []
     for name, units in known.items():
         one, evidence = _law(effect, c, v, units, lag=False), _evidence(effect, c, v, contrasts, units)
@@ -311,10 +275,10 @@ def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: 
         of_lots.append(OfLot(lot=name, units=len(units), mean=one.mean, sigma=one.sigma, evidence=evidence, has=has))
     having = [one.lot for one in of_lots if one.has]
     if differs > DIFFERS or not having or len(having) == len(of_lots):
-        return LotEffects(law=whole, lots=tuple(of_lots), differs=differs)
+        return LotEffects(**dict(whole), lots=tuple(of_lots), differs=differs)
     inside = np.array([lot in having for lot in lots])
     law, others = (_law(effect, c, v, np.flatnonzero(part)) for part in (inside, ~inside))
-    return LotEffects(law=law, others=others, lots=tuple(of_lots), differs=differs)
+    return LotEffects(**dict(law), others=others, lots=tuple(of_lots), differs=differs)
 
 
 def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> EffectDistribution:
@@ -378,7 +342,7 @@ def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     """Return an effect with its sizes and its evidence, in sentences."""
     name = described(effect.effect)
     lines = [
-        f"{name}: {_where(effect)}, {_sizes(effect, effect.law, unit, axes)}; {effect.evidence:.0f} nats "
+        f"{name}: {_where(effect)}, {_sizes(effect, effect, unit, axes)}; {effect.evidence:.0f} nats "
         f"({effect.price:.0f} needed), and a unit that was left out is predicted {effect.left_out:.2g} nats better."
     ]
     if effect.others is not None:

@@ -27,18 +27,19 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from numpy.typing import NDArray
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.unit_information import UnitInformation
-from driftlab.identification.candidates import installed
+from driftlab.identification.candidates import installed, offers_by_kind, proposals
+from driftlab.identification.records import with_residuals
 from driftlab.identification.state import name_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
-from fusion_core.errors import FusionError, MissingChannel
 from fusion_core.host.registry import kind_of
 
 CHANCE = 5.0  # nats beyond the price, as in the loop
@@ -51,7 +52,7 @@ HALVINGS = 36  # of the interval that holds s^2
 MIN_UNITS = 5  # for a mean and its scatter
 MIN_PLACEBOS = 3  # for the noise of a unit
 
-Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,27 +75,15 @@ class Offer:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An offer and its evidence, nats.
-
-    Attributes
-    ----------
-    mean, size : float
-        Of the mean of the coefficients, and of their squares.
-    chance, price : float
-        Of both, and of all trials.
-    lot : str
-        The lot that was looked at alone; empty: all.
-    left_out : (n,) array
-        Gain in the log-likelihood of the coefficients of each unit, predicted from others.
-    """
+    """An offer and its evidence, nats."""
 
     offer: Offer
-    mean: float
-    size: float
-    chance: float
-    price: float
-    lot: str
-    left_out: Array
+    mean: float  # of the mean of the coefficients
+    size: float  # of their squares
+    chance: float  # of both
+    price: float  # of all trials
+    lot: str  # that was looked at alone; empty: all
+    left_out: Array  # (n,) gain in the log-likelihood of the coefficients of each unit, predicted from others
 
     @property
     def effect(self) -> Effect:
@@ -112,7 +101,7 @@ class Candidate:
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 
-def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
+def offers_for(sample: Sequence[UnitInformation]) -> tuple[list[Offer], dict[str, str]]:
     """Return the offers of the installed effects, and why kinds of effects have none.
 
     Lines have none: their phase is the chamber's at the time, and no unit's.
@@ -120,36 +109,20 @@ def offers_for(sample: Sequence[UnitInformation], without: Collection[str]) -> t
     channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
     alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
     chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
-    offers: list[Offer] = []
-    refused: dict[str, str] = {}
-    for cls in installed():
-        kind = kind_of(cls)
-        if kind in without:
-            refused[kind] = "not wanted"
-        elif cls.course == "line":
-            refused[kind] = "its phase is no property of a unit"
-        else:
-            try:
-                offers += _offers_of(cls, sample[0].axes, chunks)
-            except MissingChannel:
-                continue
-            except FusionError as error:
-                refused[kind] = f"broken: {error}"
-    return offers, refused
+    lines = [kind_of(cls) for cls in installed() if cls.course == "line"]
+    refused = dict.fromkeys(lines, "its phase is no property of a unit")
+    broken: dict[str, str] = {}
+    kinds = offers_by_kind(partial(_offers_of, sample[0].axes, chunks), refused, broken)
+    offers = [offer for _, of_kind in kinds for offer in of_kind]
+    return offers, {**refused, **{kind: f"broken: {why}" for kind, why in broken.items()}}
 
 
-def _offers_of(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk]) -> list[Offer]:
-    try:
-        blank = cls(axes=axes)  # type: ignore[call-arg]
-    except ValidationError:
-        return []
-    offers = []
-    for proposed in blank.proposals(chunks):
-        effect = proposed.beside_map(None) if set(proposed.requires) <= set(chunks[0].channels) else None
-        size = 0 if effect is None else 1 if effect.acts_on_input else _coefficients(effect, chunks[0])
-        if effect is not None and 0 < size <= MAX_COEFFICIENTS:
-            offers.append(Offer(effect, size))
-    return offers
+def _offers_of(axes: tuple[str, ...], chunks: Sequence[Chunk], cls: type[Effect]) -> list[Offer]:
+    sized = [
+        Offer(effect, 1 if effect.acts_on_input else _coefficients(effect, chunks[0]))
+        for effect in proposals(cls, axes, chunks, None)
+    ]
+    return [offer for offer in sized if 0 < offer.size <= MAX_COEFFICIENTS]
 
 
 def _coefficients(effect: Effect, chunk: Chunk) -> int:
@@ -163,8 +136,7 @@ def _coefficients(effect: Effect, chunk: Chunk) -> int:
 def _with_residual(soaked: UnitInformation) -> list[Chunk]:
     curve = own_curve(soaked)
     parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
-    spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)
-    return [chunk.having(residual=part / spread) for chunk, part in zip(chunks_of(soaked), parts, strict=True)]
+    return with_residuals(chunks_of(soaked), parts)
 
 
 def contrasts_of(
@@ -255,11 +227,9 @@ def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate
 
 def between_lots(offer: Offer, contrasts: EffectContrasts, lots: Sequence[str]) -> float | None:
     """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
-    names, of_unit = sorted(set(lots)), np.array(lots)
-    if len(names) < 2:
+    if len(set(lots)) < 2:
         return None
-    folds = ((np.flatnonzero(of_unit != name), np.flatnonzero(of_unit == name)) for name in names)
-    return float(np.sum([_gains([offer], contrasts, *fold)[:, 0].sum() for fold in folds])) / len(lots)
+    return float(_left_out([offer], contrasts, np.arange(len(lots)), np.array(lots)).sum()) / len(lots)
 
 
 def refine(
@@ -338,11 +308,13 @@ def _part(offers: Sequence[Offer], contrasts: EffectContrasts, k: int) -> Effect
     return contrasts.of(_columns(offers)[k])
 
 
-def _left_out(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> Array:
-    """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
-    folds = np.arange(len(units)) % FOLDS
+def _left_out(
+    offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices, folds: NDArray[Any] | None = None
+) -> Array:
+    """Return the gains (n, offers) of each of some units, predicted from the other folds (n,) of these."""
+    folds = np.arange(len(units)) % FOLDS if folds is None else folds
     total = np.zeros((len(units), len(offers)))
-    for fold in range(FOLDS):
+    for fold in np.unique(folds):
         total[folds == fold] = _gains(offers, contrasts, units[folds != fold], units[folds == fold])
     return total
 

@@ -8,11 +8,12 @@ n units, d axes, q coefficients an axis of an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
 from driftlab.family.contrasts import EffectContrasts
 from driftlab.family.parallel import ParallelMap, serial
@@ -31,10 +32,8 @@ from driftlab.family.shared_effect_search import (
 )
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.result import described
+from driftlab.units import BiasUnit
 from fusion_core.contracts import Effect
-
-if TYPE_CHECKING:
-    from driftlab.units import BiasUnit
 
 SAMPLE = 400  # units that are searched
 PROPOSING = 12  # of these, whose recordings say which hyper-parameters are worth trying
@@ -43,33 +42,29 @@ MAX_EFFECTS = 4
 MIN_UNITS = 10
 
 
-@dataclass(frozen=True, eq=False)
-class SharedEffects:
-    """Result of the search.
+class RejectedEffect(BaseModel):
+    """The best of a kind that was not added, or the kind, and why."""
 
-    Attributes
-    ----------
-    verdict : str
-        `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished.
-    effects : tuple of SharedEffect
-    rejected : tuple of (str, str)
-        The best of every other kind, and why it was not added.
-    tried, units, searched : int
-        Candidates; units in all; and units that were searched.
-    of_units : mapping of str to tuple of OfUnit
-        By unit, of each effect: coefficients and deviations (d, q), shrunken to the law.
-    noise : mapping of str to UnitDensities
-        By unit, beside the effects.
-    """
+    model_config = ConfigDict(frozen=True)
 
-    verdict: str
-    effects: tuple[SharedEffect, ...]
-    rejected: tuple[tuple[str, str], ...]
-    tried: int
-    units: int
-    searched: int
-    of_units: Mapping[str, tuple[OfUnit, ...]] = field(default_factory=dict)
-    noise: Mapping[str, UnitDensities] = field(default_factory=dict)
+    effect: str
+    reason: str
+
+
+class SharedEffects(BaseModel):
+    """Result of the search, as `family.json` has it without the units."""
+
+    model_config = ConfigDict(frozen=True)
+
+    verdict: str = "nothing_common"  # `nothing_common`, `explained`, or `ambiguous`: rivals cannot be distinguished
+    effects: tuple[SharedEffect, ...] = ()
+    rejected: tuple[RejectedEffect, ...] = ()  # the best of every other kind, and why it was not added
+    tried: int = 0  # candidates
+    units: int = 0  # in all
+    searched: int = 0  # units that were searched
+    # (d, q) of each effect, by unit
+    of_units: Annotated[InstanceOf[dict[str, tuple[OfUnit, ...]]], Field(exclude=True)] = {}
+    noise: Annotated[InstanceOf[dict[str, UnitDensities]], Field(exclude=True)] = {}  # by unit, beside the effects
 
     def apart(self, soaked: UnitInformation, lot: str = "") -> UnitInformation:
         """Return the information of a unit's soaks with the effects in the model; itself where there are none."""
@@ -79,36 +74,18 @@ class SharedEffects:
 
     def of_unit(self, unit: str) -> SharedEffects:
         """Return the effects with the sizes and the noise of one unit alone."""
-        of_units = {name: self.of_units[name] for name in (unit,) if name in self.of_units}
-        return replace(self, of_units=of_units, noise={name: self.noise[name] for name in of_units})
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the effects as `family.json` has them, without the units."""
-        return {
-            "verdict": self.verdict,
-            "effects": [effect.as_json() for effect in self.effects],
-            "rejected": [{"effect": name, "reason": reason} for name, reason in self.rejected],
-            "tried": self.tried,
-            "units": self.units,
-            "searched": self.searched,
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the effects that `as_json` wrote; raises ValidationError where one is not installed."""
-        return cls(
-            content["verdict"],
-            tuple(SharedEffect.from_json(effect) for effect in content["effects"]),
-            tuple((one["effect"], one["reason"]) for one in content["rejected"]),
-            *(content[name] for name in ("tried", "units", "searched")),
-        )
+        own = {name: {unit: sizes[unit]} for name, sizes in self if name in ("of_units", "noise") and unit in sizes}
+        return self.model_copy(update={"of_units": {}, "noise": {}, **own})
 
 
 def find_common(
-    units: Iterable[tuple[UnitInformation, str]], *, bias_unit: str = "rad/s", without: Collection[str] = (),
-    seed: int = 0, sample: int = SAMPLE, each: ParallelMap = serial,
-) -> SharedEffects:  # fmt: skip
-    """Return the effects that units share.
+    units: Iterable[tuple[UnitInformation, str]],
+    *,
+    bias_unit: str = "rad/s",
+    sample: int = SAMPLE,
+    each: ParallelMap = serial,
+) -> SharedEffects:
+    """Return the effects that units share; `sample` of them at most are searched.
 
     Parameters
     ----------
@@ -116,31 +93,26 @@ def find_common(
         Units and their lots; gone through more than once, each time in the same order.
     bias_unit : str
         SI unit of the bias.
-    without : kinds of effects that are not tried
-    seed : int
-        Of the sample, where there are more units than `sample`.
     each : ParallelMap, optional
         Goes through the units.
     """
-    drawn, count = _drawn(units, sample, seed)
+    drawn, count = _drawn(units, sample)
     if len(drawn) < MIN_UNITS:
         why = f"{len(drawn)} units; {MIN_UNITS} are needed to tell what they have in common"
-        return SharedEffects("nothing_common", (), (("all", why),), 0, count, len(drawn))
-    search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], without, each)
+        return SharedEffects(rejected=(RejectedEffect(effect="all", reason=why),), units=count, searched=len(drawn))
+    search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], each)
     search.run()
     effects = search.measured(units, bias_unit)
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
     return SharedEffects(
-        verdict if effects else "nothing_common", effects, search.rejected(), len(search.offers), count, len(drawn),
-        search.of_units, search.noise,
+        verdict=verdict if effects else "nothing_common", effects=effects, rejected=search.rejected(),
+        tried=len(search.offers), units=count, searched=len(drawn), of_units=search.of_units, noise=search.noise,
     )  # fmt: skip
 
 
-def _drawn(
-    units: Iterable[tuple[UnitInformation, str]], most: int, seed: int
-) -> tuple[list[tuple[UnitInformation, str]], int]:
+def _drawn(units: Iterable[tuple[UnitInformation, str]], most: int) -> tuple[list[tuple[UnitInformation, str]], int]:
     """Return at most some units at random, in their order, and how many there are; that many are ever held."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     reservoir: dict[int, tuple[UnitInformation, str]] = {}
     count = 0
     for number, unit in enumerate(units):  # reservoir sampling
@@ -154,15 +126,13 @@ def _drawn(
 
 
 class _Search:
-    """Effects added one by one to the model of the sampled units: of each the candidate as chosen, and its rivals."""
+    """Effects added one by one to the model of the sampled units: of each the candidate, refined, and its rivals."""
 
-    def __init__(
-        self, sample: list[UnitInformation], lots: list[str], without: Collection[str], each: ParallelMap
-    ) -> None:
+    def __init__(self, sample: list[UnitInformation], lots: list[str], each: ParallelMap) -> None:
         self.sample, self.lots, self.each = sample, lots, each
-        self.taken: list[tuple[Candidate, Effect, tuple[str, ...]]] = []
+        self.taken: list[tuple[Candidate, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
-        self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)], without)
+        self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)])
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
         self.noise: dict[str, UnitDensities] = {}
 
@@ -171,14 +141,13 @@ class _Search:
         while self.offers and len(self.taken) < MAX_EFFECTS and self._add():
             pass
         for k in reversed(range(len(self.taken) - 1)):
-            old, effect, rivals = self.taken[k]
-            offer = replace(old.offer, effect=effect)
-            new = evaluate([offer], self._contrasts([offer], self._others(k)), self.lots)[0]
+            old, rivals = self.taken[k]
+            new = evaluate([old.offer], self._contrasts([old.offer], self._others(k)), self.lots)[0]
             price = float(np.log(len(self.offers))) if not old.lot else old.price
             if new.chance <= price + CHANCE or new.total <= 0:
                 del self.taken[k]
             else:
-                self.taken[k] = (replace(new, price=price), effect, rivals)
+                self.taken[k] = (replace(new, price=price), rivals)
 
     def _add(self) -> bool:
         """Add the best candidate; return whether one pays."""
@@ -201,18 +170,18 @@ class _Search:
         if nested(offers, contrasts, taken, where) <= 0:
             return False
         tuned = [self.sample[k] for k in where[:: max(1, len(where) // TUNING)]]
-        effect = refine(tuned, taken, offers, effects, self.each)
-        self.taken.append((taken, effect, tuple(described(rival.effect) for rival in rivals)))
+        refined = replace(taken.offer, effect=refine(tuned, taken, offers, effects, self.each))
+        self.taken.append((replace(taken, offer=refined), tuple(described(rival.effect) for rival in rivals)))
         return True
 
     def _others(self, k: int | None) -> list[Effect]:
         """Return the effects in the model, all but the k-th."""
-        return [effect for place, (_, effect, _) in enumerate(self.taken) if place != k]
+        return [taken.effect for place, (taken, _) in enumerate(self.taken) if place != k]
 
     def _contrasts(self, offers: list[Offer], beside: list[Effect]) -> EffectContrasts:
         return contrasts_of(self.sample, offers, beside, self.each)
 
-    def rejected(self) -> tuple[tuple[str, str], ...]:
+    def rejected(self) -> tuple[RejectedEffect, ...]:
         """Return the best of every kind that was not added in the last round, and why; and what was refused."""
         kinds = {effect.kind for effect in self._others(None) if not effect.several}
         reasons = []
@@ -226,25 +195,24 @@ class _Search:
             else:
                 why = f"{one.chance:.1f} nats of {one.price + CHANCE:.1f} needed"
             reasons.append((described(one.effect), why))
-        return (*reasons, *self.refused.items())
+        return tuple(RejectedEffect(effect=name, reason=why) for name, why in (*reasons, *self.refused.items()))
 
     def measured(self, units: Iterable[tuple[UnitInformation, str]], bias_unit: str) -> tuple[SharedEffect, ...]:
         """Return the effects with their sizes in all units."""
         if not self.taken:
             return ()
-        effects, offered = [], [(taken.offer, effect) for taken, effect, _ in self.taken]
-        laws, self.of_units, self.noise = sizes(units, offered, self.each)
-        for k, ((taken, effect, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
-            offer = replace(taken.offer, effect=effect)
-            contrasts = self._contrasts([offer], self._others(k))
+        effects = []
+        laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken], self.each)
+        for k, ((taken, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
+            contrasts = self._contrasts([taken.offer], self._others(k))
             where = np.flatnonzero([law.has(lot) for lot in self.lots])
             effects.append(
                 SharedEffect(
-                    **vars(law), effect=effect,
-                    unit=", ".join(dict.fromkeys(effect.units_of(bias_unit))) or bias_unit,
+                    **dict(law), effect=taken.effect,
+                    unit=", ".join(dict.fromkeys(taken.effect.units_of(bias_unit))) or bias_unit,
                     evidence=taken.chance, of_mean=taken.mean, of_size=taken.size, price=taken.price + CHANCE,
-                    left_out=nested([offer], contrasts, taken, where) / max(len(where), 1),
-                    in_other_lots=between_lots(offer, contrasts, self.lots) if law.others is None else None,
+                    left_out=nested([taken.offer], contrasts, taken, where) / max(len(where), 1),
+                    in_other_lots=between_lots(taken.offer, contrasts, self.lots) if law.others is None else None,
                     indistinguishable_from=rivals,
                 )
             )  # fmt: skip
@@ -259,7 +227,7 @@ def sentences(common: SharedEffects, unit: BiasUnit, axes: Sequence[str]) -> lis
     """Return the verdict in sentences, sizes in the unit of tables."""
     if not common.effects:
         if not common.tried:
-            return [f"What the units have in common was not asked: {reason}." for _, reason in common.rejected[:1]]
+            return [f"What the units have in common was not asked: {one.reason}." for one in common.rejected[:1]]
         return [f"No effect of {common.tried} candidates is common to the {common.units:,} units."]
     lines = [line for effect in common.effects for line in of_effect(effect, unit, axes)]
     if common.searched < common.units:

@@ -30,56 +30,32 @@ from fusion_core.contracts import Effect
 CHANCE = 5.0  # nats beyond the price of the choice
 GAIN = 3.0  # nats beyond the Bayesian information criterion
 FAST, BESIDE, SLOW = 0.9, 0.85, 0.5  # ratios: of a first effect, of one beside others, of slow evidence
+ONE_SIGMA, SURELY = 0.8413, 0.95  # that the parts do not show it by accident
 WORSE = 1.05  # ratio of a whole recording: where an effect does not act it may not harm
 DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further term of a channel that is named already
 
 
 @dataclass(frozen=True)
 class CandidateEvidence:
-    """A candidate's figures, as above.
+    """A candidate's figures, as above; gains, chance and price in nats."""
 
-    Attributes
-    ----------
-    ratio : float
-        Mean square of the left-out error, with over without.
-    steady : float
-        Mean of the logarithms of the ratios part by part, over the deviation of that mean.
-    parts : int
-        Number of parts.
-    poorest : float
-        The largest of the ratios of whole recordings.
-    beside : bool
-        Whether there are other effects in the model.
-    left_out, chance, gain, price : float
-        Left-out gain, chance of the matched filter's answer, its gain beyond the criterion, and log M, in nats.
-    """
-
-    ratio: float
-    steady: float
-    parts: int
-    poorest: float
-    beside: bool
-    left_out: float
-    chance: float
-    gain: float
-    price: float
+    ratio: float  # mean square of the left-out error, with over without
+    steady: float  # mean of the logarithms of the ratios part by part, over the deviation of that mean
+    parts: int  # their number
+    poorest: float  # the largest of the ratios of whole recordings
+    beside: bool  # whether there are other effects in the model
+    left_out: float  # left-out gain
+    chance: float  # of the matched filter's answer
+    gain: float  # of the matched filter, beyond the criterion
+    price: float  # log M
 
     @property
     def needed(self) -> float:
         """Upper limit of the ratio; lower beside other effects, since their misfit looks like one more."""
         return BESIDE if self.beside else FAST
 
-    @property
-    def better(self) -> bool:
-        """True if left-out parts are predicted better: in all, and part by part (one sigma)."""
-        return self._better(0.8413)
-
-    @property
-    def surely_better(self) -> bool:
-        """The same with a chance of 5 % that the parts show it by accident."""
-        return self._better(0.95)
-
-    def _better(self, probability: float) -> bool:
+    def better(self, probability: float = ONE_SIGMA) -> bool:
+        """Return True if left-out parts are predicted better: in all, and part by part with a probability."""
         quantile = -float(stdtrit(max(self.parts - 1, 1), probability))
         return self.ratio < self.needed and self.steady < quantile and self.poorest < WORSE and self.left_out > 0
 
@@ -87,12 +63,12 @@ class CandidateEvidence:
     def fast(self) -> bool:
         """True if evidence at short times is enough."""
         strong = self.chance > self.price + CHANCE and self.gain > GAIN
-        return strong and self.better
+        return strong and self.better()
 
     @property
     def slow(self) -> bool:
         """True if what is predicted of left-out parts is enough by itself."""
-        return self.surely_better and self.left_out > CHANCE and self.ratio < SLOW
+        return self.better(SURELY) and self.left_out > CHANCE and self.ratio < SLOW
 
     def reason(self) -> str:
         """Return in words what is not enough."""
@@ -101,7 +77,7 @@ class CandidateEvidence:
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
         if self.poorest >= WORSE:
             return f"predicts a left-out recording {poorest:+.0f} %, that is, worse than without it"
-        if not self.better:
+        if not self.better():
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (
@@ -122,7 +98,7 @@ def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) 
         accepted = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
     elif effect.walks and (evidence.beside or effect.course == "trend"):
         needed = SECOND if evidence.beside else DRIFTING
-        accepted = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
+        accepted = evidence.better(SURELY) and evidence.left_out > CHANCE and evidence.ratio < needed
         return accepted, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
     else:
         accepted = evidence.fast or evidence.slow

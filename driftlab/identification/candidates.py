@@ -8,17 +8,19 @@ wrong one, and is reported as unexplained, on its channel and at its time scale.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
-from driftlab.identification.normal_equations import Indices
+from driftlab.identification.records import with_residuals
 from driftlab.identification.state import Search, name_of
+from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.table import auxiliary
@@ -29,6 +31,7 @@ from fusion_core.settings import nearest
 MAX_POWER = 6  # of temperature above which a map needs no further ones
 MAX_MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
 
+Offered = TypeVar("Offered")
 Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
 
@@ -42,17 +45,7 @@ def candidates_of(search: Search) -> dict[Family, list[Term]]:
     degree = _degree(search, chunks)
     families: dict[Family, list[Term]] = {}
     before: list[Effect] = []
-    for cls in installed():
-        kind = kind_of(cls)
-        if kind in search.without or kind in search.broken:
-            continue
-        try:
-            offers = _offers(search, cls, chunks, degree)
-        except MissingChannel:
-            continue
-        except FusionError as error:
-            search.broken[kind] = str(error)
-            continue
+    for cls, offers in offers_by_kind(partial(_offers, search, chunks, degree), search.without, search.broken):
         for effect in offers:
             other = None if built_in(cls) else same(search.columns, effect, before)
             if other is not None:
@@ -63,6 +56,35 @@ def candidates_of(search: Search) -> dict[Family, list[Term]]:
                 term = Term(effect, free)
                 families.setdefault(family_of(search, term), []).append(term)
     return families
+
+
+def offers_by_kind(
+    offers: Callable[[type[Effect]], list[Offered]], without: Collection[str], broken: dict[str, str]
+) -> Iterator[tuple[type[Effect], list[Offered]]]:
+    """Yield the installed effects and their offers; those that do not keep their contract are noted as `broken`."""
+    for cls in installed():
+        kind = kind_of(cls)
+        if kind in without or kind in broken:
+            continue
+        try:
+            yield cls, offers(cls)
+        except MissingChannel:
+            continue
+        except FusionError as error:
+            broken[kind] = str(error)
+
+
+def proposals(cls: type[Effect], axes: tuple[str, ...], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
+    """Return the proposals of a class for recordings, beside a map with powers of temperature up to `degree`.
+
+    Raises PluginError if the class has settings without a default.
+    """
+    try:
+        blank = cls(axes=axes)  # type: ignore[call-arg]
+    except ValidationError:
+        raise PluginError(f"{kind_of(cls)}: has settings without a default, and cannot be proposed") from None
+    able = (one for one in blank.proposals(chunks) if set(one.requires) <= set(chunks[0].channels))
+    return [effect for one in able if (effect := one.beside_map(degree)) is not None]
 
 
 def installed() -> list[type[Effect]]:
@@ -83,19 +105,14 @@ def check_kinds(kinds: Collection[str], option: str = "--without") -> None:
             )
 
 
-def _offers(search: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
-    """Return the proposals of a class that the model can take, their columns worked out; raises PluginError."""
+def _offers(search: Search, chunks: Sequence[Chunk], degree: int | None, cls: type[Effect]) -> list[Effect]:
+    """Return the proposals of a class that the model can take, their columns worked out."""
     columns, offers = search.columns, []
     have = {name_of(term.effect) for term in search.model if not term.effect.several}
     memories = [term.effect.subject for term in search.model if term.effect.fades]
     acting = columns.basis is None or any(term.effect.acts_on_input for term in search.model)
-    try:
-        blank = cls(axes=search.evidence.axes)  # type: ignore[call-arg]
-    except ValidationError:
-        raise PluginError(f"{kind_of(cls)}: has settings without a default, and cannot be proposed") from None
-    for proposed in blank.proposals(chunks):
-        effect = proposed.beside_map(degree) if set(proposed.requires) <= set(chunks[0].channels) else None
-        if effect is None or name_of(effect) in have or (effect.acts_on_input and acting):
+    for effect in proposals(cls, search.evidence.axes, chunks, degree):
+        if name_of(effect) in have or (effect.acts_on_input and acting):
             continue
         if effect.fades and memories.count(effect.subject) >= MAX_MEMORIES:
             continue
@@ -164,12 +181,11 @@ def with_residual(search: Search) -> list[Chunk]:
     """
     evidence, columns = search.evidence, search.columns
     left = np.stack(search.residuals(search.model), axis=1) * columns.scale[columns.y]
-    chunks = []
+    residuals = []
     for record, predicted in zip(evidence.records, evidence.split(evidence.rate - left), strict=True):
         of_model = np.stack([np.interp(record.chunk.t, record.t, column) for column in predicted.T], axis=1)
-        chunks.append(record.chunk.having(residual=record.chunk[evidence.channel] - of_model))
-    spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
-    return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]
+        residuals.append(record.chunk[evidence.channel] - of_model)
+    return with_residuals(evidence.chunks, residuals)
 
 
 PROBE_INTERVALS = 12  # of a probe's smooth function
@@ -221,7 +237,7 @@ class Probe(Effect):
         return {
             "function": f"a smooth function of {self.channel}",
             "with temperature": f"{self.channel}, with an influence that changes with temperature",
-            "late": f"{self.channel}, late by about {span(self.tau)}",
+            "late": f"{self.channel}, late by about {duration(self.tau)}",
         }[self.form]
 
 
@@ -245,10 +261,3 @@ def _knots(parts: list[Array]) -> tuple[float, ...] | None:
     values = np.concatenate(parts)
     low, high = (float(v) for v in np.quantile(values, [0.005, 0.995]))
     return tuple(float(v) for v in np.linspace(low, high, PROBE_INTERVALS + 1)) if low < high else None
-
-
-def span(seconds: float) -> str:
-    """Return a time span as one says it."""
-    if seconds < 600:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -4,20 +4,160 @@ A column is what a curve of the map, one coefficient of an effect, or the unknow
 bias. Each is centred in each recording (its mean is the recording's level) and scaled to a mean square of 1, so any
 model is a choice of columns, and its least squares a choice of rows and columns of Gram matrices that are made once.
 n rows, R recordings, S segments, d axes, K columns.
+
+Normal equations of least squares are inner products of columns over some rows::
+
+    A x = b,    A = Z'Z + ridge,    b = Z'y,    what is left = y'y - b'x
+
+Those of several sets of rows add up; a choice of columns is a choice of rows and columns of A; columns that stay are
+taken out by the Schur complement. k columns; where a matrix G (k + 1, k + 1) is given, its last column is y's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from driftlab.identification.normal_equations import Indices, NormalEquations
-from driftlab.identification.records import Evidence
+from driftlab.identification.records import Evidence, map_inputs
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
+
+Indices = NDArray[np.intp]
+
+TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not determine stays small
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Symmetric, non-negative normal equations."""
+
+    A: Array  # (k, k) inner products of the columns, ridges added
+    b: Array  # (k,) theirs with the signal
+    yy: float  # the signal's sum of squares
+
+    @classmethod
+    def of(cls, G: Array) -> NormalEquations:
+        """Return those of inner products G (k + 1, k + 1), the last column the signal."""
+        return cls(G[:-1, :-1].copy(), G[:-1, -1].copy(), float(G[-1, -1]))
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        """Return those over the rows of both."""
+        return NormalEquations(self.A + other.A, self.b + other.b, self.yy + other.yy)
+
+    def raised(self, ridge: Array) -> NormalEquations:
+        """Return those with a ridge on the first columns: its diagonal (j,), or (j, j)."""
+        A, j = self.A.copy(), len(ridge)
+        A[:j, :j] += np.diag(ridge) if ridge.ndim == 1 else ridge
+        return NormalEquations(A, self.b, self.yy)
+
+    def restricted(self, keep: Indices | NDArray[np.bool_]) -> NormalEquations:
+        """Return those of some columns, the coefficients of the others being 0."""
+        return NormalEquations(self.A[np.ix_(keep, keep)], self.b[keep], self.yy)
+
+    def given(self, theta: Array) -> NormalEquations:
+        """Return those of the first columns where the coefficients of the last (p,) are given."""
+        j = len(self.b) - len(theta)
+        yy = self.yy - 2 * float(self.b[j:] @ theta) + float(theta @ self.A[j:, j:] @ theta)
+        return NormalEquations(self.A[:j, :j], self.b[:j] - self.A[:j, j:] @ theta, yy)
+
+    def solve(self, b: Array) -> Array:
+        """Return x (k,) or (k, p) of A x = b; what A does not determine is nearly zero."""
+        diagonal = np.diag_indices(len(self.A))
+        tiny = TINY * max(float(np.mean(self.A[diagonal])), 1e-300) if len(self.A) else 0.0
+        while True:
+            A = self.A.copy()
+            A[diagonal] += tiny
+            try:
+                return np.asarray(cho_solve(cho_factor(A, check_finite=False), b, check_finite=False))
+            except LinAlgError:  # rounding made it indefinite
+                tiny *= 100
+
+    @cached_property
+    def solution(self) -> Array:
+        """The coefficients (k,)."""
+        return self.solve(self.b)
+
+    @property
+    def left(self) -> float:
+        """Sum of squares that is left, with what the ridge adds."""
+        return max(self.yy - float(self.b @ self.solution), 0.0)
+
+    @property
+    def variances(self) -> Array:
+        """Variances (k,) of the coefficients for noise of density 1."""
+        return np.diag(self.solve(np.eye(len(self.A))))
+
+    def take_out(self, G: Array, cols: Indices) -> Array:
+        """Return the Schur complement of inner products G (K, K): the columns `cols`, which are these, taken out."""
+        return np.asarray(G - G[:, cols] @ self.solve(G[cols]))
+
+
+def free_starts(
+    equations: NormalEquations, first: int, starts: Sequence[Indices], rows: int, colour: float
+) -> tuple[Array, float]:
+    """Return the deviation of the starts of each term beyond what noise makes of them, and the noise's density S.
+
+    Columns are those of the starts from `first` on.
+    """
+    A = equations.A.copy()
+    A[np.diag_indices(len(A))] += TINY * max(float(np.mean(np.diag(A))), 1e-300)
+    inverse = np.linalg.inv(A)
+    beta = inverse @ equations.b
+    yy = equations.yy
+    slow = colour * max(yy - float(equations.b @ beta), 1e-12 * yy, 1e-300) / rows
+    sd, at = np.zeros(len(starts)), first
+    for k, own in enumerate(starts):
+        part = np.arange(at, at + len(own))
+        at += len(own)
+        if len(own):
+            sd[k] = np.sqrt(max(float(np.mean(beta[part] ** 2 - slow * inverse[part, part])), 0.0))
+    return sd, slow
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def left_with_starts(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
+    """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
+
+    R (K, K) holds inner products of all columns, y the signal's place. As `free_starts` and `NormalEquations.left`,
+    compiled: it is asked for tens of thousands of times.
+    """
+    k, yy = len(cols), R[y, y]
+    A, b = np.empty((k, k)), np.empty(k)
+    for i in range(k):
+        b[i] = R[cols[i], y]
+        for j in range(k):
+            A[i, j] = R[cols[i], cols[j]]
+    level = np.trace(A) / max(k, 1)
+    if k == 0 or level <= 0:
+        return float(yy)
+    for i in range(k):
+        A[i, i] += TINY * level
+    if np.sum(sizes) > 0:
+        inverse = np.linalg.inv(A)
+        beta = inverse @ b
+        slow = colour * max(yy - b @ beta, 1e-12 * yy, 1e-300) / rows
+        at = k - np.sum(sizes)
+        for size in sizes:
+            sd2 = 0.0
+            for i in range(at, at + size):
+                sd2 += (beta[i] ** 2 - slow * inverse[i, i]) / size
+            for i in range(at, at + size):
+                if sd2 > 0:
+                    A[i, i] += slow / sd2
+                else:  # it starts at equilibrium: out of the model
+                    A[i, :] = 0.0
+                    A[:, i] = 0.0
+                    A[i, i], b[i] = level, 0.0
+            at += size
+    return float(yy - b @ np.linalg.solve(A, b))
+
 
 PARTS = 5  # that a single recording is cut into
 HALVES = 2  # of each of several recordings
@@ -34,43 +174,17 @@ class RowSegment:
 
 @dataclass(frozen=True)
 class EffectColumns:
-    """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start.
+    """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start."""
 
-    Attributes
-    ----------
-    p : int
-        Number of coefficients.
-    columns, places : tuples of (k,) arrays of int, one an axis
-        Columns, and the coefficients they belong to.
-    starts : (R,) array of int, or None
-        Columns of the response to a start of 1 in each recording; None where the effect has no unknown start.
-    """
-
-    p: int
-    columns: tuple[Indices, ...]
-    places: tuple[Indices, ...]
+    p: int  # number of coefficients
+    columns: tuple[Indices, ...]  # (k,) of each axis
+    places: tuple[Indices, ...]  # (k,) of each axis: the coefficients that the columns belong to
+    # (R,) response to a start of 1 in each recording; None where the effect has no unknown start
     starts: Indices | None
 
 
 class EffectRegressors:
-    """Columns over the n rows of one evidence.
-
-    Attributes
-    ----------
-    W : (n, K) array
-        The columns.
-    means : (R, K) array
-        Means that were subtracted in each recording, in the columns' scaled unit.
-    scale : (K,) array
-        Divisor of each column.
-    y : (d,) array of int
-        Columns of the measured bias.
-    levels : (R,) array of int
-        Columns of the recordings' levels.
-    segments : tuple of Segment
-    declared_white : (d,) array
-        Variance of the declared white noise of a row, in the scaled unit; NaN where none is declared.
-    """
+    """Columns over the n rows of one evidence."""
 
     def __init__(self, evidence: Evidence, basis: Basis | None) -> None:
         self.evidence, self.basis = evidence, basis
@@ -80,15 +194,15 @@ class EffectRegressors:
         self.segments = _segments(evidence)
         self._gram = np.zeros((len(self.segments), 0, 0))
         self._sums: dict[tuple[int, ...], Array] = {}
-        self._effects: dict[str, EffectColumns] = {}
-        self._same: dict[int, tuple[Effect, EffectColumns]] = {}  # an object is found sooner than what it says
-        self._maps: dict[str, Indices] = {}
+        self._effects: dict[Effect, EffectColumns] = {}
+        self._maps: dict[tuple[Effect, ...], Indices] = {}
         levels = np.zeros((n, R))
         for r, rows in enumerate(evidence.slices):
             levels[rows, r] = 1.0
-        self.levels = self._add(levels, centred=False)
-        self.y = self._add(evidence.rate)
+        self.levels = self._add(levels, centred=False)  # (R,) columns of the recordings' levels
+        self.y = self._add(evidence.rate)  # (d,) columns of the measured bias
         noise = np.full(len(self.y), np.nan) if evidence.noise is None else evidence.noise
+        # variance (d,) of the declared white noise of a row, in the scaled unit; NaN where none is declared
         self.declared_white = (noise / self._scale[self.y]) ** 2 / evidence.interval
         self.penalty = np.zeros((0, 0)) if basis is None else basis.penalty
 
@@ -99,7 +213,7 @@ class EffectRegressors:
 
     @property
     def means(self) -> Array:
-        """Mean of each column in each recording (R, K), which was subtracted."""
+        """Mean of each column in each recording (R, K), which was subtracted, in the scaled unit."""
         return self._means[: self._size].T
 
     @property
@@ -151,19 +265,15 @@ class EffectRegressors:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""
         if self.basis is None:
             return np.zeros(0, dtype=np.intp)
-        acting = [effect for effect in effects if effect.acts_on_input]
-        key = repr(acting)
-        if key not in self._maps:
-            curves = [self.basis.values(T) for T in self.evidence.map_inputs(acting)]
-            self._maps[key] = self._add(self.evidence.rows(curves))
-        return self._maps[key]
+        acting = tuple(effect for effect in effects if effect.acts_on_input)
+        if acting not in self._maps:
+            curves = [self.basis.values(T) for T in map_inputs(self.evidence.chunks, acting)]
+            self._maps[acting] = self._add(self.evidence.rows(curves))
+        return self._maps[acting]
 
     def of(self, effect: Effect) -> EffectColumns:
         """Return the columns of an effect."""
-        if id(effect) in self._same:
-            return self._same[id(effect)][1]
-        key = repr(effect)
-        if key not in self._effects:
+        if effect not in self._effects:
             whole = self.evidence.rows([effect.signature(chunk, None)[0] for chunk in self.evidence.chunks])
             columns: list[Indices] = []
             places: list[Indices] = []
@@ -174,9 +284,8 @@ class EffectRegressors:
                 else:
                     columns.append(self._add(own[:, place]))
                 places.append(place)
-            self._effects[key] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
-        self._same[id(effect)] = effect, self._effects[key]
-        return self._effects[key]
+            self._effects[effect] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
+        return self._effects[effect]
 
     def _starts(self, effect: Effect) -> Indices | None:
         """Return a column for each recording: the response to a start of 1, row by row."""

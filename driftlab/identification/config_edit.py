@@ -17,10 +17,7 @@ from fusion_core.units import bias_unit
 def the_map(config: Config) -> ThermalMap | None:
     """Return the one thermal map of the config; None where temperature is a channel like any other.
 
-    Raises
-    ------
-    ConfigError
-        If the bias model cannot hold effects.
+    Raises ConfigError if the bias model cannot hold effects.
     """
     host_of(_bias(config))
     maps = config.tracked_maps()
@@ -30,12 +27,8 @@ def the_map(config: Config) -> ThermalMap | None:
 def host_of(declared: BiasModel) -> ThermalBias:
     """Return the bias model that follows map and effects in place of the declared one: itself, where it does.
 
-    Else the first that is installed, those that come with driftlab before others.
-
-    Raises
-    ------
-    ConfigError
-        If the declared model is neither such a one nor a random walk.
+    Else the first that is installed, those that come with driftlab before others. Raises ConfigError if the declared
+    model is neither such a one nor a random walk.
     """
     if isinstance(declared, ThermalBias):
         return declared

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, Indices
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
-from driftlab.identification.normal_equations import Indices
 from driftlab.noise.local_level import LocalLevel
 from fusion_core.chunk import Array
 
@@ -29,50 +28,26 @@ MIN_ROWS = 8  # of a part that is predicted
 
 @dataclass(frozen=True)
 class LeftOutPart:
-    """Rows of one recording that are left out, and of which segments the model is learned.
+    """Rows of one recording that are left out, and of which segments the model is learned."""
 
-    Attributes
-    ----------
-    record, rows, whole : int, slice, bool
-        The rows that are left out, and whether they are all of the recording.
-    rest, refit : tuples of int
-        Segments that effects are fitted on, and map and levels, the effects given.
-    window : slice
-        Rows in which the unit is aligned.
-    """
-
-    record: int
-    rows: slice
-    whole: bool
-    rest: tuple[int, ...]
-    refit: tuple[int, ...]
-    window: slice
+    record: int  # number of the recording
+    rows: slice  # that are left out
+    whole: bool  # whether they are all of the recording
+    rest: tuple[int, ...]  # segments that effects are fitted on
+    refit: tuple[int, ...]  # segments that map and levels are fitted on, the effects given
+    window: slice  # rows in which the unit is aligned
 
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A model on one axis with everything but the starts of the part that is left out.
+    """A model on one axis with everything but the starts of the part that is left out."""
 
-    Attributes
-    ----------
-    cols, beta : (k,) arrays
-        Columns of map and effects, and their coefficients.
-    starts : (terms, R) array of int
-        Columns of the free terms' starts.
-    sd : (terms,) array
-        Their deviations.
-    a : (terms, R) array
-        The starts, as all recordings show them.
-    levels : (R,) array
-        Levels of the recordings, less map, effects and starts.
-    """
-
-    cols: Indices
-    beta: Array
-    starts: Indices
-    sd: Array
-    a: Array
-    levels: Array
+    cols: Indices  # (k,) columns of map and effects
+    beta: Array  # (k,) their coefficients
+    starts: Indices  # (terms, R) columns of the free terms' starts
+    sd: Array  # (terms,) their deviations
+    a: Array  # (terms, R) the starts, as all recordings show them
+    levels: Array  # (R,) of the recordings, less map, effects and starts
 
 
 def parts(columns: EffectRegressors) -> tuple[LeftOutPart, ...]:

@@ -20,8 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.identification.columns import EffectRegressors
-from driftlab.identification.normal_equations import Indices, NormalEquations, free_starts
+from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations, free_starts
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -41,45 +40,23 @@ Model = tuple[Term, ...]
 
 @dataclass(frozen=True)
 class AxisFit:
-    """A model fitted on one axis.
+    """A model fitted on one axis."""
 
-    Attributes
-    ----------
-    cols, beta : (k,) arrays
-        Columns and their coefficients.
-    equations : NormalEquations
-        Of the columns, ridges added.
-    sd : (terms,) array
-        Deviation of the starts of each term; 0 where it starts at equilibrium.
-    slow : float
-        Density of the residual at low frequencies, S.
-    cost : float
-        Sum of squares left, with what the ridge adds.
-    """
-
-    cols: Indices
-    beta: Array
-    equations: NormalEquations
-    sd: Array
-    slow: float
-    cost: float
+    cols: Indices  # (k,) columns
+    beta: Array  # (k,) their coefficients
+    equations: NormalEquations  # of the columns, ridges added
+    sd: Array  # (terms,) deviation of the starts of each term; 0 where it starts at equilibrium
+    slow: float  # density of the residual at low frequencies, S
+    cost: float  # sum of squares left, with what the ridge adds
 
 
 @dataclass
 class LeastSquares:
-    """Fits of models on one set of columns.
-
-    Attributes
-    ----------
-    smoothing : (d,) array
-        Weight of the map's penalty, of its curves' own.
-    colour : (d,) array
-        Density of the residual at low frequencies, over its mean square.
-    """
+    """Fits of models on one set of columns."""
 
     columns: EffectRegressors
-    smoothing: Array
-    colour: Array
+    smoothing: Array  # (d,) weight of the map's penalty, of its curves' own
+    colour: Array  # (d,) density of the residual at low frequencies, over its mean square
     _fits: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)
 
     def fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:

@@ -15,7 +15,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.identification.config_edit import the_map, with_host
 from driftlab.identification.cross_validation import level_prior
-from driftlab.identification.records import Evidence
+from driftlab.identification.records import Evidence, map_inputs
 from driftlab.identification.state import Search
 from driftlab.maps.fit import provenance
 from driftlab.soak.temperature import of_thermometer
@@ -29,38 +29,18 @@ ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperatur
 
 @dataclass(frozen=True)
 class Joint:
-    """A model fitted to all rows.
+    """A model fitted to all rows; all in SI."""
 
-    Attributes
-    ----------
-    effects : tuple of Effect
-        With their coefficients, standard deviations, domain, and how large an unknown start is.
-    sizes, sizes_sigma : (effects, d) arrays
-        Half of what each effect moves the bias by over all rows, and its standard deviation, SI.
-    curve, left : (n, d) arrays
-        The map's curve, and the residual, SI.
-    levels : (R, d) array
-        Of the recordings: rate less map, effects and starts, SI.
-    common : (d,) array
-        Level of the calibration, which is that of the map, SI.
-    walk : (d,) array
-        Density of the bias's walk, SI/sqrt(s).
-    repeatability : (d,) array, or None
-        Deviation of the level of one more recording, SI; None for a single one.
-    starts : bool
-        Whether an effect begins at an unknown start.
-    """
-
-    effects: tuple[Effect, ...]
-    sizes: Array
-    sizes_sigma: Array
-    curve: Array
-    left: Array
-    levels: Array
-    common: Array
-    walk: Array
-    repeatability: Array | None
-    starts: bool
+    effects: tuple[Effect, ...]  # with coefficients, standard deviations, domain, and how large an unknown start is
+    sizes: Array  # (effects, d) half of what each effect moves the bias by over all rows
+    sizes_sigma: Array  # (effects, d) its standard deviation
+    curve: Array  # (n, d) the map's
+    left: Array  # (n, d) residual
+    levels: Array  # (R, d) of the recordings: rate less map, effects and starts
+    common: Array  # (d,) level of the calibration, which is that of the map
+    walk: Array  # (d,) density of the bias's walk, SI/sqrt(s)
+    repeatability: Array | None  # (d,) deviation of the level of one more recording; None for a single one
+    starts: bool  # whether an effect begins at an unknown start
 
 
 def joint(search: Search) -> Joint:
@@ -177,7 +157,7 @@ def explained_map(search: Search, fit: Joint, declared: FittedMap, settings: The
     then. Those of the training alone are shifted to the level of the calibration.
     """
     evidence = search.evidence
-    T = evidence.rows(evidence.map_inputs([effect for effect in fit.effects if effect.acts_on_input]))
+    T = evidence.rows(map_inputs(evidence.chunks, fit.effects))
     bias = fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
         bias[rows] += level if record.calibration else fit.common

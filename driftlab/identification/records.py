@@ -41,28 +41,14 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Record:
-    """One recording in N means, and rows of them.
+    """One recording in N means, and rows of them."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the recording.
-    calibration, train : bool
-        Its roles; it may have both.
-    chunk : Chunk
-        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is without the
-        thermometer's steps; and the other channels.
-    starts : (n,) array of int
-        The first mean of each row.
-    ranges : mapping of str to (columns, 2) array
-        Smallest and largest value of each channel, update by update.
-    """
-
-    name: str
-    calibration: bool
-    train: bool
-    chunk: Chunk
-    starts: NDArray[np.int64]
+    name: str  # of the recording
+    calibration: bool  # whether it has this role
+    train: bool  # whether it has this one; it may have both
+    chunk: Chunk  # N means in SI; the sensor's channel (N, d) less the reference, `temperature` without steps
+    starts: NDArray[np.int64]  # (n,) the first mean of each row
+    # (columns, 2) smallest and largest value of each channel, update by update
     ranges: Mapping[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -84,33 +70,15 @@ class Record:
 
 @dataclass(frozen=True)
 class Evidence:
-    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at.
+    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at."""
 
-    Attributes
-    ----------
-    records : tuple of Record
-        The recordings, those of the calibration first.
-    channel : str
-        Of the tracked sensor.
-    axes : tuple of str
-        Its axes.
-    unit : BiasUnit
-        Of its bias.
-    interval : float
-        Of a row, s.
-    align : float
-        How long a unit is aligned, s.
-    noise : (d,) array or None
-        Declared white-noise density, SI/sqrt(Hz); None: as the model leaves it.
-    """
-
-    records: tuple[Record, ...]
-    channel: str
-    axes: tuple[str, ...]
-    unit: BiasUnit
-    interval: float
-    align: float
-    noise: Array | None = None
+    records: tuple[Record, ...]  # those of the calibration first
+    channel: str  # of the tracked sensor
+    axes: tuple[str, ...]  # of the sensor
+    unit: BiasUnit  # of its bias
+    interval: float  # of a row, s
+    align: float  # how long a unit is aligned, s
+    noise: Array | None = None  # (d,) declared density of white noise, SI/sqrt(Hz); None: as the model leaves it
 
     def __len__(self) -> int:
         return sum(len(record) for record in self.records)
@@ -127,7 +95,7 @@ class Evidence:
 
     def ends(self, channel: str) -> Array:
         """Return the range (columns, 2) of a channel in all recordings, SI."""
-        return _union([record.ends(channel) for record in self.records])
+        return _ends(np.hstack([record.ends(channel) for record in self.records]).T)
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -143,24 +111,25 @@ class Evidence:
         """Return the part of rows (n, ...) that is each recording's."""
         return [values[rows] for rows in self.slices]
 
-    def map_inputs(self, acting: Sequence[Effect]) -> list[Array]:
-        """Return the temperature that the map sees behind effects that act on its input, of each recording's means."""
-        inputs = []
-        for chunk in self.chunks:
-            for effect in acting:
-                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-            inputs.append(chunk["temperature"])
-        return inputs
+
+def map_inputs(chunks: Iterable[Chunk], effects: Iterable[Effect]) -> list[Array]:
+    """Return the temperature that the map sees of each recording behind effects, some of which act on its input."""
+    acting, inputs = [effect for effect in effects if effect.acts_on_input], []
+    for chunk in chunks:
+        for effect in acting:
+            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        inputs.append(chunk["temperature"])
+    return inputs
+
+
+def with_residuals(chunks: Sequence[Chunk], residuals: Sequence[Array]) -> list[Chunk]:
+    """Return recordings with their residuals (N, d) as channel `residual`, in its own deviation."""
+    spread = np.maximum(np.std(np.concatenate(residuals), axis=0), 1e-300)
+    return [chunk.having(residual=one / spread) for chunk, one in zip(chunks, residuals, strict=True)]
 
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:
-    """Run the declared model over the recordings, and return the readings at rest.
-
-    Raises
-    ------
-    DataError, ConfigError
-        If a recording cannot be used.
-    """
+    """Return readings at rest by the declared model; raises DataError or ConfigError if a recording cannot be used."""
     config = clamped(config)
     settings = config.filter
     assert settings is not None
@@ -224,7 +193,8 @@ def _at_rest(segments: Iterable[RunSegment], channel: str, ends: dict[str, Array
         if "temperature_raw" in channels:
             channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
         for name, values in {"temperature": np.zeros(1), **channels}.items():
-            ends[name] = _union([ends.get(name, _ends(values)), _ends(values)])
+            own = _ends(values)
+            ends[name] = _ends(np.hstack([ends.get(name, own), own]).T)
         channels = {k: v for k, v in channels.items() if k not in ("dt", "tau", "temperature_raw")}
         channels[channel] = segment.rate
         still = Chunk(rows.t, channels, previous, rows.sensors).where(segment.still)
@@ -237,12 +207,6 @@ def _ends(values: Array) -> Array:
     """Return the smallest and the largest value of each column (columns, 2)."""
     columns = values.reshape(len(values), -1)
     return np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
-
-
-def _union(ranges: Sequence[Array]) -> Array:
-    """Return the range (columns, 2) that holds all of some."""
-    each = np.stack(ranges)
-    return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=1)
 
 
 def _without(chunk: Chunk, name: str) -> Chunk:

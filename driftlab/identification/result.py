@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,45 +20,32 @@ from driftlab import __version__
 from driftlab.identification.acceptance import CHANCE, GAIN
 from driftlab.identification.diagnosis import MAX_NATS, Diagnosis, Finding, judge
 from driftlab.identification.model import Joint, joint
-from driftlab.identification.prediction_errors import LeftOut, check_length, left_out, rms
 from driftlab.identification.records import Evidence, Progress, missing_excitation
 from driftlab.identification.search import search
-from driftlab.identification.state import Search, Trial, name_of
+from driftlab.identification.state import LeftOut, Search, Trial, check_length, left_out, name_of, rms
 from driftlab.noise.local_level import falling
 from driftlab.soak.blocks import means, runs
-from driftlab.units import RATE, BiasUnit
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
+
+if TYPE_CHECKING:
+    from driftlab.evaluation.overview import Overview
+    from driftlab.filtering.segment import RunLog
 
 
 @dataclass(frozen=True)
 class Identification:
-    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout.
+    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout."""
 
-    Attributes
-    ----------
-    search : Search
-        The identified model, and the trials.
-    verdict : Diagnosis
-    left_out : tuple of LeftOut
-        Prediction errors of left-out parts without the effects and with them.
-    fit : Joint
-        The model fitted to all rows.
-    lines : tuple of str
-        The verdict in sentences.
-    outcomes : tuple of Outcome
-        Each holdout recording through both configs.
-    content : dict
-        That of `loop.json`.
-    """
-
-    search: Search
-    verdict: Diagnosis
-    left_out: tuple[LeftOut, ...]
-    fit: Joint
-    lines: tuple[str, ...]
-    outcomes: tuple[Outcome, ...] = ()
-    content: dict[str, Any] = field(default_factory=dict)
+    search: Search  # the identified model, and the trials
+    verdict: Diagnosis  # on it
+    left_out: tuple[LeftOut, ...]  # prediction errors of left-out parts without the effects and with them
+    fit: Joint  # the model fitted to all rows
+    lines: tuple[str, ...]  # the verdict in sentences
+    outcomes: tuple[Outcome, ...] = ()  # each holdout recording through both configs
+    change: ErrorChange | None = None  # of the prediction error over all of them
+    content: dict[str, Any] = field(default_factory=dict)  # that of `loop.json`
 
     @property
     def anything(self) -> bool:
@@ -73,7 +60,7 @@ class Identification:
     @property
     def worse(self) -> bool:
         """True if the holdout is predicted worse with the effects, by chance or beyond it."""
-        return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
+        return self.change is not None and self.change.after > self.change.before
 
 
 def investigate(
@@ -85,12 +72,8 @@ def investigate(
 ) -> Identification:
     """Find the effects that a model with this map (or none) and declared effects lacks on recordings.
 
-    Effects of the kinds `without` are not tried.
-
-    Raises
-    ------
-    EmptyRecording
-        If the recordings are too short to leave anything out.
+    Effects of the kinds `without` are not tried. Raises EmptyRecording if the recordings are too short to leave
+    anything out.
     """
     check_length(evidence)
     basis = None
@@ -116,9 +99,8 @@ def closed(
     first = sentence(change, outcomes)
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     lines = (*([first] if first else []), *identified.lines, *remarks)
-    whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), lines=lines)
-    content = {**as_json(whole, recordings), "holdout_change": asdict(change)}
-    return replace(whole, content=content)
+    whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
+    return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
 
 
 NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
@@ -130,7 +112,7 @@ SURE = 1.645  # deviations: one-sided, 95 %
 class Outcome:
     """One holdout recording through both configs: N times, d axes, SI.
 
-    `summaries` are those of the two runs, `remarks` what a user should know of the second.
+    `overviews` are of the two runs; log and remarks are of the second.
     """
 
     name: str
@@ -142,8 +124,9 @@ class Outcome:
     after: Array
     before_sigma: Array
     after_sigma: Array
-    summaries: tuple[dict[str, Any], dict[str, Any]]
-    remarks: tuple[str, ...]
+    overviews: tuple[Overview, Overview]
+    journal: RunLog
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -216,12 +199,12 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
     """Return the content of `loop.json`."""
     state, verdict = whole.search, whole.verdict
     before, after = rms(whole.left_out)
-    unit = state.evidence.unit.si
+    unit = state.evidence.unit
     return {
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
-        "unit": unit,
+        "unit": unit.si,
         "recordings": recordings,
         "effects": [_effect(whole.fit, finding, state.evidence) for finding in verdict.findings],
         "rejected": [
@@ -234,20 +217,15 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
             *({"kind": kind, "reason": f"broken: {reason}"} for kind, reason in state.broken.items()),
             *({"kind": kind, "reason": "not wanted"} for kind in sorted(state.without)),
         ],
-        "unexplained": [
-            {"channel": s.channel, "time_scale_s": s.time_scale, "description": s.description,
-             "log_likelihood_gain": s.gain, "threshold": s.threshold}
-            for s in verdict.left
-        ],
+        "unexplained": list(map(asdict, verdict.left)),
         "hidden": {},
-        "experiments": [
-            {"description": e.description, "separates": list(e.separates), "expected_gain_nats": e.gain}
-            for e in verdict.experiments
-        ],
+        "experiments": list(map(asdict, verdict.experiments)),
         "candidates_tried": state.tried,
         "left_out": {"before": before, "after": after},
-        "before": _errors([outcome.summaries[0] for outcome in whole.outcomes], unit),
-        "after": _errors([outcome.summaries[1] for outcome in whole.outcomes], unit),
+        **{
+            name: _errors([outcome.overviews[k] for outcome in whole.outcomes], unit)
+            for k, name in enumerate(("before", "after"))
+        },
     }  # fmt: skip
 
 
@@ -306,30 +284,22 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
+def _errors(overviews: Sequence[Overview], unit: BiasUnit) -> dict[str, Any]:
     """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values.
 
     Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
     """
-    key = BiasUnit(unit, unit).key
-
-    def rms(values: list[Any]) -> Any:
-        return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
-
-    d = len(figures(summaries[0], "filter_rmse")["whole"])
-    return {
-        key("coast_rmse"): rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
-        key("coast_sigma"): rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
-        key("filter_rmse"): rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
-        "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
-        "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),
+    scores = [overview.yardsticks for overview in overviews]
+    rms = {
+        "coast_rmse": [one.coast["to the end"] for one in scores],
+        "coast_sigma": [one.coast_sigma["to the end"] for one in scores],
+        "filter_rmse": [one.filter_whole for one in scores],
     }
-
-
-def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
-    errors: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
-    return errors
+    return {
+        **{unit.key(name): np.sqrt(np.mean(np.square(values), axis=0)) for name, values in rms.items()},
+        "nis": float(np.mean([overview.nis.mean for overview in overviews])),
+        "whiteness_p": float(min(np.min(one.whiteness_p[-len(one.bias) :]) for one in overviews)),
+    }
 
 
 def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
@@ -348,7 +318,7 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
+        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.expected_gain_nats)})")
     named = {name_of(finding.effect) for finding in verdict.findings}
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]

@@ -28,7 +28,6 @@ from driftlab.identification.candidates import candidates_of
 from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import MIN_ROWS, condition, parts
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term
-from driftlab.identification.prediction_errors import Errors, left_out_errors
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
@@ -133,7 +132,7 @@ def _merge(state: Search) -> None:
     if not own:
         return
     single = _best(tried(state, base, own))
-    two = replace(single, blocks=blocks_of(_left_out_errors(state, pair), state.axes))
+    two = replace(single, blocks=blocks_of(state.errors_of(pair), state.axes))
     as_well = single.evidence.fast and difference(single, two) <= uncertainty(single, two)
     if as_well and not does_not_carry_over(state, single):
         _remove(state, k)
@@ -148,13 +147,9 @@ def _drop(state: Search) -> None:
             state.fresh()
 
 
-def _left_out_errors(state: Search, model: Model) -> Errors:
-    return left_out_errors(state, [model] * len(state.left_out), state.noises_of(model))
-
-
 def _left_out_square(state: Search, model: Model) -> float:
     """Return the log of the sum of squares of a model's left-out errors, mean over the axes."""
-    blocks = blocks_of(_left_out_errors(state, model), state.axes)
+    blocks = blocks_of(state.errors_of(model), state.axes)
     return float(np.mean(np.log(np.maximum(blocks.sum(axis=1), 1e-300))))
 
 

@@ -1,8 +1,5 @@
 """Each family at its best beside the model so far: hyper-parameters, left-out errors, evidence.
 
-Those of a family are chosen by training error, anew for each part that is left out; with a memory, those of the
-memories in the model are chosen with it, since two memories found one after the other are not the best two.
-
 Hyper-parameters by training error: which of a family's candidates fits some segments best beside a base.
 
 With base columns B (map, levels, effects that stay) taken out once, the sum of squares that any candidate leaves is a
@@ -23,11 +20,9 @@ import numpy as np
 
 from driftlab.identification.acceptance import CandidateEvidence, accept, fast_evidence
 from driftlab.identification.candidates import Family, family_of
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, left_with_starts
 from driftlab.identification.least_squares import LeastSquares, Model, Term
-from driftlab.identification.normal_equations import left_with_starts
-from driftlab.identification.prediction_errors import Errors, left_out_errors
-from driftlab.identification.state import Search, Trial
+from driftlab.identification.state import Errors, Search, Trial
 from driftlab.noise.local_level import LocalLevel, effective
 from fusion_core.chunk import Array
 
@@ -70,7 +65,7 @@ def tried(search: Search, base: Model, families: dict[Family, list[Term]]) -> li
     for segments in {search.everything, *(part.rest for part in search.left_out)}:
         search.columns.gram(segments)
     tunings: dict[tuple[Model, tuple[int, ...]], Tuning] = {}
-    without = left_out_errors(search, [base] * len(search.left_out), search.noises)
+    without = search.left_out_errors([base] * len(search.left_out), search.noises)
 
     def work(terms: list[Term]) -> Trial:
         slots = [k for k, term in enumerate(base) if _retuned(search, term, terms[0])]
@@ -89,7 +84,7 @@ def tried(search: Search, base: Model, families: dict[Family, list[Term]]) -> li
         noises, ratio = search.noises_of(model), _in_sample(search, base, model)
         if ratio > WORTH:
             return _not_worth_it(search, base, model, noises, ratio)
-        errors = left_out_errors(search, [chosen(part.rest) for part in search.left_out], noises)
+        errors = search.left_out_errors([chosen(part.rest) for part in search.left_out], noises)
         return _trial(search, base, model, noises, without, errors)
 
     with ThreadPoolExecutor(cpu_count() or 1) as pool:

@@ -41,7 +41,7 @@ REACH = 0.45  # of an averaging time: differences nearer than that tell the same
 Sums = tuple[Array, Index, Index, Index]
 
 
-def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
+def factors(lengths: int | Index) -> Index:
     """Return the numbers m of samples to average over, evenly spread on a logarithmic scale.
 
     They go from 1 to a fifth of a single stretch; of several, `lengths` (S,), to the longest averaging time whose
@@ -54,7 +54,7 @@ def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
         long = ORDER * m <= N
         enough = int(n[long] @ (N[long] - 2 * m)) >= COVERED * m
         low, high = (m, high) if enough else (low, m - 1)
-    count = int(np.ceil(np.log10(low) * per_decade)) + 1
+    count = int(np.ceil(np.log10(low) * PER_DECADE)) + 1
     return np.unique(np.rint(np.geomspace(1, low, count)).astype(np.int64))
 
 
@@ -191,13 +191,7 @@ def spans(lengths: Index, missing: Index) -> Index:
 
     A gap is within a span where some interval around it has PRESENT of its samples. Such intervals cover a span at
     most twice, so it has at least 80 % of its samples: the time grid never is much longer than the recording.
-
-    Parameters
-    ----------
-    lengths : (S,) array of int
-        Samples of each stretch.
-    missing : (S - 1,) array of int
-        Samples lost behind each stretch but the last.
+    `lengths` (S,) are samples of each stretch, `missing` (S - 1,) those lost behind each but the last.
     """
     lost = np.minimum(missing, np.sum(lengths)) * PRESENT / (1 - PRESENT)
     after = np.cumsum(lengths - np.concatenate([[0.0], lost]))
@@ -228,16 +222,8 @@ def bridged(
 ) -> tuple[Array, Bridge]:
     """Return mean squares (J, 2) of the differences of means over m places, second and third, and their basis.
 
-    Parameters
-    ----------
-    stretches : (S, 2) array of int
-        First row of each stretch of `rate` (N,), and the row after its last.
-    missing : (S - 1,) array of int
-        Samples lost behind each stretch but the last.
-    parts : (P, 2) array of int
-        First stretch of each span, and the stretch after its last.
-    m, stride : (J,) arrays of int
-        Places to average over, and which overlaps are taken: m is a multiple.
+    Rates (N,), `stretches` (S, 2) and `missing` (S - 1,) are those of `curve`, `parts` (P, 2) those of `spans`; m (J,)
+    is a multiple of the `stride` (J,), which says which overlaps are taken.
     """
     lengths = np.diff(stretches, axis=1)[:, 0]
     whole = places(lengths, missing, parts)

@@ -33,33 +33,17 @@ LINES = 12  # lines of the periodogram that are bands of their own, from the low
 
 @dataclass(frozen=True)
 class Bridge:
-    """Basis of averaging times where gaps are bridged; of second differences, then of third ones.
+    """Basis of averaging times where gaps are bridged; of second differences, then of third ones."""
 
-    Attributes
-    ----------
-    stretches : (S,) array
-        Samples of each stretch without a gap.
-    gaps : (B,) array
-        Samples lost in each gap that is bridged.
-    differences : (2, J) array
-        How many differences count.
-    white, angle : (2, J) arrays
-        By how much the variance of white noise and of quantisation is larger than without lost samples.
-    part, square : (2, G, J) arrays
-        Of the differences of G groups of spans, the part that counts; and of the pairs of them that tell the same.
-    pieces, samples : (J,) arrays
-        Coverage of the differences: how many pieces without a gap that is not bridged, and their samples.
-    """
-
-    stretches: Index
-    gaps: Index
-    differences: Array
-    white: Array
-    angle: Array
-    part: Array
-    square: Array
-    pieces: Index
-    samples: Index
+    stretches: Index  # (S,) samples of each stretch without a gap
+    gaps: Index  # (B,) samples lost in each gap that is bridged
+    differences: Array  # (2, J) how many differences count
+    white: Array  # (2, J) factor on the variance of white noise, beside that without lost samples
+    angle: Array  # (2, J) the same of quantisation
+    part: Array  # (2, G, J) of the differences of G groups of spans, the part that counts
+    square: Array  # (2, G, J) the same of the pairs of them that tell the same
+    pieces: Index  # (J,) pieces without a gap that is not bridged, which the differences cover
+    samples: Index  # (J,) of these pieces
 
     def of(self, kept: NDArray[np.bool_]) -> Bridge:
         """Return the same for some of the averaging times, as `kept` (J,) says."""
@@ -119,27 +103,13 @@ class AllanCurve:
 
 @dataclass(frozen=True)
 class Class:
-    """Stretches of like length, and their contribution to the first L averaging times, which alone are short enough.
+    """Stretches of like length, and their contribution to the first L averaging times, which alone are short enough."""
 
-    Attributes
-    ----------
-    number : int
-        How many stretches.
-    share : (L,) array
-        Their part of all differences.
-    W : (p, L, F) array
-        How each frequency band contributes to each term. Zero for the ramp, which is no noise.
-    shape : (F,) array
-        Independent lines of the periodogram in each band, of all stretches.
-    power : (L,) array
-        By how much the ends of the stretches widen the scatter of long averaging times.
-    """
-
-    number: int
-    share: Array
-    W: Array
-    shape: Array
-    power: Array
+    number: int  # how many stretches
+    share: Array  # (L,) their part of all differences
+    W: Array  # (p, L, F) part of each frequency band in each term; zero for the ramp, which is no noise
+    shape: Array  # (F,) independent lines of the periodogram in each band, of all stretches
+    power: Array  # (L,) by how much the ends of the stretches widen the scatter of long averaging times
 
     def since(self, first: int) -> Class:
         """Return the same without the averaging times before number `first`."""
@@ -166,19 +136,11 @@ class Class:
 
 @dataclass(frozen=True)
 class Design:
-    """Shapes of the five terms on one kind of curve.
+    """Shapes of the five terms on one kind of curve."""
 
-    Attributes
-    ----------
-    A : (J, p) array
-        Variance of each term at coefficient one.
-    classes : tuple of Class
-        How stretches of like lengths contribute to it; their W sum to A over the bands and the classes.
-    """
-
-    tau: Array
-    A: Array
-    classes: tuple[Class, ...]
+    tau: Array  # (J,) averaging times, s
+    A: Array  # (J, p) variance of each term at coefficient one
+    classes: tuple[Class, ...]  # stretches of like lengths; their W sum to A over the bands and the classes
 
     @cached_property
     def variates(self) -> list[Array]:

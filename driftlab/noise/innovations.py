@@ -61,10 +61,7 @@ class SensorReadings:
 def inflation(readings: SensorReadings, noise: Array, walk: Array) -> Inflation:
     """Return the factors on white noise and walk, both (d,) and declared in unit/sqrt(Hz) and unit/sqrt(s).
 
-    Raises
-    ------
-    SingularFit
-        If fewer than MIN_UPDATES updates count, or a declared density is zero.
+    Raises SingularFit if fewer than MIN_UPDATES updates count, or a declared density is zero.
     """
     count = int(np.sum(np.all(np.isfinite(readings.d), axis=1)))
     if count < MIN_UPDATES:

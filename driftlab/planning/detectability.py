@@ -20,9 +20,9 @@ import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, CandidateEvidence, accept, matched, nats_of
 from driftlab.identification.candidates import candidates_of
+from driftlab.identification.columns import Indices
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import Model, Term
-from driftlab.identification.normal_equations import Indices
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
 from driftlab.noise.local_level import effective, one_step

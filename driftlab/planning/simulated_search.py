@@ -20,10 +20,9 @@ from itertools import pairwise
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.columns import EffectRegressors, NormalEquations
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.least_squares import LeastSquares
-from driftlab.identification.normal_equations import NormalEquations
 from driftlab.identification.records import Evidence, Record, lengths
 from driftlab.identification.state import Search
 from driftlab.noise.local_level import LocalLevel, one_step

@@ -36,7 +36,7 @@ from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 
-NOTHING = SharedEffects("nothing_common", (), (), 0, 0, 0)
+NOTHING = SharedEffects()
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, Sh
         family.information_of(next(iter(store))[0])
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
-    return family, NOTHING if family.common_effects is None else SharedEffects.from_json(family.common_effects)
+    return family, NOTHING if family.common_effects is None else SharedEffects.model_validate(family.common_effects)
 
 
 def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:

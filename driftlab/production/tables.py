@@ -58,7 +58,7 @@ def write_fleet(
     """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
-        common = analysis.common.as_json() if analysis.common.effects else None
+        common = analysis.common.model_dump(mode="json") if analysis.common.effects else None
         save_family(
             folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
             odd_lots=[lot.sentence for lot in analysis.lots],

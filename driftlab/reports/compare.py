@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.evaluation.comparison import Columns, Comparison, notes, paper, verdict
+from driftlab.evaluation.comparison import TO_THE_END, Columns, Comparison, notes, paper, ranking, verdict
 from driftlab.evaluation.overview import thin
-from driftlab.evaluation.ranking import TO_THE_END, ranking
 from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
 from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
 from driftlab.reports import charts

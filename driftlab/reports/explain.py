@@ -9,22 +9,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.evaluation.overview import thin
+from driftlab.evaluation.summary import Rows, error_rows
 from driftlab.identification.acceptance import CHANCE, FAST, SLOW
 from driftlab.identification.diagnosis import Diagnosis
-from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Identification, Outcome, described, parameters, size
-from driftlab.identification.result import figures as errors_of
-from driftlab.identification.state import name_of
+from driftlab.identification.state import LeftOut, name_of, to_show
 from driftlab.reports import charts
-from driftlab.reports.charts import Chart, Clock, Line, Panel, Shade
+from driftlab.reports.charts import Chart, Clock, Line, Panel
 from driftlab.reports.pages import write_page
 from driftlab.reports.provenance import Sheet
+from driftlab.reports.run import event_shades
 from driftlab.reports.tables import error_table
 from driftlab.units import RATE, BiasUnit, formatted
 from fusion_core.chunk import Array
@@ -55,28 +55,9 @@ def tables(closed: Identification) -> list[Table]:
     ]
 
 
-def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
+def _rows(outcome: Outcome) -> Rows:
     """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
-
-    def errors(key: str, name: str) -> list[Array]:
-        return [np.asarray(errors_of(summary, key)[name], dtype=float) for summary in outcome.summaries]
-
-    rows = []
-    for name in reversed(errors_of(outcome.summaries[0], "coast_rmse")):
-        rows.append((f"coast, {name}", errors("coast_rmse", name)))
-        rows.append(("  its sigma", errors("coast_sigma", name)))
-    return [*rows, ("filter, all", errors("filter_rmse", "whole"))]
-
-
-@dataclass(frozen=True)
-class Holdout:
-    """The part of the page on one holdout recording."""
-
-    name: str
-    decisive: str
-    rows: list[tuple[str, list[str], list[str], str]]
-    prediction: Chart
-    loop: Chart | None
+    return error_rows([overview.yardsticks for overview in outcome.overviews])
 
 
 def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:
@@ -88,35 +69,29 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
     write_page(
         path,
         "explain",
+        closed=closed,
         word=verdict.word.replace("_", " "),
         outcome="unknown" if worse else OUTCOME[verdict.word],
         meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
-        lines=closed.lines,
-        axes=axes,
         unit=unit.shown,
-        channel=evidence.channel,
         known="Earth rate" if unit == RATE else "its known input",
         effects=[(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
         parameters=parameters,
         name_of=name_of,
-        holdouts=[_holdout(o, axes) for o in closed.outcomes],
+        holdouts=[(Path(outcome.name).name, outcome) for outcome in closed.outcomes],
+        decisive=_decisive,
+        cells=_cells,
+        prediction_chart=prediction_chart,
+        loop_chart=loop_chart,
         taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
         bars=bars(verdict),
         needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
         rejected=[(trial, _percent(float(np.sqrt(trial.evidence.ratio)))) for trial in verdict.rejected],
         described=described,
         chance=CHANCE,
-        left=verdict.left,
-        experiments=verdict.experiments,
-        tried=closed.search.tried,
         sheet=sheet,
         config=config,
     )
-
-
-def _holdout(outcome: Outcome, axes: Sequence[str]) -> Holdout:
-    loop = None if outcome.temperature is None else loop_chart(outcome, axes)
-    return Holdout(Path(outcome.name).name, _decisive(outcome), _cells(outcome), prediction_chart(outcome, axes), loop)
 
 
 def _decisive(outcome: Outcome) -> str:
@@ -179,8 +154,8 @@ STRETCHES = 600  # of an error, whose smallest and largest value are drawn
 def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     """Return the measured and the predicted bias of each axis, before and after, the errors below, and temperature."""
     rows, factor, unit = thin(len(outcome.t)), outcome.unit.factor, outcome.unit.shown
-    clock = Clock(outcome.summaries[0]["t"]["first_row_s"], float(outcome.t[-1]))
-    t, shades = clock(outcome.t), _shades(outcome.summaries[1], clock)
+    clock = Clock(outcome.overviews[0].first_row, float(outcome.t[-1]))
+    t, shades = clock(outcome.t), event_shades(outcome.journal, clock, "refused, after")
 
     def biases(k: int) -> Iterator[Line]:
         yield Line(t[rows], outcome.reference[rows, k] * factor, "measured", "reference")
@@ -199,15 +174,6 @@ def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     if outcome.temperature is not None:
         panels.append(charts.temperature_panel(t[rows], outcome.temperature[rows], shades, height=0.7))
     return Chart(tuple(panels), clock.label, "Measured and predicted, before and after")
-
-
-def _shades(summary: dict[str, Any], clock: Clock) -> tuple[Shade, ...]:
-    """Return the spans in which the unit moved, or the filter of the new config refused measurements."""
-    dt = summary.get("updates", {}).get("interval_s", 0.0)
-    return (
-        *charts.span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),
-        *charts.span_shades(summary.get("motion_s", ()), clock, "moved", "moving", dt),
-    )
 
 
 def _sides(outcome: Outcome) -> Iterator[tuple[str, Array, Array, str]]:

@@ -126,11 +126,11 @@ def bias_chart(
     return Chart(panels, clock.label, f"Bias of the {sensor.channel}")
 
 
-def event_shades(journal: RunLog, clock: Clock) -> tuple[Shade, ...]:
+def event_shades(journal: RunLog, clock: Clock, refused: str = "refused") -> tuple[Shade, ...]:
     """Return the spans in which the filter refused measurements, or the unit moved."""
     dt = journal.alignments[0].dt
     return (
-        *charts.span_shades(journal.refused.spans, clock, "refused", "refused", dt),
+        *charts.span_shades(journal.refused.spans, clock, refused, "refused", dt),
         *charts.span_shades(journal.moving.spans, clock, "moved", "moving", dt),
     )
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from driftlab.config import Limits
-from driftlab.evaluation.bias_instability import Averages
 from driftlab.evaluation.limits import SIDE, check_limits, outcome, verdict
-from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
+from driftlab.evaluation.measurements import Averages, of_alignment, of_coast, of_map
 from driftlab.evaluation.scores import score
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk

@@ -24,4 +24,4 @@ def test_what_is_left_is_noise_or_is_not():
             into.append(structures(found, np.full(3, 3e-6)))
     assert quiet == [[]] * 5
     assert all(any("jumps" in s.description for s in seen) for seen in jumping)
-    assert all(s.gain > s.threshold for seen in jumping for s in seen)
+    assert all(s.log_likelihood_gain > s.threshold for seen in jumping for s in seen)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from driftlab.filtering.segment import RunLog
 from driftlab.identification.result import Outcome, change_of, sentence
 from driftlab.units import BiasUnit
 
@@ -10,7 +11,7 @@ def outcome(e, s, name="holdout.h5"):
     """Return what is predicted with errors e (n, d) before, changed by s (n, d)."""
     t, reference = 10.0 * np.arange(len(e)), np.zeros_like(e)
     sigma = np.ones_like(e)
-    return Outcome(name, BiasUnit("rad/s", "deg/h"), t, None, reference, e, e + s, sigma, sigma, ({}, {}), ())
+    return Outcome(name, BiasUnit("rad/s", "deg/h"), t, None, reference, e, e + s, sigma, sigma, (), RunLog())
 
 
 def drawn(seed, slow):

@@ -7,7 +7,7 @@ from sensors_at_rest import DT, simulated
 from driftlab.noise.allan import curve, places, spans
 from driftlab.noise.allan_fit import fit
 from driftlab.noise.allan_model import KEYS, design
-from driftlab.noise.stretches import NEVER, pieces
+from driftlab.noise.recording import NEVER, pieces
 
 WHITE, WALK = KEYS.index("white"), KEYS.index("rate_random_walk")
 

@@ -9,7 +9,7 @@ from families_at_rest import effect_of
 
 from driftlab.family.basis import STEP
 from driftlab.family.parallel import serial
-from driftlab.family.shared_effect import EffectDistribution, SharedEffect
+from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import UnitSpool
@@ -72,13 +72,13 @@ def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
 
 
 def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
-    law = EffectDistribution(mean=np.full((3, 1), 2.0), sigma=np.full((3, 1), 0.01), spread=np.full((3, 1), 0.1))
     effect = effect_of("hysteresis", width=1.0)
     shared = SharedEffect(
-        law=law, effect=effect, unit="rad/s/K", evidence=9, of_mean=9, of_size=9, price=5, left_out=1.0,
+        mean=np.full((3, 1), 2.0), sigma=np.full((3, 1), 0.01), spread=np.full((3, 1), 0.1), effect=effect,
+        unit="rad/s/K", evidence=9, of_mean=9, of_size=9, price=5, left_out=1.0,
         in_other_lots=None, indistinguishable_from=(),
     )  # fmt: skip
-    common = SharedEffects("explained", (shared,), (), 1, COUNT, COUNT)
+    common = SharedEffects(verdict="explained", effects=(shared,), tried=1, units=COUNT, searched=COUNT)
     expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept]
     with UnitSpool(kept, common, serial, whole=(2, 5)) as units:
         assert len(units) == COUNT

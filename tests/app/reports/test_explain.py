@@ -1,37 +1,42 @@
 """The report of a loop is in the unit of the sensor that it is about."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from driftlab.identification.result import Outcome, figures
+from driftlab.evaluation.scores import HORIZONS, Scores
+from driftlab.filtering.segment import RunLog
+from driftlab.identification.result import Outcome
 from driftlab.reports.explain import _cells, _decisive, prediction_chart
 from driftlab.units import BiasUnit
 
 
-def outcome(unit, suffix, value):
+def outcome(unit, value):
     """Return one of a single axis, whose errors halve."""
     t = np.arange(200.0)
     curve = np.full((200, 1), value)
-    before, after = (
-        {
-            "t": {"first_row_s": 0.0},
-            f"coast_rmse{suffix}": {"to the end": [size]},
-            f"coast_sigma{suffix}": {"to the end": [size]},
-            f"filter_rmse{suffix}": {"whole": [size]},
-        }
-        for size in (value, value / 2)
-    )
-    return Outcome("day.h5", unit, t, None, curve, curve, curve, curve, curve, (before, after), ())
+    errors = [np.array([size]) for size in (value, value / 2)]
+    overviews = tuple(SimpleNamespace(first_row=0.0, yardsticks=scores(one)) for one in errors)
+    journal = RunLog(alignments=[SimpleNamespace(dt=1.0)])
+    return Outcome("day.h5", unit, t, None, curve, curve, curve, curve, curve, overviews, journal)
 
 
-RATE = outcome(BiasUnit("rad/s", "deg/h"), "_rad_s", np.deg2rad(3.0) / 3600)
-HELD = outcome(BiasUnit("1", "ppm"), "", 3e-6)
+def scores(error):
+    """Return those of errors (1,) over every horizon, and of a deviation as large."""
+    each = dict.fromkeys(HORIZONS, error)
+    return Scores(("x",), error, error, each, each, {}, {}, 0.0)
+
+
+RATE = outcome(BiasUnit("rad/s", "deg/h"), np.deg2rad(3.0) / 3600)
+HELD = outcome(BiasUnit("1", "ppm"), 3e-6)
 
 
 @pytest.mark.parametrize("found", [RATE, HELD], ids=["deg/h", "ppm"])
 def test_errors_are_shown_in_the_sensors_unit(found):
     rows = _cells(found)
-    assert [row[0] for row in rows] == ["coast, to the end", "  its sigma", "filter, all"]
+    assert [row[0] for row in rows][:2] == ["coast, to the end", "  its sigma"]
+    assert [row[0] for row in rows][-2:] == ["bias, all", "bias, first 30 s"]
     for label, before, after, change in rows:
         assert (float(before[0]), float(after[0])) == (3.0, 1.5)
         assert change == ("" if label.startswith(" ") else "-50")
@@ -40,11 +45,6 @@ def test_errors_are_shown_in_the_sensors_unit(found):
 def test_the_decisive_sentence_says_what_the_change_does():
     assert _decisive(RATE) == "the error of the prediction to the end falls by 50 %: 3 to 1.5 deg/h rms"
     assert "falls by 50 %: 3 to 1.5 ppm rms" in _decisive(HELD)
-
-
-def test_errors_of_a_summary_are_found_by_either_name():
-    assert figures(RATE.summaries[0], "coast_rmse")["to the end"] == [np.deg2rad(3.0) / 3600]
-    assert figures(HELD.summaries[0], "coast_rmse")["to the end"] == [3e-6]
 
 
 @pytest.mark.parametrize(("found", "unit"), [(RATE, "deg/h"), (HELD, "ppm")])

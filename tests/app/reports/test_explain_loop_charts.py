@@ -1,18 +1,19 @@
 """Figures of the loop: their content, and that a browser and matplotlib draw it."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browsers import colours, overflow
 
+from driftlab.filtering.segment import RunLog
 from driftlab.identification.acceptance import FAST, SLOW, CandidateEvidence
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.diagnosis import Diagnosis, Finding
 from driftlab.identification.least_squares import Term
-from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Outcome
-from driftlab.identification.state import Trial, name_of
+from driftlab.identification.state import LeftOut, Trial, name_of, to_show
 from driftlab.reports.explain import MAX_RATIO, NEEDED, bars, left_out_chart, loop_chart, prediction_chart
 from driftlab.reports.figures import figure_of
 from driftlab.units import BiasUnit
@@ -22,7 +23,7 @@ from fusion_plugins.effects.interaction import Interaction
 AXES = ("x", "y", "z")
 RATE = BiasUnit("rad/s", "deg/h")
 DEG_H = np.rad2deg(3600.0)
-FIRST = {"t": {"first_row_s": 0.0}}
+FIRST = SimpleNamespace(first_row=0.0)
 
 
 def trial(effect, ratio):
@@ -57,7 +58,8 @@ def outcome(d=3, n=500, temperature=True):
     curves = [rng.normal(size=(n, d)) * 1e-5 for _ in range(3)]
     sigma = np.full((n, d), 1e-6)
     T = 20 + np.sin(t / 500) if temperature else None
-    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), ())
+    journal = RunLog(alignments=[SimpleNamespace(dt=10.0)])
+    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), journal)
 
 
 def test_bias_and_error_of_each_axis_are_drawn_with_two_deviations():
@@ -84,8 +86,9 @@ def test_no_spike_of_an_error_is_left_out():
 
 
 def test_what_was_refused_and_what_moved_are_shaded():
-    summary = FIRST | {"refused_s": [[600.0, 700.0]], "motion_s": [[1200.0, 1300.0]], "updates": {"interval_s": 10.0}}
-    shown = replace(outcome(), summaries=(FIRST, summary))
+    shown = outcome()
+    shown.journal.refused.spans.append((600.0, 700.0))
+    shown.journal.moving.spans.append((1200.0, 1300.0))
     chart = prediction_chart(shown, AXES)
     assert chart.label.endswith("[min]")
     for panel in chart.panels:
@@ -132,20 +135,22 @@ def test_the_errors_of_what_was_left_out_are_drawn(parts):
 
 
 def test_a_page_shows_charts_and_bars_on_a_phone(tmp_path, opened):
-    from driftlab.reports.explain import Holdout
     from driftlab.reports.pages import write_page
     from driftlab.reports.provenance import Sheet
 
     shown = outcome()
     sheet = Sheet("SN 7", "2026-11-22", "page", "c.yaml", "0" * 64, [], {}, [], [], [], "")
     row = ("coast, to the end", ["3"] * 3, ["1"] * 3, "-67")
-    held = Holdout("day.h5", "it falls", [row], prediction_chart(shown, AXES), loop_chart(shown, AXES))
     found = verdict(20)
+    evidence = SimpleNamespace(axes=AXES, channel="gyro")
+    search = SimpleNamespace(tried=20, evidence=evidence)
+    closed = SimpleNamespace(lines=[], search=search, verdict=SimpleNamespace(left=[], experiments=[]))
     write_page(
-        tmp_path / "report.html", "explain", word="explained", outcome="pass", meaning="", lines=[], axes=AXES,
-        unit="deg/h", channel="gyro", known="Earth rate", effects=[], holdouts=[held], taught=[], bars=bars(found),
-        needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], left=[], experiments=[],
-        tried=20, sheet=sheet, config="a: b",
+        tmp_path / "report.html", "explain", closed=closed, word="explained", outcome="pass", meaning="",
+        unit="deg/h", known="Earth rate", effects=[], holdouts=[("day.h5", shown)], taught=[], bars=bars(found),
+        needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], sheet=sheet,
+        config="a: b", decisive=lambda outcome: "it falls", cells=lambda outcome: [row],
+        prediction_chart=prediction_chart, loop_chart=loop_chart,
     )  # fmt: skip
     for dark in (False, True):
         page = opened(tmp_path / "report.html", width=390, dark=dark)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.identification.normal_equations import NormalEquations, free_starts, left_with_starts
+from driftlab.identification.columns import NormalEquations, free_starts, left_with_starts
 
 
 def problem(seed=0, n=200, k=6):

@@ -3,7 +3,7 @@
 from rows_at_rest import PLAY, SLIP, VOLTAGE, evidence, known, search_of
 from third_parties import effect, registry_of
 
-from driftlab.identification.experiment_design import Question, propose
+from driftlab.identification.diagnosis import Question, propose
 from driftlab.identification.least_squares import Term
 from driftlab.identification.trials import AS_GOOD
 
@@ -16,7 +16,7 @@ def test_what_differs_is_told_apart_and_the_same_is_not_asked():
     never = Question((PLAYS, MOVES), (MOVES, PLAYS), ("one", "the same"))
     (proposed,) = propose(found, [asked, never])
     assert proposed.separates == ("hysteresis", "relaxation")
-    assert proposed.gain > AS_GOOD
+    assert proposed.expected_gain_nats > AS_GOOD
 
 
 def test_a_recording_that_an_effect_has_no_answer_to_tells_nothing():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.noise.stretches import NEVER, RestWindows, limits, pieces
+from driftlab.noise.recording import NEVER, RestWindows, limits, pieces
 
 
 def times(*spans):

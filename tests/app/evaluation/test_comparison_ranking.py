@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from driftlab.evaluation.ranking import ranking, verdict
+from driftlab.evaluation.comparison import coast_verdict, ranking
 from driftlab.evaluation.scores import HORIZONS, Scores
 from driftlab.units import RATE, BiasUnit
 
@@ -30,7 +30,7 @@ def coasting(error, sigma=5.0, axes="xyz", unit=DEG_H):
 
 
 def of(runs, span=2400.0, unit=RATE):
-    return verdict(runs, unit, span)
+    return coast_verdict(runs, unit, span)
 
 
 def test_the_best_is_named_with_its_error_whatever_the_order():
