@@ -14,7 +14,7 @@ import json, planted, run
 from rich.console import Console
 if __name__ == "__main__":
     out = run.Path({out!r})
-    line = planted.make(out / "line", 20, 1 / 3, fresh=4)
+    line = planted.make(out / "line", 14, 1 / 3, fresh=4)
     found = run.prove(line, out, Console(stderr=True, width=200))
     print(json.dumps([sorted(found.odd), line.odd, {{k: v.tolist() for k, v in found.errors.items()}}, found.held]))
 """

@@ -5,9 +5,9 @@ last name that is mentioned before it; recordings that a page does not make are 
 """
 
 import json
-import os
 import re
 import shlex
+from contextlib import chdir
 from pathlib import Path
 
 import dataflash_writer
@@ -17,6 +17,7 @@ import numpy as np
 import planted
 import pytest
 import ulog_writer
+from command_line import driftlab
 from other_formats import write_formats
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
@@ -111,13 +112,8 @@ def write_logs(path, unit):
 
 
 def run_in(folder, *args):
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        done = CliRunner().invoke(app, list(args))
-    finally:
-        os.chdir(before)
-    assert done.exit_code == 0, f"driftlab {shlex.join(args)}: {done.exception or done.output}"
+    done = driftlab(*args, cwd=folder)
+    assert done.returncode == 0, f"driftlab {shlex.join(args)}: {done.stderr}"
 
 
 def with_commands():
@@ -140,12 +136,8 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
         elif kind == "python" and "Save this as" in before:
             for made in re.findall(r'record\("(\S+?)"', text):
                 (tmp_path / made).unlink(missing_ok=True)
-            here = Path.cwd()
-            os.chdir(tmp_path)
-            try:
+            with chdir(tmp_path):
                 exec(compile(text, page.name, "exec"), {})
-            finally:
-                os.chdir(here)
         elif kind == "shell":
             for command in commands(text):
                 if command not in ELSEWHERE:
