@@ -3,8 +3,6 @@
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.chunk import Chunk, concatenate
@@ -19,7 +17,7 @@ def whole(source, size=100):
     return concatenate(source.chunks(size, Faults()))
 
 
-@given(st.integers(1, 12))
+@pytest.mark.parametrize("size", range(1, 13))
 def test_any_size_of_chunk_gives_the_same_samples(size):
     parts = list(in_memory_name(DATA).chunks(size, Faults()))
     assert max(map(len, parts)) <= size
