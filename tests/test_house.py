@@ -272,7 +272,7 @@ BUDGET = {
     "plugins/exporters": 1507,
     "plugins/framings": 571,
     "plugins/measurement_models": 690,
-    "plugins/sources": 4725,
+    "plugins/sources": 4720,
     "plugins/thermal_maps": 839,
 }
 """Lines of code a room may have: neither blank, nor comment, nor docstring. A change may lower them."""

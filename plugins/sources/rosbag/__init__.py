@@ -378,9 +378,9 @@ def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
     if first.startswith(sqlite.SIGNATURE):
         return sqlite.Sqlite(path, faults)
     if first.startswith(ros1.SIGNATURE):
-        return ros1.Ros1(path, faults)
+        return ros1.Ros1(path, stack.enter_context(path.open("rb")), faults)
     if first.startswith(mcap.SIGNATURE):
-        return mcap.Mcap(path, faults)
+        return mcap.Mcap(path, stack.enter_context(path.open("rb")), faults)
     if first.startswith(b"#ROSBAG V"):
         version = first.partition(b"\n")[0].decode("latin-1")
         raise UnreadableFile(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Set
 from pathlib import Path
-from typing import ClassVar
+from typing import BinaryIO, ClassVar
 from zlib import crc32
 
 from fusion_core.budget import LISTED, PIECE, TEXTS, check_count, check_size, size_of
@@ -38,11 +38,11 @@ class Mcap(storage.ChunkedFile):
 
     repair: ClassVar[str] = REPAIR
 
-    def __init__(self, path: Path, faults: Faults) -> None:
+    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
         self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
         self._counts: dict[int, int] = {}
-        super().__init__(path, faults)
+        super().__init__(path, file, faults)
 
     def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
@@ -55,16 +55,17 @@ class Mcap(storage.ChunkedFile):
 
     def _indexed(self) -> bool:
         end = self.size - HEAD.size - 20 - len(SIGNATURE)
-        if end < len(SIGNATURE) or HEAD.unpack_from(self.data, end) != (FOOTER, 20):
+        footer = self.data[max(end, 0) :]
+        if end < len(SIGNATURE) or HEAD.unpack_from(footer) != (FOOTER, 20):
             return False
-        at = struct.unpack_from("<Q", self.data, end + HEAD.size)[0]
-        if self.data[-len(SIGNATURE) :] != SIGNATURE or not 0 < at < self.size:
+        at = struct.unpack_from("<Q", footer, HEAD.size)[0]
+        if not footer.endswith(SIGNATURE) or not 0 < at < self.size:
             return False
         check_size(self.path, "the summary", end - at, PIECE)
         declared = None
         try:
             while at < end:
-                op, length = HEAD.unpack_from(self.data, at)
+                op, length = self._head(at)
                 begin, at = at + HEAD.size, at + HEAD.size + length
                 content = self.data[begin : min(at, end)]
                 self.clock.tick()
@@ -116,7 +117,7 @@ class Mcap(storage.ChunkedFile):
         at, op = len(SIGNATURE), 0
         while at + HEAD.size <= self.size and op not in (END, FOOTER):
             self.clock.tick()
-            op, length = HEAD.unpack_from(self.data, at)
+            op, length = self._head(at)
             end = at + HEAD.size + length
             if op == MESSAGE:
                 end = self._loose(at)
@@ -135,13 +136,18 @@ class Mcap(storage.ChunkedFile):
             self.faults.add(f"file that was not closed, read without its summary; {REPAIR}", 1, f"in {self.path.name}")
             self._lose(self.size - at, f"at byte {at}")
 
+    def _head(self, at: int) -> tuple[int, int]:
+        """Return type and length of the record at an offset."""
+        op, length = HEAD.unpack(self.data[at : at + HEAD.size])
+        return op, length
+
     def _loose(self, at: int) -> int:
         """Keep messages that stand outside chunks, from an offset on; return where they end."""
         end = at
-        while end + STAMPED.size <= self.size and self.data[end] == MESSAGE:
-            length = HEAD.unpack_from(self.data, end)[1]
+        while end + STAMPED.size <= self.size:
+            op, length = self._head(end)
             step = end + HEAD.size + length
-            if step > self.size or (end > at and step > at + READ):
+            if op != MESSAGE or step > self.size or (end > at and step > at + READ):
                 break
             check_size(self.path, f"the message at byte {end}", length, LISTED)
             end = step

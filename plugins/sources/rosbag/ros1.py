@@ -15,10 +15,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Set
-from mmap import mmap
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
@@ -41,10 +40,10 @@ class Ros1(storage.ChunkedFile):
 
     repair: ClassVar[str] = REPAIR
 
-    def __init__(self, path: Path, faults: Faults) -> None:
+    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
         self._raw: dict[int, tuple[bytes, bytes]] = {}  # of each connection: topic, and the fields of its data
         self._form = _HeaderLayout(b"")
-        super().__init__(path, faults)
+        super().__init__(path, file, faults)
 
     def count(self, connection: int) -> int:
         """Return the number of messages of a connection."""
@@ -211,10 +210,10 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def _record(data: bytes | mmap, at: int) -> tuple[dict[bytes, bytes], int, int]:
+def _record(data: bytes | storage.FileBytes, at: int) -> tuple[dict[bytes, bytes], int, int]:
     """Return the header of a record, and where its data begins and ends, which may be behind the end of all."""
-    length = storage.U32.unpack_from(data, at)[0]
+    length = storage.U32.unpack(data[at : at + 4])[0]
     if length > LONGEST:
         raise ValueError("no record")
     begin = at + 8 + length
-    return _fields(data[at + 4 : begin - 4]), begin, begin + storage.U32.unpack_from(data, begin - 4)[0]
+    return _fields(data[at + 4 : begin - 4]), begin, begin + storage.U32.unpack(data[begin - 4 : begin])[0]

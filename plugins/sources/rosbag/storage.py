@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import struct
 import sys
 from abc import ABC, abstractmethod
@@ -10,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,16 +80,26 @@ class Piece(NamedTuple):
     chunk: bool = True
 
 
+class FileBytes:
+    """The bytes of an open file by slices, as far as they are there; a file of any size takes no memory."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.size = file, file.seek(0, 2)
+
+    def __getitem__(self, part: slice) -> bytes:
+        begin, end, _ = part.indices(self.size)
+        self.file.seek(begin)
+        return self.file.read(max(end - begin, 0))
+
+
 class ChunkedFile(ABC):
     """An open bag file of chunks, with an index that one which was not closed lacks: it is then walked over."""
 
     repair: ClassVar[str]
 
-    def __init__(self, path: Path, faults: Faults) -> None:
-        self.path, self.faults = path, faults
-        with path.open("rb") as file:
-            self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        self.size = len(self.data)
+    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
+        self.path, self.data, self.faults = path, FileBytes(file), faults
+        self.size = self.data.size
         self.pieces: list[Piece] = []
         self._texts = 0  # bytes of definitions and topics
         self._told: set[str] = set()  # places whose losses were reported
@@ -148,9 +157,7 @@ class ChunkedFile(ABC):
     def _stored(self, what: str, begin: int, end: int) -> bytes:
         """Return bytes of the file as far as they are there; raises UnreadableFile beyond the budget."""
         check_size(self.path, what, min(end, self.size) - begin, LISTED)
-        data = self.data[begin:end]
-        self.data.madvise(mmap.MADV_DONTNEED)  # what was copied needs no memory twice
-        return data
+        return self.data[begin:end]
 
     def _add_text(self, count: int, what: str) -> None:
         self._texts += count
