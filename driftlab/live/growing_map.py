@@ -70,7 +70,6 @@ class GrowingMap:
                                 axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
         self.faults = Faults()
         self.blocks, self.used = GrowingSoak(MAX_BLOCKS), Used()
-        self.fitted: FittedMap | None = None
         self._soak: GatheredSoak | None = None  # of the last fit
         self._readings, self._each = np.empty(0), 1  # every how many-th temperature
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
@@ -187,11 +186,11 @@ class GrowingMap:
             within = self.blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
             update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
         self._soak = soak
-        return replace(fitted, record=fitted.record.model_copy(update=update))
+        return fitted.noting(**update)
 
     def _publish(self, fitted: FittedMap) -> None:
         assert self._soak is not None, "the map was fitted on it"
-        self.fitted, memory = fitted, memory_of(self._soak.brief())
+        memory = memory_of(self._soak.brief())
         self.status = with_curve(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
         self.publish(self.status)
 

@@ -123,11 +123,6 @@ class LiveHistory:
         self._waiting: deque[RunSegment] = deque()  # the run appends while another thread takes
         self._nis, self._made = np.empty(0), -PERIOD
 
-    @property
-    def ended(self) -> bool:
-        """True if the run has ended."""
-        return self.fixed["ended"] is not None
-
     def seen(self, stretch: RunSegment) -> None:
         """Take the next stretch."""
         self._waiting.append(stretch)

@@ -16,7 +16,7 @@ Placements of a unit: the levels and scale factors that they determine, and the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -60,8 +60,7 @@ class MapVerdict:
     @cached_property
     def map(self) -> FittedMap:
         """The map with the soak's evidence for memories in its record, for those who judge by its file."""
-        record = self.fitted.record.model_copy(update={"memory": self.memory.as_json()})
-        return replace(self.fitted, record=record)
+        return self.fitted.noting(memory=self.memory.as_json())
 
     @cached_property
     def T(self) -> Array:

@@ -96,8 +96,7 @@ def fit_gathered(
     if soak.placements is not None:
         fitted = soak.placements.widened(fitted, settings.smoother(soak.T, soak.bias))
     residual = residual_of(fitted, settings, soak.T, soak.bias, soak.starts, soak.interval)
-    averaged = residual.as_record(soak.interval * len(soak.T))
-    fitted = replace(fitted, record=fitted.record.model_copy(update=averaged))
+    fitted = fitted.noting(**residual.as_record(soak.interval * len(soak.T)))
     return of_sensor(config, of_thermometer(fitted, soak.steps))
 
 
@@ -124,7 +123,7 @@ def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
     update: dict[str, object] = {"channel": sensor.channel, "unit": sensor.unit}
     if sensor.axes != tuple("xyz"[: len(sensor.axes)]):  # their names where the record has none
         update["axes"] = sensor.axes
-    return replace(fitted, record=fitted.record.model_copy(update=update))
+    return fitted.noting(**update)
 
 
 def axes_of(fitted: FittedMap) -> tuple[str, ...]:

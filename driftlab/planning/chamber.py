@@ -88,11 +88,6 @@ class Profile:
         t = np.asarray((np.arange(count) + 0.5) * (self.duration / count), dtype=np.float64)
         return t, self.body(t, lag)
 
-    def covered(self, lag: float) -> tuple[float, float]:
-        """Return the lowest and the highest temperature that the body comes to, degC."""
-        T = self.samples(lag, 20_000)[1]
-        return float(T.min()), float(T.max())
-
 
 def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False) -> Profile | None:
     """Return levels every `step` K from low to high, each held alike; with `down` the same ones back.

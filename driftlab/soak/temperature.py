@@ -16,7 +16,6 @@ N readings, K groups.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -83,16 +82,15 @@ def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
 
     Its two ends tell little: within a step of them no level is passed as a whole.
     """
-    known = {"resolution": steps.size, "dither": steps.noise}
-    fitted = replace(fitted, record=fitted.record.model_copy(update=known))
+    fitted = fitted.noting(resolution=steps.size, dither=steps.noise)
     error = fitted.record.error
     if error is None or steps.size == 0.0:
         return fitted
     grid = np.asarray(error.T)
     off = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
     depth = np.stack([grid[0] + steps.size - grid, grid - grid[-1] + steps.size]) / steps.size
-    error = error.model_copy(update={"modes": (*nested(np.maximum(depth, 0.0)[:, :, None] * off), *error.modes)})
-    return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
+    modes = (*nested(np.maximum(depth, 0.0)[:, :, None] * off), *error.modes)
+    return fitted.noting(error=error.model_copy(update={"modes": modes}))
 
 
 def _offset(T: Array, size: float) -> float:

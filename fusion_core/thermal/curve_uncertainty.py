@@ -11,7 +11,6 @@ that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d ax
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -80,8 +79,7 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     grid = np.asarray(error.T)
     more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
     modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    error = error.model_copy(update={"modes": (*modes_kept, *nested(_stacked(more)))})
-    return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
+    return fitted.noting(error=error.model_copy(update={"modes": (*modes_kept, *nested(_stacked(more)))}))
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:

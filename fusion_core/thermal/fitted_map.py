@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -118,6 +118,10 @@ class FittedMap(ABC):
     def domain(self) -> tuple[float, float]:
         """Smallest and largest temperature of the fit, degC."""
         return self.record.domain
+
+    def noting(self, **fields: Any) -> Self:
+        """Return the map with other fields in its record."""
+        return replace(self, record=self.record.model_copy(update=fields))
 
     def bias(self, T: Array, t: Array | None = None) -> Array:
         """Bias (N, d) at T (N,) degC, or (1, d) at one T.
