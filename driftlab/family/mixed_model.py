@@ -276,7 +276,7 @@ class Family(BaseModel):
     weights : dict of str to (d,)
         Of the units that were weighted down in Sigma and mu.
     steps, moved : (d,)
-        Of EM, and by what share of its deviations Sigma changed in the last.
+        Of EM, and by what share of the units' deviations Sigma or Lambda changed in the last.
     map_kind, config : str
         Kind of the units' own maps, and the config (YAML).
     bands : Bands or None

@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from fusion_core.chunk import Array
 
-TOLERANCE = 2e-3  # of Sigma's deviations in a step: far below their sampling error
+TOLERANCE = 2e-3  # of the units' deviations in a step: far below their sampling error
 MAX_STEPS = 60
 CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
 NEAREST = 0.8  # of the units, for the first law
@@ -192,9 +192,10 @@ def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> Varia
 
 
 def change(before: VarianceComponents, after: VarianceComponents) -> float:
-    """Return the largest change of an entry of Sigma, as a share of its deviations."""
+    """Return the largest change of an entry of Sigma or Lambda, as a share of the deviations of units."""
     size = np.sqrt(np.diag(before.Sigma))
-    return float(np.max(np.abs(after.Sigma - before.Sigma) / np.outer(size, size)))
+    moved = np.maximum(np.abs(after.Sigma - before.Sigma), np.abs(after.Lambda - before.Lambda))
+    return float(np.max(moved / np.outer(size, size)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +203,7 @@ class RemlFit:
     """Result of the fit of an axis.
 
     `w` (n,) are the weights, `limit` the share of the expected distance beyond which they fall, `steps` how many EM
-    took and `moved` by how much Sigma changed in the last.
+    took and `moved` by how much the law changed in the last.
     """
 
     law: VarianceComponents
