@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 import yaml
 from command_line import driftlab as command
-from units_at_rest import unit_at_rest
+from units_at_rest import UNITS, unit_at_rest
 
 import driftlab
 from driftlab.config import Config, load_config
@@ -21,7 +21,6 @@ from fusion_core.chunk import Chunk
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 CONFIG = {"extends": "mems_crs05", "latitude": "40.9 deg", "heading": "0 deg"}
-UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
 LISTED = (Path(__file__).parents[2] / "docs" / "reference" / "errors.md").read_text()
 
 
@@ -39,10 +38,7 @@ def data(unit):
 def files(unit, tmp_path, monkeypatch):
     """The same recording and config as files, in the working directory."""
     monkeypatch.chdir(tmp_path)
-    with h5py.File("rest.h5", "w") as file:
-        for name, values in {"time": unit.t, **unit.channels()}.items():
-            file[name] = values
-            file[name].attrs["unit"] = UNITS[name]
+    unit.write("rest.h5")
     channels = {name: {"path": name} for name in UNITS}
     Path("unit.yaml").write_text(yaml.safe_dump({**CONFIG, "source": {"kind": "hdf5", "channels": channels}}))
     return tmp_path

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
+import h5py
 import numpy as np
 
+UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
 OMEGA_IE = np.array([5.51177e-5, 0.0, 4.77445e-5])  # level, x north, 40.9 deg: rate (cos, 0, sin)
 G = 9.80206  # m/s^2 at 40.9 deg by the tables of WGS 84
 
@@ -18,6 +20,12 @@ class Unit:
 
     def channels(self):
         return {"gyro": self.gyro, "accel": self.accel, "temperature": self.temperature}
+
+    def write(self, path):
+        """Write it as an HDF5 file, each channel with its unit."""
+        with h5py.File(path, "w") as file:
+            for name, values in {"time": self.t, **self.channels()}.items():
+                file.create_dataset(name, data=values).attrs["unit"] = UNITS[name]
 
 
 def thermal_bias(T):

@@ -51,10 +51,7 @@ def recording(tmp_path):
     unit.gyro[30_000:30_200] += 0.02
     unit.gyro[60_000:] += 4e-3
     unit.t[90_000:] += 33.3
-    with h5py.File(tmp_path / "recording.h5", "w") as file:
-        file["time"] = unit.t
-        for name, values in unit.channels().items():
-            file[name] = values
+    unit.write(tmp_path / "recording.h5")
     T = np.linspace(0, 60, 500)
     settings = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "order": 5})
     settings.fit(T, thermal_bias(T), {}).save(tmp_path / "map.json")

@@ -4,7 +4,6 @@ import json
 import re
 import time
 
-import h5py
 import numpy as np
 import pytest
 from command_line import driftlab
@@ -197,16 +196,7 @@ filter:
 def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("select")
     (folder / "unit.yaml").write_text(CONFIG)
-    unit = unit_at_rest(seconds=3000, temperature=lambda t: 10 + t / 100, walk=1e-8)
-    with h5py.File(folder / "soak.h5", "w") as file:
-        for name, values, label in (
-            ("time", unit.t, "s"),
-            ("gyro", unit.gyro, "rad/s"),
-            ("accel", unit.accel, "m/s^2"),
-            ("temperature", unit.temperature, "degC"),
-        ):
-            file[name] = values
-            file[name].attrs["unit"] = label
+    unit_at_rest(seconds=3000, temperature=lambda t: 10 + t / 100, walk=1e-8).write(folder / "soak.h5")
     return folder
 
 

@@ -59,10 +59,7 @@ def bench(tmp_path_factory):
     (folder / "other.yaml").write_text(plain.replace("1e-4", "2e-4"))
     (folder / "twin.yaml").write_text(TWIN)
     for name, seed in (("soak.h5", 0), ("day.h5", 1)):
-        unit = unit_at_rest(seconds=600, temperature=lambda t: 20 + t / 60, seed=seed)
-        with h5py.File(folder / name, "w") as file:
-            for channel, values in {"time": unit.t, **unit.channels()}.items():
-                file[channel] = values
+        unit_at_rest(seconds=600, temperature=lambda t: 20 + t / 60, seed=seed).write(folder / name)
     (folder / "disk").mkdir()
     return folder
 

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import fleets
-import h5py
 import numpy as np
 import pytest
 import yaml
 from bench import FRAMING, Device, frame, paced
 from flying_units import fitted
 from typer.testing import CliRunner
-from units_at_rest import unit_at_rest
+from units_at_rest import UNITS, unit_at_rest
 
 from driftlab.cli import COMMANDS, app
 from driftlab.production import units_pass
@@ -29,7 +28,6 @@ from fusion_core.contracts import Exporter
 from fusion_core.host.registry import registry
 
 WRITE_NOTHING = {"check", "plugins", "schema"}
-UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
 CHANNELS = {name: {"path": name} for name in UNITS}
 WALK = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
 MAP = {**WALK, "kind": "thermal_derivative", "map": {"kind": "polynomial", "order": 2, "min_swing": "0.5 K"}}
@@ -112,11 +110,7 @@ def inputs(tmp_path_factory):
     """The files that the commands read."""
     folder = tmp_path_factory.mktemp("inputs")
     for seed, name in enumerate("abc"):
-        unit = unit_at_rest(seconds=300, rate=10, seed=seed, temperature=lambda t: 20 + t / 60)
-        with h5py.File(folder / f"{name}.h5", "w") as file:
-            for channel, values in {"time": unit.t, **unit.channels()}.items():
-                file[channel] = values
-                file[channel].attrs["unit"] = UNITS[channel]
+        unit_at_rest(seconds=300, rate=10, seed=seed, temperature=lambda t: 20 + t / 60).write(folder / f"{name}.h5")
     configs = {"plain": WALK, "other": {"kind": "constant"}, "map": MAP, "network": NETWORK}
     for name, bias in configs.items():
         write_config(folder / f"{name}.yaml", config({"kind": "hdf5", "path": "a.h5", "channels": CHANNELS}, bias))
