@@ -14,10 +14,10 @@ import json
 import pickle
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -85,10 +85,6 @@ class Supply(Effect):
     kind: Literal["supply"] = "supply"
     requires: ClassVar = ("voltage",)
     explanation: ClassVar = "The supply reaches the sensor's readout."
-
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself."""
-        yield self
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the voltage."""

@@ -18,8 +18,7 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core.errors import UnitError, quote
 from fusion_core.units.conversion import convert as convert
-from fusion_core.units.conversion import dimension_of, of_pint, plain, si_unit
-from fusion_core.units.conversion import registry as registry
+from fusion_core.units.conversion import dimension_of, plain, powers_of, si_unit
 from fusion_core.units.conversion import same_dimension as same_dimension
 from fusion_core.units.conversion import si_unit_of as si_unit_of
 from fusion_core.units.conversion import to_si as to_si
@@ -161,7 +160,7 @@ class Unit:
         if "bias" not in self.unit:
             return self.unit
         if bias is None:
-            return si_unit(of_pint(read_quantity(text)[1], text))
+            return si_unit(powers_of(read_quantity(text)[1], text))
         # at its front, and without a power, the unit of the bias reads as well without parentheses
         return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 

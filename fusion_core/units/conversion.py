@@ -1,42 +1,139 @@
-"""Conversion of units by pint, with the definitions of `units.txt`.
+"""Conversion of units, by the definitions of `units.txt`.
 
 An angle is a dimension of its own (so 5 Hz is not 5 rad/s), `g` is standard gravity and not a gram. Inside the program
-everything is SI, except that temperatures are in degC.
+everything is SI, except that temperatures are in degC. A unit is given by its powers here: the exponents of units by
+their full names.
 """
 
 from __future__ import annotations
 
-import sys
+import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from functools import cache, lru_cache
-from importlib.resources import files
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_core.errors import UnitError, quote
-from fusion_core.units.grammar import read_quantity, read_scaled_unit
-
-if TYPE_CHECKING:
-    import pint
+from fusion_core.units.grammar import NUMBER, read_quantity, read_scaled_unit, read_unit
 
 PRODUCTS = ("V", "ohm", "Pa", "T", "W", "N", "J", "F", "H", "Wb")  # SI units that are products of others
-_THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
+_DEFINITION = re.compile(rf"(?:({NUMBER.pattern})(?: \* |$))?([^;]*)(?:; offset: ({NUMBER.pattern}))?")
+
+Powers = Mapping[str, float]
+
+
+class NamedUnit(NamedTuple):
+    """A unit that has a name: `scale` times the powers `of` others; what a thermometer reads counts from `zero`."""
+
+    name: str
+    symbol: str
+    scale: float = 1.0
+    of: Powers | None = None  # None of a base unit
+    zero: float = 0.0
+    dimension: str = ""  # of a base unit; a count has none
 
 
 @cache
-def registry() -> pint.UnitRegistry[float]:
-    """Return the unit registry of the program: pint, with the definitions of `units.txt`."""
-    hidden = sys.modules.setdefault("dask", None) is None  # type: ignore[arg-type]
-    import pint  # which else imports dask, to know its arrays: that takes longer than all of pint
+def _table() -> tuple[dict[str, NamedUnit], dict[str, tuple[str, float]]]:
+    """Return the units, and full name and scale of the prefixes, by all that they are called."""
+    units: dict[str, NamedUnit] = {}
+    prefixes = {"": ("", 1.0)}
+    for line in Path(__file__).with_name("units.txt").read_text(encoding="utf-8").splitlines():
+        name, *others = (part.strip() for part in line.partition("#")[0].split("="))
+        if not others:
+            continue
+        value, *called = others
+        if name.endswith("-"):
+            prefixes |= dict.fromkeys((each.rstrip("-") for each in (name, *called)), (name.rstrip("-"), float(value)))
+            continue
+        unit = _defined(name, called[0] if called else name, value)
+        units |= dict.fromkeys((name, *called), unit)
+        if unit.zero:  # and of the differences of its readings
+            differences = (f"delta_{name}", *(f"{delta}{each}" for each in called for delta in ("delta_", "Δ")))
+            units |= dict.fromkeys(differences, unit._replace(name=differences[0], zero=0.0))
+    return units, prefixes
 
-    if hidden:
-        del sys.modules["dask"]
-    definitions = str(files(__package__).joinpath("units.txt"))
-    return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
+
+def _defined(name: str, symbol: str, value: str) -> NamedUnit:
+    if value.startswith("["):
+        return NamedUnit(name, symbol, dimension=value.partition(";")[0].removeprefix("[]"))
+    scale, of, zero = _DEFINITION.fullmatch(value).groups()  # type: ignore[union-attr]
+    powers = {part: float(power) for part, power in read_unit(of).items()} if of else {}
+    return NamedUnit(name, symbol, float(scale or 1), powers, float(zero or 0))
+
+
+@cache
+def _named_unit(name: str) -> NamedUnit | None:
+    """Return the unit of a name, which may have a prefix and the s of a plural; None where there is none."""
+    units, prefixes = _table()
+    for plural in ("", "s"):
+        for prefix, (full, scale) in prefixes.items():
+            unit = units.get(name[len(prefix) : len(name) - len(plural)])
+            alike = name.startswith(prefix) and name.endswith(plural)
+            if not alike or unit is None or (plural and len(name) - len(prefix) == 2):  # ms is no plural of m
+                continue
+            if not prefix or full + unit.name in units:
+                return units[full + unit.name]
+            return None if unit.zero else NamedUnit(full + unit.name, name, scale, {unit.name: 1.0})
+    return None
+
+
+def _parts(powers: Powers, times: float = 1.0) -> Iterator[tuple[NamedUnit, float]]:
+    """Yield each unit of a product with its exponent, and behind it those that it is made of."""
+    for name, power in powers.items():
+        unit = _named_unit(name)
+        assert unit is not None, "powers are of known units"
+        yield unit, times * power
+        yield from _parts(unit.of or {}, times * power)
+
+
+def _sum(pairs: Iterator[tuple[str, float]]) -> dict[str, float]:
+    """Return the sum of the exponents of each name, without those of zero."""
+    total: dict[str, float] = {}
+    for name, power in pairs:
+        total[name] = total.get(name, 0.0) + power
+    return {name: power for name, power in total.items() if power}
+
+
+def _dimension(powers: Powers) -> dict[str, float]:
+    return _sum((unit.dimension, power) for unit, power in _parts(powers) if unit.dimension)
+
+
+def _scale(source: Powers, target: Powers) -> float:
+    """Return the factor from one unit to another of its dimension."""
+    up: dict[float, float] = {}
+    down: dict[float, float] = {}
+    ratio = {name: source.get(name, 0.0) - target.get(name, 0.0) for name in (*source, *target)}
+    for unit, power in _parts({name: power for name, power in ratio.items() if power}):
+        if unit.of is not None:
+            side = down if power < 0 else up
+            side[unit.scale] = side.get(unit.scale, 0.0) + abs(power)
+    factor = 1.0
+    for side, other, sign in ((up, down, 1), (down, up, -1)):
+        for scale, power in side.items():
+            left = power - other.get(scale, 0.0)  # what is above and below cancels, and rounds nothing
+            factor *= scale ** (sign * left) if left > 0 else 1.0
+    return factor
+
+
+def _converted(value: float, source: Powers, target: Powers) -> float:
+    """Return a value in another unit of the same dimension; beyond the numbers of a computer it is infinite."""
+    if source == target:
+        return value
+    first, last = (_named_unit(*powers) if len(powers) == 1 else None for powers in (source, target))
+    try:
+        if first is not None and first.zero:
+            value, source = value * first.scale + first.zero, first.of or {}
+        if last is not None and last.zero:
+            return (value * _scale(source, last.of or {}) - last.zero) / last.scale
+        return value * _scale(source, target)
+    except (OverflowError, ZeroDivisionError):
+        return np.inf
 
 
 def to_si(text: str, unit: str) -> float:
@@ -56,18 +153,14 @@ def to_si(text: str, unit: str) -> float:
     """
     number, names = read_quantity(text)
     target = _known(unit)
-    if not names and not target.dimensionless:
+    if not names and _dimension(target):
         raise UnitError(f"'{quote(text)}' has no unit")
-    source = of_pint(names, text)
-    if str(target).startswith("delta_") and str(source) in _THERMOMETERS:
+    source = powers_of(names, text)
+    if _is_difference(target) and _is_reading(source):
         raise UnitError(f"'{quote(text)}' is a temperature, a difference was expected; write it in K")
-    if source.dimensionality != target.dimensionality:
+    if _dimension(source) != _dimension(target):
         raise UnitError(f"'{quote(text)}' cannot be converted to {plain(unit)}; write a quantity of that dimension")
-    try:
-        value = float(registry().Quantity(number, source).to(target).magnitude)
-    except (OverflowError, ZeroDivisionError):
-        value = np.inf
-    return _checked(value, number, text)
+    return _checked(_converted(number, source, target), number, text)
 
 
 def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray[np.float64]:
@@ -90,21 +183,18 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     """Return factor and offset from `unit` to `si_unit`."""
     number, source = _scaled(unit)
     target = _known(si_unit or si_unit_of(unit))
-    if source.dimensionality != target.dimensionality:
+    if _dimension(source) != _dimension(target):
         raise UnitError(f"unit '{quote(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
-    try:
-        zero = float(registry().Quantity(0.0, source).to(target).magnitude)
-        slope = float(registry().Quantity(1.0, source).to(target).magnitude) - zero
-    except (OverflowError, ZeroDivisionError):
-        slope, zero = np.inf, 0.0
-    except TypeError:  # pint's, for a difference of temperatures where a reading is meant
-        raise UnitError(f"unit '{quote(unit)}' is of a difference; name that of a reading, e.g. degC") from None
+    if _is_difference(source) and _is_reading(target):
+        raise UnitError(f"unit '{quote(unit)}' is of a difference; name that of a reading, e.g. degC")
+    zero = _converted(0.0, source, target)
+    slope = _converted(1.0, source, target) - zero
     return _checked(slope * number, number, unit), zero
 
 
 def dimension_of(unit: str) -> str:
     """Return the dimension of a unit, as `[angle] / [time]`."""
-    return str(_known(unit).dimensionality)
+    return _written(_dimension(_known(unit)), " * ", " / ", " ** ")
 
 
 def si_unit_of(unit: str) -> str:
@@ -112,11 +202,19 @@ def si_unit_of(unit: str) -> str:
     return si_unit(_scaled(unit)[1])
 
 
-def si_unit(unit: pint.Unit) -> str:
-    """Return the unit in which a quantity of pint's unit is kept inside the program."""
-    if dict(unit.dimensionality) == {"[temperature]": 1}:
+def si_unit(powers: Powers) -> str:
+    """Return the unit in which a quantity of a unit is kept inside the program."""
+    if _dimension(powers) == {"[temperature]": 1}:
         return "degC"
-    return f"{registry().get_base_units(unit)[1]:C}" or "1"
+    base = _sum((unit.name, power) for unit, power in _parts(powers) if unit.of is None)
+    return _written(dict(sorted(base.items())), "*", "/", "**")
+
+
+def _written(powers: Powers, times: str, per: str, power: str, one: str = "dimensionless") -> str:
+    """Return powers as a product and quotients; `one` where there are none."""
+    parts = {name: name + (f"{power}{abs(value):g}" if abs(value) != 1 else "") for name, value in powers.items()}
+    up, down = ([parts[name] for name, value in powers.items() if sign * value > 0] for sign in (1, -1))
+    return per.join([times.join(up) or "1", *down]) if up or down else one
 
 
 def unit_of_density(text: str) -> tuple[str, str]:
@@ -134,63 +232,64 @@ def unit_of_density(text: str) -> tuple[str, str]:
         raise UnitError(f"'{quote(text)}' has no unit")
     powers = {name: float(power) for name, power in names.items()}
     powers["Hz"] = powers.get("Hz", 0.0) + 0.5
-    up, down = (
-        [name if power == s else f"{name}^{abs(power):g}" for name, power in powers.items() if s * power > 0]
-        for s in (1, -1)
-    )
-    written = "/".join(["*".join(up) or "1", *down])
-    si = _named(si_unit_of(written))
+    written = _written(powers, "*", "/", "^", one="1")
+    si = _with_symbols(si_unit_of(written))
     return si, written if all(power.is_integer() for power in powers.values()) else si
 
 
-def _named(unit: str) -> str:
+def _with_symbols(unit: str) -> str:
     """Return an SI unit by its symbols: one where it has one (V), or those that a map of a triad has too (m/s^2)."""
     simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
-    return simple.get(unit) or next(
-        (n for n in PRODUCTS if si_unit_of(n) == unit), f"{registry().Unit(unit):~C}".replace("**", "^")
-    )
+    one = simple.get(unit) or next((name for name in PRODUCTS if si_unit_of(name) == unit), None)
+    symbols = {base.symbol: power for base, power in _parts(_known(unit))}
+    return one or _written(symbols, "*", "/", "^")
 
 
 def same_dimension(unit: str, other: str) -> bool:
     """Return True if two units are of one dimension; False where one is not known."""
     try:
-        return _known(unit).dimensionality == _known(other).dimensionality
+        return _dimension(_known(unit)) == _dimension(_known(other))
     except UnitError:
         return False
 
 
-def _scaled(unit: str) -> tuple[float, pint.Unit]:
+def _scaled(unit: str) -> tuple[float, Powers]:
     number, names = read_scaled_unit(unit)
-    return number, of_pint(names, unit)
+    return number, powers_of(names, unit)
 
 
-def _known(unit: str) -> pint.Unit:
+@lru_cache(maxsize=256)
+def _known(unit: str) -> Powers:
     return _scaled(unit)[1]
 
 
-def of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
-    """Return pint's unit; a thermometer's reading is one only where it stands alone, elsewhere it is a difference."""
-    known = [(_canonical(name, text), exponent) for name, exponent in names.items()]
-    alone = len(known) == 1 and known[0][1] == 1
+def powers_of(names: Mapping[str, Fraction], text: str) -> Powers:
+    """Return the powers of a unit that was read; a thermometer's reading is one only where it stands alone.
+
+    Elsewhere it is a difference. Raises UnitError where a name is unknown; `text` is what the unit was read from.
+    """
     powers: dict[str, float] = {}
-    for name, exponent in known:
-        plain = name if alone or name not in _THERMOMETERS else f"delta_{name}"
-        powers[plain] = powers.get(plain, 0.0) + float(exponent)
-    powers.pop("", None)  # dimensionless
-    container = registry().UnitsContainer({name: power for name, power in powers.items() if power})
-    return registry().Unit(container)
+    for written, exponent in names.items():
+        plain_name = unicodedata.normalize("NFKC", written)
+        unit = None if plain_name == "dimensionless" else _named_unit(plain_name)
+        if unit is None and plain_name != "dimensionless":
+            part = "" if written == text else f"'{quote(text)}': "
+            advice = "write one like deg/s, mrad/s, mg, hPa, degC"
+            raise UnitError(f"{part}unknown unit '{quote(written)}'; {advice}")
+        if unit is not None:
+            name = f"delta_{unit.name}" if unit.zero and (len(names) > 1 or exponent != 1) else unit.name
+            powers[name] = powers.get(name, 0.0) + float(exponent)
+    return {name: power for name, power in powers.items() if power}
 
 
-def _canonical(name: str, text: str) -> str:
-    """Return pint's name of a unit; nothing but a single name is ever given to pint."""
-    known = registry()
-    import pint
+def _is_reading(powers: Powers) -> bool:
+    """Return True if a unit is that of what a thermometer reads."""
+    return any(unit.zero for unit, _ in _parts(powers))
 
-    try:
-        return str(known.get_name(unicodedata.normalize("NFKC", name)))
-    except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
-        part = "" if name == text else f"'{quote(text)}': "
-        raise UnitError(f"{part}unknown unit '{quote(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
+
+def _is_difference(powers: Powers) -> bool:
+    """Return True if a unit is that of the differences of what a thermometer reads."""
+    return any(name.startswith("delta_") for name in powers)
 
 
 def _checked(value: float, number: float, text: str) -> float:
