@@ -279,7 +279,8 @@ def _integrate(
                 squares[j] += lasted * error[k, j] ** 2
                 total[j] += lasted * error[k, j]
         last[0] = t[k]
-        last[1:] = error[k]
+        for j in range(d):
+            last[1 + j] = error[k, j]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

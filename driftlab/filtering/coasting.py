@@ -357,7 +357,9 @@ class Prediction:
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        bias, coast = (_to_the_end(values, *self._late(done, step), calibration) for values in (bias, coast))
+        bias, coast = (
+            _to_the_end(np.ascontiguousarray(values), *self._late(done, step), calibration) for values in (bias, coast)
+        )
         return BiasOutput(bias, sigma, coast, coast_sigma)
 
     def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:

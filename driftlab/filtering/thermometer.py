@@ -164,4 +164,5 @@ def _look(
         off = forgotten * off + (1 - forgotten) * (raw[k] - T[k])
         lag = max(off * off - OFF[0] * whole - OFF[1] * noise * white, 0.0)
         variance[k, 1], left[k, 1] = noise * white + lag, forgotten
-    memory[:] = np.array([one, two, count, noise, ended, since, took, off])
+    for place, value in enumerate((one, two, count, noise, ended, since, took, off)):
+        memory[place] = value

@@ -15,10 +15,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled, inlined
 from fusion_core.fast.groups import Size
 from fusion_core.model import Flags
 
@@ -93,9 +93,6 @@ class SampleArrays(NamedTuple):
 
 
 WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
-
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
 @compiled  # type: ignore[untyped-decorator]
@@ -310,24 +307,23 @@ def single(
 
 
 @compiled  # type: ignore[untyped-decorator]
-def gains(
-    s: Size, c: Size, N: int, P: Array, F: Array, Q: Array, H: Array, r: Array
-) -> tuple[Array, Array, Array, Array]:
+def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Run the covariance alone over N steps, from P (D, s, s); F, Q (D, s, s), H (D, c, s), r (D, c) stay the same.
 
     Returned are P after each step (N, D, s, s), the gain of each scalar update (N, D, c, s), one over the deviation of
     its innovation (N, D, c), and log_det (N, D).
     """
-    nothing, p, w = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s))
-    x, u, log_det = np.zeros(len(s)), np.zeros(len(s)), np.zeros((N, len(P)))
+    s = P.shape[2]
+    nothing, p, w = np.zeros(s), np.empty(s), np.empty(s)
+    x, u, log_det = np.zeros(s), np.zeros(s), np.zeros((N, len(P)))
     all_P, all_K, root = np.empty((N, *P.shape)), np.empty((N, *H.shape)), np.empty((N, *r.shape))
     for k in range(N):
         for g in range(len(P)):
             before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
-            predict(s, nothing, before, F[g], Q[g], u, x, after, w)
-            for i in range(len(c)):
-                inverse = correct(s, x, after, H[g, i], r[g, i], 0.0, p)[1]
-                for j in range(len(s)):
+            predict(x, nothing, before, F[g], Q[g], u, x, after, w)
+            for i in range(H.shape[1]):
+                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p)[1]
+                for j in range(s):
                     all_K[k, g, i, j] = p[j] * inverse
                 root[k, g, i] = np.sqrt(inverse)
                 log_det[k, g] -= np.log(inverse)

@@ -121,15 +121,17 @@ def _scale(source: Powers, target: Powers) -> float:
     return factor
 
 
-def _converted(value: float, source: Powers, target: Powers) -> float:
+def _converted(value: float, source: Powers, target: Powers, text: str) -> float:
     """Return a value in another unit of the same dimension; beyond the numbers of a computer it is infinite."""
     if source == target:
         return value
-    first, last = (_named_unit(*powers) if len(powers) == 1 else None for powers in (source, target))
+    first, last = _thermometer(source), _thermometer(target)
+    if (first and _is_difference(target)) or (last and _is_difference(source)):
+        raise UnitError(f"unit '{quote(text)}' is of a difference; name that of a reading, e.g. degC")
     try:
-        if first is not None and first.zero:
+        if first is not None:
             value, source = value * first.scale + first.zero, first.of or {}
-        if last is not None and last.zero:
+        if last is not None:
             return (value * _scale(source, last.of or {}) - last.zero) / last.scale
         return value * _scale(source, target)
     except (OverflowError, ZeroDivisionError):
@@ -156,11 +158,11 @@ def to_si(text: str, unit: str) -> float:
     if not names and _dimension(target):
         raise UnitError(f"'{quote(text)}' has no unit")
     source = powers_of(names, text)
-    if _is_difference(target) and _is_reading(source):
+    if _is_difference(target) and _thermometer(source):
         raise UnitError(f"'{quote(text)}' is a temperature, a difference was expected; write it in K")
     if _dimension(source) != _dimension(target):
         raise UnitError(f"'{quote(text)}' cannot be converted to {plain(unit)}; write a quantity of that dimension")
-    return _checked(_converted(number, source, target), number, text)
+    return _checked(_converted(number, source, target, text), number, text)
 
 
 def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray[np.float64]:
@@ -185,10 +187,8 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     target = _known(si_unit or si_unit_of(unit))
     if _dimension(source) != _dimension(target):
         raise UnitError(f"unit '{quote(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
-    if _is_difference(source) and _is_reading(target):
-        raise UnitError(f"unit '{quote(unit)}' is of a difference; name that of a reading, e.g. degC")
-    zero = _converted(0.0, source, target)
-    slope = _converted(1.0, source, target) - zero
+    zero = _converted(0.0, source, target, unit)
+    slope = _converted(1.0, source, target, unit) - zero
     return _checked(slope * number, number, unit), zero
 
 
@@ -206,8 +206,14 @@ def si_unit(powers: Powers) -> str:
     """Return the unit in which a quantity of a unit is kept inside the program."""
     if _dimension(powers) == {"[temperature]": 1}:
         return "degC"
-    base = _sum((unit.name, power) for unit, power in _parts(powers) if unit.of is None)
-    return _written(dict(sorted(base.items())), "*", "/", "**")
+    return _written({unit.name: power for unit, power in _in_base(powers)}, "*", "/", "**")
+
+
+def _in_base(powers: Powers) -> list[tuple[NamedUnit, float]]:
+    """Return the base units with their exponents, sorted by name."""
+    units = {unit.name: unit for unit, _ in _parts(powers) if unit.of is None}
+    total = _sum((unit.name, power) for unit, power in _parts(powers) if unit.of is None)
+    return [(units[name], power) for name, power in sorted(total.items())]
 
 
 def _written(powers: Powers, times: str, per: str, power: str, one: str = "dimensionless") -> str:
@@ -233,16 +239,13 @@ def unit_of_density(text: str) -> tuple[str, str]:
     powers = {name: float(power) for name, power in names.items()}
     powers["Hz"] = powers.get("Hz", 0.0) + 0.5
     written = _written(powers, "*", "/", "^", one="1")
-    si = _with_symbols(si_unit_of(written))
-    return si, written if all(power.is_integer() for power in powers.values()) else si
-
-
-def _with_symbols(unit: str) -> str:
-    """Return an SI unit by its symbols: one where it has one (V), or those that a map of a triad has too (m/s^2)."""
+    known = _known(written)
     simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
-    one = simple.get(unit) or next((name for name in PRODUCTS if si_unit_of(name) == unit), None)
-    symbols = {base.symbol: power for base, power in _parts(_known(unit))}
-    return one or _written(symbols, "*", "/", "^")
+    si = simple.get(si_unit(known)) or next((one for one in PRODUCTS if si_unit_of(one) == si_unit(known)), None)
+    si = si or _written(
+        {unit.symbol: power for unit, power in _in_base(known)}, "*", "/", "^"
+    )  # those of a triad: m/s^2
+    return si, written if all(power.is_integer() for power in powers.values()) else si
 
 
 def same_dimension(unit: str, other: str) -> bool:
@@ -282,9 +285,10 @@ def powers_of(names: Mapping[str, Fraction], text: str) -> Powers:
     return {name: power for name, power in powers.items() if power}
 
 
-def _is_reading(powers: Powers) -> bool:
-    """Return True if a unit is that of what a thermometer reads."""
-    return any(unit.zero for unit, _ in _parts(powers))
+def _thermometer(powers: Powers) -> NamedUnit | None:
+    """Return the unit of what a thermometer reads, None where that is not what powers are of."""
+    unit = _named_unit(*powers) if len(powers) == 1 else None
+    return unit if unit is not None and unit.zero else None
 
 
 def _is_difference(powers: Powers) -> bool:
