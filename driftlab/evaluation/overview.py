@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
+from fusion_core.fast import compiled
 
 if TYPE_CHECKING:
     from driftlab.evaluation.bias_instability import Averages
@@ -289,7 +289,7 @@ class Envelope:
         return np.column_stack([t / number, nis / number, number])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _take(
     t: Array, errors: Array, nis: Array, counts: Flags, at: int, length: int, low: Array, high: Array, sums: Array
 ) -> tuple[float, float]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.fast import compiled
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
 
@@ -111,7 +111,7 @@ class Gaps:
         self.faults.add(what, count, self.where)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
     """Return True if any value (N, d) is stuck or beyond the limit, and the length of each axis' repetition (d,).
 

@@ -120,7 +120,7 @@ def _nonzero(matrices: Array) -> Flags:
     return nonzero
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def _bits(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
     bits = np.zeros(rows.shape[1], dtype=np.uint64)
     for k in range(len(rows)):

@@ -211,7 +211,7 @@ class Job:
 
 
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def steady(
     size: tuple[Size, Size, Size], x: Array, F: Array, H: Array, kind: tuple[int, ...], K: Array, root: Array,
     u: Array, z: Array, out: SampleArrays,

@@ -95,7 +95,7 @@ class SampleArrays(NamedTuple):
 WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def uneven(Q: Array) -> bool:
     """Return True if a matrix has a variance below zero or is not symmetric by more than rounding."""
     for i in range(len(Q)):
@@ -108,7 +108,7 @@ def uneven(Q: Array) -> bool:
     return False
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bool:
     """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample.
 
@@ -137,7 +137,7 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
     return symmetric
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array) -> None:
     """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored."""
     for i in range(len(s)):
@@ -157,7 +157,7 @@ def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Ar
             P_new[i, j] = P_new[j, i] = total
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
     """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s, NaN where P is too wide.
 
@@ -190,7 +190,7 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
     return y, inverse
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def measure(
     places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: SampleStep,
     sums: InnovationSums, results: SampleArrays,
@@ -224,7 +224,7 @@ def measure(
     return InnovationSums(nis, log_det, det, count)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def recursive(
     places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays
 ) -> tuple[Array, Array, int]:
@@ -271,7 +271,7 @@ def recursive(
     return x, P, len(data.z)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def single(
     z: Array, x: Array, P: Array, F: Array, Q: Array, u: Array, H: Array, R: Array, gate: float,
     of_x: Array, of_z: Array, sums: Array,
@@ -306,7 +306,7 @@ def single(
     return bool(np.isfinite(check) and sums[0] <= gate)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Run the covariance alone over N steps, from P (D, s, s); F, Q (D, s, s), H (D, c, s), r (D, c) stay the same.
 

@@ -32,7 +32,7 @@ from fusion_core.fast import compiled
 from fusion_core.statespace import StateSpace
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def _turned(tau: Array, values: Array, given: Array, drift: Array, integral: Array) -> None:
     """Write tau (values - given - drift) into integral (N, d): with NumPy rows of three are ten times as slow."""
     for k in range(len(values)):

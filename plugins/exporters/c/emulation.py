@@ -91,7 +91,7 @@ def durations(dt: Single) -> Single:
     return np.asarray(np.minimum(known, LONGEST), dtype=np.float32)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def finite_readings(u: Single, last: np.float32, lowest: np.float32, highest: np.float32) -> Single:
     """Return u (N,) between two limits; a value that is not finite is the one before, `last` at first."""
     out = np.empty_like(u)
@@ -102,7 +102,7 @@ def finite_readings(u: Single, last: np.float32, lowest: np.float32, highest: np
     return out
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def share_gone(h: np.float32) -> np.float32:
     """Return 1 - exp(-h)."""
     if not h < _FAR:
@@ -120,7 +120,7 @@ def share_gone(h: np.float32) -> np.float32:
     return gone
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Single:
     """Return the part of u (N,) that a lag has not followed yet, `behind` at first."""
     out = np.empty_like(u)
@@ -140,7 +140,7 @@ def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Singl
     return out
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def playing(u: Single, half: np.float32) -> Single:
     """Return the place of a play of twice the half width in its loop, from the middle."""
     out = np.empty_like(u)
@@ -155,7 +155,7 @@ def playing(u: Single, half: np.float32) -> Single:
     return out
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def ticking(dt: Single) -> Single:
     """Return the time since the first sample: whole seconds, and what is left of them."""
     out = np.empty_like(dt)
