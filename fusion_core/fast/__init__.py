@@ -22,16 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial, update_wrapper
-from typing import Any, Generic, ParamSpec, TypeVar
-
-Given = ParamSpec("Given")
-Returned = TypeVar("Returned")
+from typing import Any
 
 
-class Compiled(Generic[Given, Returned]):
+class Compiled:
     """A function that numba compiles, with what it calls of its module; numba is imported when it is first called."""
 
-    def __init__(self, function: Callable[Given, Returned], **options: Any) -> None:
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         update_wrapper(self, function)
         self.py_func, self.options = function, options
 
@@ -44,12 +41,12 @@ class Compiled(Generic[Given, Returned]):
         options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
         return njit(self.py_func, **options)
 
-    def __call__(self, *given: Given.args, **named: Given.kwargs) -> Returned:
+    def __call__(self, *given: Any, **named: Any) -> Any:
         """Return what the function does; compile it first where it has not been for such arguments."""
         if "dispatcher" not in vars(self):
-            names = self.py_func.__globals__  # type: ignore[attr-defined]
+            names = self.py_func.__globals__
             names.update({name: value.dispatcher for name, value in names.items() if isinstance(value, Compiled)})
-        return self.dispatcher(*given, **named)  # type: ignore[no-any-return]
+        return self.dispatcher(*given, **named)
 
 
 compiled = Compiled

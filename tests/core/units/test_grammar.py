@@ -2,6 +2,7 @@
 
 import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pint
@@ -10,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_core.errors import UnitError
-from fusion_core.units import convert, registry, si_unit_of, to_si
+from fusion_core.units import conversion, convert, si_unit_of, to_si
 from fusion_core.units.grammar import LONGEST, read_quantity, read_scaled_unit
 
+PINT = pint.UnitRegistry(str(Path(conversion.__file__).with_name("units.txt")), autoconvert_offset_to_baseunit=True)
 NAMES = ["deg", "rad", "s", "h", "min", "Hz", "m", "mg", "hPa", "K", "V", "µV", "ppm", "inHg", "g_0", "mH2O"]
 PIECES = [*NAMES, *"0123456789.,;:+-*/^()[]{}<>=!?#%&|~_'\"\\ √·°²⁻", "sqrt", "sqrt(", "**", "e", "1e9", "nan", "inf"]
 
@@ -154,7 +156,7 @@ def test_the_value_is_that_of_pint(number, unit):
     """pint evaluates the text as an expression; where the text is of valid parts, the two agree."""
     plain = re.sub(r"sqrt\((\w+)\)", r"(\1)**0.5", unit)
     try:
-        expected = registry().Quantity(f"({number}) * {plain}").to_base_units()
+        expected = PINT.Quantity(f"({number}) * {plain}").to_base_units()
     except (pint.PintError, OverflowError):
         return
     if not abs(expected.magnitude) < 1e300 or abs(expected.magnitude) < 1e-300:
@@ -167,3 +169,25 @@ def test_the_value_is_that_of_pint(number, unit):
             raise
         return
     assert found == pytest.approx(expected.magnitude, rel=1e-9)
+
+
+def test_every_unit_is_what_pint_reads_in_the_table():
+    """By each of its names, with each prefix, and in the plural; to the last bit."""
+    units, prefixes = conversion._table()
+    names = [n for n, unit in units.items() if n.isidentifier() and not (unit.zero or n.startswith(("delta", "Δ")))]
+    assert len(names) > 100
+    ends = [(name, plural) for name in names for plural in ("", "s")]
+    for name in (f"{prefix}{name}{plural}" for prefix in prefixes for name, plural in ends):
+        if "kgram" in name or (name != "kilogram" and "kilogram" in name):
+            continue  # pint takes a kilo-gram for another unit than the kilogram
+        try:
+            base = PINT.Quantity(1.0, name).to_base_units()
+        except pint.UndefinedUnitError:
+            with pytest.raises(UnitError):
+                si_unit_of(name)
+            continue
+        assert si_unit_of(name) in (f"{base.units:C}", "degC"), name
+        assert (
+            float(convert(1.0, name, si_unit_of(name).replace("degC", "K").replace("dimensionless", "1")))
+            == base.magnitude
+        )
