@@ -42,7 +42,7 @@ class Compiled:
         return njit(self.py_func, **options)
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        """Return what the function does; compile it first where it has not been for such arguments."""
+        """Call the function; it is compiled first where it has not been for such arguments."""
         if "dispatcher" not in vars(self):
             names = self.py_func.__globals__
             names.update({name: value.dispatcher for name, value in names.items() if isinstance(value, Compiled)})

@@ -25,12 +25,6 @@ SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a t
 
 def steady_state(F: Array, Q: Array, H: Array, R: Array) -> tuple[Array, Array] | None:
     """Return the steady posterior P and predicted P_ of a model, or None (an undriven or unobserved state)."""
-    return _steady_state(*((np.ascontiguousarray(a).tobytes(), a.shape) for a in (F, Q, H, R)))
-
-
-@lru_cache(maxsize=256)
-def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> tuple[Array, Array] | None:
-    F, Q, H, R = (np.frombuffer(data).reshape(shape) for data, shape in matrices)
     try:
         P_ = _riccati(F, Q, H, R)
     except np.linalg.LinAlgError:  # of numbers that differ by more than double precision has

@@ -121,7 +121,8 @@ def writes_what_it_says_it_writes(exporter: Exporter) -> None:
         assert files, "no file is written"
         assert all(files.values()), f"{', '.join(name for name, content in files.items() if not content)}: is empty"
         if not exporter.folder:
-            assert list(files) == [_name(exporter)], f"{', '.join(files)} is written, {_name(exporter)} was asked for"
+            name = f"unit{exporter.suffix}"
+            assert list(files) == [name], f"{', '.join(files)} is written, {name} was asked for"
     for lost in loss.sensors:
         sensor = what.sensor(lost.sensor.channel)
         assert sensor is not None, f"a loss of {lost.sensor.channel} is reported, which the unit does not have"
@@ -310,7 +311,7 @@ def _written_or_refused(
 
 
 def _path(exporter: Exporter, folder: Path) -> Path:
-    return folder if exporter.folder else folder / _name(exporter)
+    return folder if exporter.folder else folder / f"unit{exporter.suffix}"
 
 
 def _files(folder: Path) -> list[Path]:
@@ -326,10 +327,6 @@ def _content(what: Export) -> bytes:
         for one in what.sensors
     ]
     return pickle.dumps((sensors, what.rate, what.serial))
-
-
-def _name(exporter: Exporter) -> str:
-    return f"unit{exporter.suffix}"
 
 
 def _check_deviation(deviation: Deviation, d: int) -> None:

@@ -92,16 +92,17 @@ def _parts(powers: Powers, times: float = 1.0) -> Iterator[tuple[NamedUnit, floa
         yield from _parts(unit.of or {}, times * power)
 
 
-def _sum(pairs: Iterator[tuple[str, float]]) -> dict[str, float]:
-    """Return the sum of the exponents of each name, without those of zero."""
-    total: dict[str, float] = {}
-    for name, power in pairs:
-        total[name] = total.get(name, 0.0) + power
-    return {name: power for name, power in total.items() if power}
+def _in_base(powers: Powers) -> dict[NamedUnit, float]:
+    """Return the exponents of the base units, sorted by their names."""
+    total: dict[NamedUnit, float] = {}
+    for unit, power in _parts(powers):
+        if unit.of is None:
+            total[unit] = total.get(unit, 0.0) + power
+    return {unit: power for unit, power in sorted(total.items()) if power}
 
 
 def _dimension(powers: Powers) -> dict[str, float]:
-    return _sum((unit.dimension, power) for unit, power in _parts(powers) if unit.dimension)
+    return {unit.dimension: power for unit, power in _in_base(powers).items() if unit.dimension}
 
 
 def _scale(source: Powers, target: Powers) -> float:
@@ -206,14 +207,7 @@ def si_unit(powers: Powers) -> str:
     """Return the unit in which a quantity of a unit is kept inside the program."""
     if _dimension(powers) == {"[temperature]": 1}:
         return "degC"
-    return _written({unit.name: power for unit, power in _in_base(powers)}, "*", "/", "**")
-
-
-def _in_base(powers: Powers) -> list[tuple[NamedUnit, float]]:
-    """Return the base units with their exponents, sorted by name."""
-    units = {unit.name: unit for unit, _ in _parts(powers) if unit.of is None}
-    total = _sum((unit.name, power) for unit, power in _parts(powers) if unit.of is None)
-    return [(units[name], power) for name, power in sorted(total.items())]
+    return _written({unit.name: power for unit, power in _in_base(powers).items()}, "*", "/", "**")
 
 
 def _written(powers: Powers, times: str, per: str, power: str, one: str = "dimensionless") -> str:
@@ -243,7 +237,7 @@ def unit_of_density(text: str) -> tuple[str, str]:
     simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
     si = simple.get(si_unit(known)) or next((one for one in PRODUCTS if si_unit_of(one) == si_unit(known)), None)
     si = si or _written(
-        {unit.symbol: power for unit, power in _in_base(known)}, "*", "/", "^"
+        {unit.symbol: power for unit, power in _in_base(known).items()}, "*", "/", "^"
     )  # those of a triad: m/s^2
     return si, written if all(power.is_integer() for power in powers.values()) else si
 

@@ -118,16 +118,22 @@ def _look(
             _average(other, of_other, x, k, warm[0], tau[k])
             moving = settled < patience and quiet < HOLD
             if settled >= patience:
-                for i in range(len(of_level)):  # one by one: to copy arrays would take seconds more to compile
-                    of_level[i] = of_other[i]
-                for j in range(D):
-                    level[0, j], level[1, j] = other[0, j], other[1, j]
-                    fast[0, j], fast[1, j], fast[2, j] = other[0, j], of_other[0], of_other[2]
+                _settle(level, of_level, fast, other, of_other)
         if not moving:
             _average(level, of_level, x, k, warm[0], tau[k])
         still[k] = not moving
     counters[0], counters[1], counters[2], counters[3] = 1.0 if moving else 0.0, quiet, settled, last
     return still, out
+
+
+@inlined
+def _settle(level: Array, of_level: Array, fast: Array, other: Array, of_other: Array) -> None:
+    """Take another level for the level; one by one, as to copy arrays would take seconds more to compile."""
+    for i in range(len(of_level)):
+        of_level[i] = of_other[i]
+    for j in range(level.shape[1]):
+        level[0, j], level[1, j] = other[0, j], other[1, j]
+        fast[0, j], fast[1, j], fast[2, j] = other[0, j], of_other[0], of_other[2]
 
 
 @inlined
