@@ -6,13 +6,14 @@ Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Naviga
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import special
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 
 PIECE = 4096  # rows multiplied at once: they stay in the cache
 
@@ -119,7 +120,7 @@ class Whiteness:
         return np.asarray(special.chdtrc(lags, weights @ self.autocorrelation()[:lags] ** 2))
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+@partial(compiled, fastmath={"reassoc", "contract"})
 def _lagged(rows: Array, stop: int, products: Array) -> None:
     """Add sum_k rows[k] rows[k + lag] over k < stop to products (lags + 1, m), piece by piece in the cache."""
     lags, m = len(products) - 1, rows.shape[1]

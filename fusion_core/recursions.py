@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import njit
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 
 PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def play(x: Array, width: float, y: float) -> Array:
     """Return the play operator's output (N,): it follows x (N,) once x has crossed the width; y is its last output.
 
@@ -36,7 +36,7 @@ def play(x: Array, width: float, y: float) -> Array:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
     """Return x (N,) through y' = (x - y) / tau, exactly for an x that is straight between its samples.
 
@@ -53,7 +53,7 @@ def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def drift(x: Array, F: Array, u: Array) -> Array:
     """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
     N, n = len(u), len(x)
@@ -78,7 +78,7 @@ def lag_fading(dt: Array, N: int, tau: float, begun: bool) -> Array:
     return factor if begun or N == 0 else np.concatenate([np.ones(1), factor[1:]])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
     """Return values (N,), their rates (N,) and the memory of a straight line whose weights fade by tau s."""
     # weighted sums with time counted from the current sample and T from the first one
@@ -98,7 +98,7 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
     return smooth, rate, np.array([T_0, w, wt, wtt, wT, wtT, pull])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def regression_value(
     dt: Array, T: Array, rate: Array, steps: Array, known: tuple[float, ...], memory: Array, longest: float, walk: float
 ) -> tuple[Array, Array, Array]:
@@ -133,7 +133,7 @@ def regression_value(
     return smooth, windows, np.array([T_0, w, wt, wtt, wT, wtT, one, two, count, noise])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
     """Return values (N,), their rates (N,) and the memory of a two-state filter with variances r and q dt."""
     x, v, xx, xv, vv = memory
@@ -155,7 +155,7 @@ def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple
     return smooth, rate, np.array([x, v, xx, xv, vv])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, Array]:
     """Return the step (N,) of which all changes of T (N,) are multiples (Euclid), and its variance (N,) so far.
 

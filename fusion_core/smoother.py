@@ -15,11 +15,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.checks import checked_measurement, checked_reset, checked_state, checked_transition, flags
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled, inlined
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 Index = NDArray[np.uint64]
@@ -143,7 +143,7 @@ class SmoothedArrays(NamedTuple):
     sigma: Array  # (N, n)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+@inlined
 def uncorrect(s: Size, lam: Array, Lam: Array, h: Array, K: Array, y_S: float, inverse: float, w: Array) -> None:
     """Do lam <- B' lam - h' y / S and Lam <- B' Lam B + h' h / S in place, with B = I - K h; w (s,) is scratch."""
     gain, curve = y_S, inverse
@@ -160,7 +160,7 @@ def uncorrect(s: Size, lam: Array, Lam: Array, h: Array, K: Array, y_S: float, i
             Lam[i, j] += h[i] * curve * h[j] - h[i] * w[j] - w[i] * h[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+@inlined
 def unpredict(s: Size, lam: Array, Lam: Array, F: Array, A: Array, w: Array) -> None:
     """Do lam <- F' lam and Lam <- F' Lam F in place; A (s, s) and w (s,) are scratch."""
     for j in range(len(s)):
@@ -182,7 +182,7 @@ def unpredict(s: Size, lam: Array, Lam: Array, F: Array, A: Array, w: Array) -> 
             Lam[j, q] = Lam[q, j] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+@inlined
 def smoothed(s: Size, i: int, x: float, P: Array, lam: Array, Lam: Array) -> tuple[float, float]:
     """Return state i, x before it is smoothed, as x - P lam, and its variance in P - P Lam P."""
     variance = P[i, i]
@@ -195,7 +195,7 @@ def smoothed(s: Size, i: int, x: float, P: Array, lam: Array, Lam: Array) -> tup
     return x, variance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def backward(s: Size, passed: Passed, lam: Array, Lam: Array, out: SmoothedArrays) -> None:
     """Go from the last sample to the first; lam (G, s) and Lam (G, s, s) are changed in place."""
     G, c = passed.rows.shape

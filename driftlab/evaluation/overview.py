@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from driftlab.config import Config
 from driftlab.evaluation.limits import LimitResult, check_limits
@@ -26,6 +25,7 @@ from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, ThermalBias
+from fusion_core.fast import compiled
 from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
@@ -255,7 +255,7 @@ class Envelope:
         return np.column_stack([t / number, nis / number, number])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _take(
     t: Array, errors: Array, nis: Array, counts: Flags, at: int, length: int, low: Array, high: Array, sums: Array
 ) -> tuple[float, float]:

@@ -20,10 +20,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 from fusion_core.model import Flags
 
 WINDOW = 30.0  # s, of the moving average
@@ -67,7 +67,7 @@ def moving_average(t: Array, rate: Array, tau: Array, still: Flags, window: floa
     return averages
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _average(t: Array, rate: Array, weight: Array, still: Flags, window: float, least: float) -> Array:
     # sums from the first row of each window up to its last, which both only ever move on
     N, d = rate.shape
@@ -196,7 +196,7 @@ class Cells:
         return np.array(coasts).reshape(-1, d)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _sum_cells(rows: NDArray[np.int64], tau: Array, error: Array, raw: Array, sums: Array) -> None:
     d = error.shape[1]
     for k in range(len(rows)):
@@ -235,7 +235,7 @@ class Integral:
         return float(min(self._times[1] / span, 1.0)) if span > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _integrate(
     t: Array, tau: Array, error: Array, known: Flags, start: float, end: float,
     last: Array, squares: Array, total: Array, times: Array,
@@ -261,10 +261,11 @@ def _integrate(
                 squares[j] += lasted * error[k, j] ** 2
                 total[j] += lasted * error[k, j]
         last[0] = t[k]
-        last[1:] = error[k]
+        for j in range(d):
+            last[1 + j] = error[k, j]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def errors_of(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
     """Return the errors (N, 3 d) of bias and coast, and the coast's deviation: rows of three take NumPy too long."""
     N, d = bias.shape

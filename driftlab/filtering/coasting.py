@@ -26,13 +26,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
 from driftlab.filtering.setup import RunSetup
 from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
+from fusion_core.fast import compiled
 from fusion_core.model import Estimates
 from fusion_core.recursions import drift
 from fusion_core.thermal.thermometer import NO_STEPS
@@ -72,7 +72,7 @@ def spread(P: Array, step: Transition, N: int) -> tuple[Array, Array]:
     return variance, after
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
     """Go on from P, state by state; return whether all of them are alone (P, F and Q diagonal), else nothing counts."""
     n = len(P)
@@ -87,7 +87,7 @@ def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
     for k in range(len(variance)):
         F_k, C_k = F[min(k, len(F) - 1)], C[min(k, len(C) - 1)]
@@ -170,7 +170,7 @@ class Uncertainty:
         return sigma
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
     """Return the row of a table at or below T, and the share of the next one; the ends of a table go on level."""
     place = min(max((T - low) / step, 0.0), count - 1.0)
@@ -178,7 +178,7 @@ def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
     return k, place - k
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _of_estimate(
     T: Array, error: Array, left: Array, P: Array, weight: Array, noise: Array, tilt: Array,
     low: float, step: float, slope: Array, modes: Array, following: Array, learnt: Array, sigma: Array,
@@ -219,7 +219,7 @@ def _of_estimate(
             sigma[k, j] = np.sqrt(sigma[k, j] + learnt[r + 2, j])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _gain(P: float, weight: float, noise: float, j: int, known: Array) -> None:
     """Work out how much of an error of its own an epoch takes out of axis j of the estimate, and the logarithm."""
     gain = min(P * weight / noise, 1.0)
@@ -230,13 +230,13 @@ def _gain(P: float, weight: float, noise: float, j: int, known: Array) -> None:
     known[0, j], known[1, j] = P, gain
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _unless_tiny(x: float) -> float:
     """Return x, and 0 where it is too small to matter: a processor takes long over such numbers."""
     return x if abs(x) > 1e-200 else 0.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _learn(T: float, i: int, share: float, modes: Array, learnt: Array) -> None:
     """Work out the variance of the map's error less what the filter has learnt of it, mode by mode.
 
@@ -253,7 +253,7 @@ def _learn(T: float, i: int, share: float, modes: Array, learnt: Array) -> None:
         learnt[r, j], learnt[r + 1, j], learnt[r + 2, j] = T, 0.0, total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _of_coast(
     T: Array, error: Array, left: Array, P: Array, tilt: Array,
     low: float, step: float, slope: Array, between: Array, departing: Array, sigma: Array,
@@ -357,7 +357,9 @@ class Prediction:
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        bias, coast = (_to_the_end(values, *self._late(done, step), calibration) for values in (bias, coast))
+        bias, coast = (
+            _to_the_end(np.ascontiguousarray(values), *self._late(done, step), calibration) for values in (bias, coast)
+        )
         return BiasOutput(bias, sigma, coast, coast_sigma)
 
     def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:
@@ -370,7 +372,7 @@ class Prediction:
         return np.zeros_like(share) if self.effects else share, np.atleast_2d(drift)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _to_the_end(values: Array, share: Array, drift: Array, calibration: Array) -> Array:
     """Return the values (N, d) with a share (N,) of the drift and with the calibration (N, d)."""
     N, d = values.shape

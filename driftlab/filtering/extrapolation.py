@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
+from fusion_core.fast import compiled
 
 
 class Extrapolated(NamedTuple):
@@ -104,7 +104,7 @@ def beyond(effect: Effect, chunk: Chunk) -> Iterator[tuple[str, NDArray[np.bool_
                 yield name, outside
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _follow(x: Array, gain: Array, lagged: Array, left: Array) -> None:
     for k in range(len(x)):
         for j in range(len(lagged)):

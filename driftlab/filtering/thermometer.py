@@ -29,10 +29,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk
+from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, Steps, noise_before, readings, sawtooth, started
 
 Index = NDArray[np.int64]
@@ -125,7 +125,7 @@ def _sawtooth(step: float, variance: float, known: Steps) -> Array:
     return sawtooth(step, known.noise if from_soak else noise_before(step, 2 ** (variance / 4)), HARMONICS)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _look(
     T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Index, windows: Array, memory: Array,
     variance: Array, left: Array,
@@ -164,4 +164,5 @@ def _look(
         off = forgotten * off + (1 - forgotten) * (raw[k] - T[k])
         lag = max(off * off - OFF[0] * whole - OFF[1] * noise * white, 0.0)
         variance[k, 1], left[k, 1] = noise * white + lag, forgotten
-    memory[:] = np.array([one, two, count, noise, ended, since, took, off])
+    for place, value in enumerate((one, two, count, noise, ended, since, took, off)):
+        memory[place] = value

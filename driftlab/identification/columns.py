@@ -21,7 +21,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
@@ -121,7 +120,7 @@ def free_starts(
     return sd, slow
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def left_with_starts(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
     """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
 

@@ -25,11 +25,13 @@ the order of a difference is 0 for the second, 1 for the third.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
-from numba import njit
 
 from driftlab.noise.allan_model import PRESENT, AllanCurve, Bridge, Index, octaves
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 from fusion_core.model import Flags
 
 PER_DECADE = 10  # averaging times; nearer ones are so correlated that they show nothing more
@@ -126,7 +128,7 @@ def _stride(m: int, N: int) -> int:
     return s
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _sums(rate: Array, stretches: Index, dt: float) -> tuple[Array, Index]:
     """Return x of one stretch after the other, a zero before each, and where each begins (S + 1,).
 
@@ -149,7 +151,7 @@ def _sums(rate: Array, stretches: Index, dt: float) -> tuple[Array, Index]:
     return x, places
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _thinned_rows(edges: Index, stride: int) -> tuple[Index, Index]:
     """Return every so-manyth row between edges (S + 1,), from each on, and the edges of these rows."""
     few = np.zeros_like(edges)
@@ -162,7 +164,7 @@ def _thinned_rows(edges: Index, stride: int) -> tuple[Index, Index]:
     return rows, few
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})  # type: ignore[untyped-decorator]
+@partial(compiled, fastmath={"reassoc"})
 def _mean_squares(x: Array, places: Index, m: int) -> tuple[float, float]:
     """Return the mean squares of the second and of the third differences of x over m samples."""
     squares = cubes = 0.0
@@ -256,7 +258,7 @@ def bridged(
     return mean[:, :, 0], bridge
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, whole: Index) -> Sums:
     """Return sums over one span after the other, a zero before each, and where each begins (P + 1,).
 
@@ -294,13 +296,13 @@ def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, wh
     return x, count, runs, edges
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _number(runs: Index, a: int, b: int) -> int:
     """Return the number of runs of samples in the window from a to b; one that began before it, too."""
     return int((runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _window(grid: Sums, sizes: tuple[int, int, int, int], group: Index, sums: Array, taken: Array) -> tuple[int, int]:
     """Add up the differences over m places; return the pieces that they cover without a break, and their samples.
 
@@ -348,7 +350,7 @@ def _window(grid: Sums, sizes: tuple[int, int, int, int], group: Index, sums: Ar
     return pieces, samples
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
     """Add to `taken` (4,) as in `_window`, of differences of which some count."""
     n = len(counts)
@@ -361,7 +363,7 @@ def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
     taken[3] += every
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _pairs(counts: Flags, reach: int) -> int:
     """Return the number of pairs of differences that count at most `reach` apart, each in both orders."""
     n, near, pairs = len(counts), 0, 0

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 from fusion_core.thermal.soak_noise import minimum_near
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def whitened(columns: Array, white: Array, walk: Array) -> tuple[Array, Array]:
     """Return columns (R, m) as normalised innovations (R, m) of a local level that begins at 0, and variances (R,).
 
@@ -145,7 +145,7 @@ def one_step(parts: Sequence[Array], gain: float) -> list[Array]:
     return [_one_step(np.atleast_2d(x.T).T, gain).reshape(len(x) - 1, *x.shape[1:]) for x in parts]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _one_step(x: Array, gain: float) -> Array:
     """Return the errors (n - 1, d) of the signals (n, d)."""
     n, d = x.shape

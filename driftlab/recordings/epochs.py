@@ -14,10 +14,10 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, readings, started
 
 Index = NDArray[np.int64]
@@ -88,7 +88,7 @@ def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield chunk.having(**dict(zip(READINGS, seen, strict=True)))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _owned(t: Array, before: float, pace: Array) -> Array:
     """Return the steps to times t (N,) without the gaps, which are no one's time; `pace` (usual step, streaks) follows.
 
@@ -108,7 +108,7 @@ def _owned(t: Array, before: float, pace: Array) -> Array:
     return owned
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, float]:
     """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
     starts = np.empty(len(t), dtype=np.int64)
@@ -122,7 +122,7 @@ def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, 
     return starts[:count], last
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
     """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape

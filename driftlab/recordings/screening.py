@@ -6,13 +6,13 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from driftlab.config import Config
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.fast import compiled
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
 
@@ -106,7 +106,7 @@ class Gaps:
         self.faults.add(what, count, self.where)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
     """Return True if any value (N, d) is stuck or beyond the limit, and the length of each axis' repetition (d,).
 

@@ -95,10 +95,6 @@ class Effect(Plugin):
         """The physics in a sentence or two, with a reference."""
 
     @abstractmethod
-    def candidates(self) -> Iterator[Self]:
-        """Yield the grid of hyper-parameters to try, as configured copies of this effect."""
-
-    @abstractmethod
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
 
@@ -108,6 +104,10 @@ class Effect(Plugin):
     def channel_columns(self) -> Mapping[str, int]:
         """Columns d of each channel that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
         return {}
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield the grid of hyper-parameters to try, as configured copies of this effect; by default itself."""
+        yield self
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the grid of hyper-parameters to try, where it depends on the recordings; it does not by default.

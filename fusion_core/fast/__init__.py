@@ -17,3 +17,37 @@ way                  when                                        factor    price
 
 Measured with 12 states in six groups, 6 components (`benchmarks/methods.py`). `job` switches within a call.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial, update_wrapper
+from typing import Any
+
+
+class Compiled:
+    """A function that numba compiles, with what it calls of its module; numba is imported when it is first called."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        update_wrapper(self, function)
+        self.py_func, self.options = function, options
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """The function as numba has it."""
+        from numba import njit
+
+        # nobody asks for the address of a function: without it a sixth less is compiled
+        options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
+        return njit(self.py_func, **options)
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        """Call the function; it is compiled first where it has not been for such arguments."""
+        if "dispatcher" not in vars(self):
+            names = self.py_func.__globals__
+            names.update({name: value.dispatcher for name, value in names.items() if isinstance(value, Compiled)})
+        return self.dispatcher(*given, **named)
+
+
+compiled = Compiled
+inlined = partial(Compiled, forceinline=True, no_cpython_wrapper=True)  # for compiled functions: Python cannot call it

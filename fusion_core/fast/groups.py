@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 from fusion_core.model import Flags
 
 Index = NDArray[np.int64]
@@ -120,7 +120,7 @@ def _nonzero(matrices: Array) -> Flags:
     return nonzero
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _bits(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
     bits = np.zeros(rows.shape[1], dtype=np.uint64)
     for k in range(len(rows)):

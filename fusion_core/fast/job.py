@@ -12,11 +12,11 @@ the compiler to put several groups into one instruction: half the time of groups
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import FLOAT, covariance
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled
 from fusion_core.fast.groups import IndependentGroups, Size, find_groups
 from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive, single
 from fusion_core.fast.steady import Gains, Invariant, invariant
@@ -211,7 +211,7 @@ class Job:
 
 
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def steady(
     size: tuple[Size, Size, Size], x: Array, F: Array, H: Array, kind: tuple[int, ...], K: Array, root: Array,
     u: Array, z: Array, out: SampleArrays,

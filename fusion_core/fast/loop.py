@@ -15,10 +15,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.fast import compiled, inlined
 from fusion_core.fast.groups import Size
 from fusion_core.model import Flags
 
@@ -94,11 +94,8 @@ class SampleArrays(NamedTuple):
 
 WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
-
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def uneven(Q: Array) -> bool:
     """Return True if a matrix has a variance below zero or is not symmetric by more than rounding."""
     for i in range(len(Q)):
@@ -111,7 +108,7 @@ def uneven(Q: Array) -> bool:
     return False
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bool:
     """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample.
 
@@ -140,7 +137,7 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
     return symmetric
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array) -> None:
     """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored."""
     for i in range(len(s)):
@@ -160,7 +157,7 @@ def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Ar
             P_new[i, j] = P_new[j, i] = total
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
     """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s, NaN where P is too wide.
 
@@ -193,7 +190,7 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
     return y, inverse
 
 
-@inlined  # type: ignore[untyped-decorator]
+@inlined
 def measure(
     places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: SampleStep,
     sums: InnovationSums, results: SampleArrays,
@@ -227,7 +224,7 @@ def measure(
     return InnovationSums(nis, log_det, det, count)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def recursive(
     places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays
 ) -> tuple[Array, Array, int]:
@@ -274,7 +271,7 @@ def recursive(
     return x, P, len(data.z)
 
 
-@compiled  # type: ignore[untyped-decorator]
+@compiled
 def single(
     z: Array, x: Array, P: Array, F: Array, Q: Array, u: Array, H: Array, R: Array, gate: float,
     of_x: Array, of_z: Array, sums: Array,
@@ -309,25 +306,24 @@ def single(
     return bool(np.isfinite(check) and sums[0] <= gate)
 
 
-@compiled  # type: ignore[untyped-decorator]
-def gains(
-    s: Size, c: Size, N: int, P: Array, F: Array, Q: Array, H: Array, r: Array
-) -> tuple[Array, Array, Array, Array]:
+@compiled
+def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Run the covariance alone over N steps, from P (D, s, s); F, Q (D, s, s), H (D, c, s), r (D, c) stay the same.
 
     Returned are P after each step (N, D, s, s), the gain of each scalar update (N, D, c, s), one over the deviation of
     its innovation (N, D, c), and log_det (N, D).
     """
-    nothing, p, w = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s))
-    x, u, log_det = np.zeros(len(s)), np.zeros(len(s)), np.zeros((N, len(P)))
+    s = P.shape[2]
+    nothing, p, w = np.zeros(s), np.empty(s), np.empty(s)
+    x, u, log_det = np.zeros(s), np.zeros(s), np.zeros((N, len(P)))
     all_P, all_K, root = np.empty((N, *P.shape)), np.empty((N, *H.shape)), np.empty((N, *r.shape))
     for k in range(N):
         for g in range(len(P)):
             before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
-            predict(s, nothing, before, F[g], Q[g], u, x, after, w)
-            for i in range(len(c)):
-                inverse = correct(s, x, after, H[g, i], r[g, i], 0.0, p)[1]
-                for j in range(len(s)):
+            predict(x, nothing, before, F[g], Q[g], u, x, after, w)
+            for i in range(H.shape[1]):
+                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p)[1]
+                for j in range(s):
                     all_K[k, g, i, j] = p[j] * inverse
                 root[k, g, i] = np.sqrt(inverse)
                 log_det[k, g] -= np.log(inverse)

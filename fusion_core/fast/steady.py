@@ -25,12 +25,6 @@ SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a t
 
 def steady_state(F: Array, Q: Array, H: Array, R: Array) -> tuple[Array, Array] | None:
     """Return the steady posterior P and predicted P_ of a model, or None (an undriven or unobserved state)."""
-    return _steady_state(*((np.ascontiguousarray(a).tobytes(), a.shape) for a in (F, Q, H, R)))
-
-
-@lru_cache(maxsize=256)
-def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> tuple[Array, Array] | None:
-    F, Q, H, R = (np.frombuffer(data).reshape(shape) for data, shape in matrices)
     try:
         P_ = _riccati(F, Q, H, R)
     except np.linalg.LinAlgError:  # of numbers that differ by more than double precision has
@@ -161,8 +155,7 @@ class Invariant:
         first: dict[bytes, int] = {}  # group of each kind
         alike = [first.setdefault(b"".join(a[g].tobytes() for a in parts), g) for g in range(len(P))]
         leaders = list(first.values())
-        s, c, _ = self.groups.size
-        P, K, root, log_det = gains(s, c, N, P[leaders], *(a[leaders] for a in parts[:-1]))
+        P, K, root, log_det = gains(N, P[leaders], *(a[leaders] for a in parts[:-1]))
         kind = np.searchsorted(leaders, alike)
         return Gains(kind, P, K, root, log_det @ np.bincount(kind).astype(np.float64))
 

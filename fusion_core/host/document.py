@@ -133,9 +133,7 @@ class _Reader:
                 )
             if key_node.style is None and key == "<<":
                 raise self._wrong(key_node, "'<<' does not merge here", "use extends, or write the keys")
-            self._plain_tag(key_node)
-            self._check_characters(key_node)
-            self._check_line(key_node, at)
+            self._check(key_node, at)
             known[key] = line
             self.lines[*at, key] = (self.path, line)
             content[key] = self.value(value_node, (*at, key))
@@ -150,9 +148,8 @@ class _Reader:
             raise self._wrong(node, f"with its aliases written out it holds more than {MAX_VALUES} values", "use fewer")
         if len(at) > DEEPEST:
             raise self._wrong(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
-        self._plain_tag(node)
+        self._check(node, at)
         if isinstance(node, yaml.ScalarNode):
-            self._check_line(node, at)
             return self._scalar(node)
         self.within.append(node)
         result: Any
@@ -166,16 +163,24 @@ class _Reader:
         self.within.pop()
         return result
 
-    def _plain_tag(self, node: yaml.Node) -> None:
-        """Refuse a tag that is written out, and is not what the value is anyway."""
+    def _check(self, node: yaml.Node, at: Location) -> None:
+        """Refuse a tag that is written out, and is not what the value is anyway, and a text that nobody can take.
+
+        That is one with what an escape in quotes can write, and neither a path nor a terminal has; and one of several
+        lines, as what names it would have them too.
+        """
         scalar = {"str", "int", "float", "bool", "null", "timestamp", "merge", "value"}
         usual = scalar if isinstance(node, yaml.ScalarNode) else {"map", "seq"}
         if not node.tag.startswith(_TAG) or node.tag.removeprefix(_TAG) not in usual:
             raise self._wrong(node, f"has the tag '{quote(node.tag.replace(_TAG, '!!'))}'", "remove it")
+        if isinstance(node, yaml.ScalarNode) and (strange := _STRANGE.search(node.value)):
+            raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
+        if isinstance(node, yaml.ScalarNode) and _BREAK.search(node.value):
+            where = f"{quote('.'.join(map(str, at)))}: " if at else ""
+            raise self._wrong(node, f"{where}a text goes over several lines", "write it on one")
 
     def _scalar(self, node: yaml.ScalarNode) -> Any:
         text, kind = node.value, node.tag.removeprefix(_TAG)
-        self._check_characters(node)
         if kind == "null":
             return None
         if kind == "bool" and text.lower() in _TRUE | _FALSE:
@@ -188,17 +193,6 @@ class _Reader:
             word = {"bool": "true or false", "int": "a plain integer", "float": "a plain, finite number"}[kind]
             raise self._wrong(node, f"'{quote(text)}' is not {word}", "write one, or quotes around a text")
         return text  # a date too
-
-    def _check_characters(self, node: yaml.ScalarNode) -> None:
-        """Refuse what an escape in quotes can write, and neither a path nor a terminal can take."""
-        if strange := _STRANGE.search(node.value):
-            raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
-
-    def _check_line(self, node: yaml.ScalarNode, at: Location) -> None:
-        """Refuse a text of several lines: what names it would have them too."""
-        if _BREAK.search(node.value):
-            where = f"{quote('.'.join(map(str, at)))}: " if at else ""
-            raise self._wrong(node, f"{where}a text goes over several lines", "write it on one")
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:
         return ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")

@@ -14,10 +14,10 @@ import json
 import pickle
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -44,10 +44,11 @@ AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
-class WavyMap(FittedMap):
-    """A map of straight lines and gentle waves about 20 degC, times `size`, in the unit of its record."""
+class MadeMap(FittedMap):
+    """A map about 20 degC, times `size`, in the unit of its record: gentle waves, or straight lines."""
 
     size: float = 1.0
+    form: Literal["wavy", "straight", "holed"] = "wavy"
 
     def save(self, path: Path) -> None:
         """Raise: it is no map of a file."""
@@ -55,54 +56,24 @@ class WavyMap(FittedMap):
 
     def _bias(self, T: Array) -> Array:
         x = (T - 20) / 30
+        if self.form == "straight":
+            return self.size * np.outer(x, [1.0, -0.5, 0.3])
+        x = np.where(T > 40, np.nan, x) if self.form == "holed" else x
         return self.size * np.stack([x, x**2 - 0.3 * x, np.sin(2 * x)], axis=1)
 
     def _slope(self, T: Array) -> Array:
-        x = (T - 20) / 30
-        return self.size / 30 * np.stack([np.ones_like(x), 2 * x - 0.3, 2 * np.cos(2 * x)], axis=1)
+        return (self._bias(T + 1e-4) - self._bias(T - 1e-4)) / 2e-4
 
 
-class Holed(WavyMap):
-    """The same with no number above 40 degC."""
+class Named(Effect):
+    """An effect of a channel that the simulated warm-up lacks, with a term, called as somebody likes."""
 
-    def _bias(self, T: Array) -> Array:
-        return np.where(T[:, None] > 40, np.nan, super()._bias(T))
-
-
-class StraightMap(WavyMap):
-    """A map of straight lines."""
-
-    def _bias(self, T: Array) -> Array:
-        return self.size * np.outer((T - 20) / 30, [1.0, -0.5, 0.3])
-
-    def _slope(self, T: Array) -> Array:
-        return np.broadcast_to(self.size / 30 * np.array([1.0, -0.5, 0.3]), (len(T), 3))
-
-
-class Supply(Effect):
-    """A bias that follows the supply voltage."""
-
-    kind: Literal["supply"] = "supply"
-    requires: ClassVar = ("voltage",)
+    kind: Literal["named"] = "named"
     explanation: ClassVar = "The supply reaches the sensor's readout."
-
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself."""
-        yield self
-
-    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the voltage."""
-        return on_each_axis(chunk["voltage"], len(self.axes)), memory
-
-
-class Named(Supply):
-    """An effect of a channel, with terms and hyper-parameters, that are called as somebody likes."""
-
-    kind: Literal["named"] = "named"  # type: ignore[assignment]
     channel: str = "voltage"
 
     @property
-    def requires(self) -> tuple[str, ...]:  # type: ignore[override]
+    def requires(self) -> tuple[str, ...]:
         """The channel."""
         return (self.channel,)
 
@@ -134,7 +105,7 @@ def unit(*mapped: str) -> Export:
             provenance={"device_id": "1310988"},
         )
         densities = size * np.array([0.1, 0.2, 0.15]), size * np.array([2e-3, 1e-3, 3e-3])
-        fitted = WavyMap(record, size=size) if channel in mapped else None
+        fitted = MadeMap(record, size=size) if channel in mapped else None
         sensors.append(Calibrated(channel, si, shown, AXES, fitted, (), *densities))
     return Export(tuple(sensors), 200.0, "17")
 
@@ -150,7 +121,8 @@ def writes_what_it_says_it_writes(exporter: Exporter) -> None:
         assert files, "no file is written"
         assert all(files.values()), f"{', '.join(name for name, content in files.items() if not content)}: is empty"
         if not exporter.folder:
-            assert list(files) == [_name(exporter)], f"{', '.join(files)} is written, {_name(exporter)} was asked for"
+            name = f"unit{exporter.suffix}"
+            assert list(files) == [name], f"{', '.join(files)} is written, {name} was asked for"
     for lost in loss.sensors:
         sensor = what.sensor(lost.sensor.channel)
         assert sensor is not None, f"a loss of {lost.sensor.channel} is reported, which the unit does not have"
@@ -190,11 +162,10 @@ def refuses_what_it_cannot_hold(exporter: Exporter) -> None:
 def refuses_a_map_that_gives_no_number(exporter: Exporter) -> None:
     """A map that gives no number somewhere in its domain is refused with ConfigError, where maps leave at all."""
     what = _accepted(exporter)
-    holed = [
-        one if one.map is None else replace(one, map=Holed(one.map.record, size=one.map.size))
+    holed = (
+        replace(one, map=replace(one.map, form="holed")) if isinstance(one.map, MadeMap) else one
         for one in what.sensors
-        if one.map is None or isinstance(one.map, WavyMap)
-    ]
+    )
     written = _written_or_refused(exporter, replace(what, sensors=tuple(holed)))
     if written is not None:
         assert not written[0].sensors, "a map that gives no number is exported; use Export.mapped, which refuses it"
@@ -203,7 +174,7 @@ def refuses_a_map_that_gives_no_number(exporter: Exporter) -> None:
 def takes_effects_that_a_warm__up_does_not_show(exporter: Exporter) -> None:
     """An effect of a channel that the simulated warm-up lacks is left out, or held; it is no reason to fail."""
     what = _accepted(exporter)
-    effect = Supply.model_validate({"kind": "supply", "coefficients": [1e-6, 2e-6, 3e-6]})
+    effect = Named(coefficients=(1e-6, 2e-6, 3e-6))
     more = replace(what, sensors=tuple(replace(one, effects=(effect,)) for one in what.sensors))
     with tempfile.TemporaryDirectory() as folder:
         loss, _ = _written(exporter, more, Path(folder))
@@ -277,7 +248,7 @@ PLAIN = "voltage"  # a text as most are
 def _with_a_line(what: Export) -> Export:
     """Return a unit with one map, which is a line: it is exported in no time."""
     (first, *_) = what.mapped
-    held = replace(first, map=StraightMap(first.fitted.record, size=1e-3))
+    held = replace(first, map=MadeMap(first.fitted.record, size=1e-3, form="straight"))
     return replace(what, sensors=tuple(held if one is first else replace(one, map=None) for one in what.sensors))
 
 
@@ -286,7 +257,7 @@ def _changed(what: Export, recorded: dict[str, Any], **more: Any) -> Export:
 
     def change(one: Calibrated) -> Calibrated:
         record = MapRecord.model_construct(**{**dict(one.fitted.record), **recorded})
-        return replace(one, map=StraightMap(record, size=1e-3), **more)
+        return replace(one, map=MadeMap(record, size=1e-3, form="straight"), **more)
 
     return replace(what, sensors=tuple(one if one.map is None else change(one) for one in what.sensors))
 
@@ -340,7 +311,7 @@ def _written_or_refused(
 
 
 def _path(exporter: Exporter, folder: Path) -> Path:
-    return folder if exporter.folder else folder / _name(exporter)
+    return folder if exporter.folder else folder / f"unit{exporter.suffix}"
 
 
 def _files(folder: Path) -> list[Path]:
@@ -356,10 +327,6 @@ def _content(what: Export) -> bytes:
         for one in what.sensors
     ]
     return pickle.dumps((sensors, what.rate, what.serial))
-
-
-def _name(exporter: Exporter) -> str:
-    return f"unit{exporter.suffix}"
 
 
 def _check_deviation(deviation: Deviation, d: int) -> None:

@@ -29,10 +29,6 @@ class Channel(OfChannel):
     columns: Annotated[int, Field(ge=1, le=64)] = 1
     """Number of columns of the channel."""
 
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself: which channels there are, the recordings say."""
-        yield self
-
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every auxiliary channel."""
         for name in auxiliary(recordings):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
@@ -23,10 +22,6 @@ class Drift(Effect):
     )
 
     kind: Literal["drift"] = "drift"
-
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself: there is nothing to search."""
-        yield self
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the time; the memory is the time of the first sample."""

@@ -27,10 +27,6 @@ class GSensitivity(Effect):
 
     kind: Literal["g_sensitivity"] = "g_sensitivity"
 
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself: there is nothing to search."""
-        yield self
-
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield itself where the unit was tilted during a recording: less may be the accelerometers' own drift."""
         for chunk in recordings:

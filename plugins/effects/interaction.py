@@ -39,10 +39,6 @@ class Interaction(Effect):
         """The two channels."""
         return self.channels
 
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself: which channels there are, the recordings say."""
-        yield self
-
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every pair of single-column channels, temperature among them, about their means; also their squares."""
         names = [name for name in (*auxiliary(recordings), "temperature") if recordings[0][name].ndim == 1]

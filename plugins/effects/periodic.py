@@ -35,10 +35,6 @@ class Periodic(Effect):
     period: Annotated[float, Unit("s", positive=True, example="97 s")] = Quantity(100.0, "100 s")
     """Period of the line."""
 
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself: the lines are found in the residual."""
-        yield self
-
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the highest lines of the residual's power, summed over axes and recordings."""
         for period in _lines(recordings):

@@ -6,22 +6,20 @@
     b = interp1(gyro.temperature, gyro.bias, T, 'spline');     % rad/s, one column an axis
 
 Rows are a fixed step apart. The loss of straight lines between them is measured, and that of a spline. A file that is
-read back is checked before scipy makes room for what it declares.
+read back is read element by element, and no further than the budget of a reader.
 """
 
 from __future__ import annotations
 
-import io
-import math
-import zlib
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from fusion_core.budget import DEEPEST, FILE, inflated, read_whole
+from fusion_core.budget import FILE, check_regular, check_size
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibration import TEMPERATURES
@@ -29,6 +27,7 @@ from fusion_core.errors import ConfigError, FusionError, UnreadableFile, quote
 from fusion_core.escaping import is_plain, line, matlab_name
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.mat_elements import Elements, Variable
 
 
 class Mat(Exporter):
@@ -78,19 +77,17 @@ class Mat(Exporter):
     def read(self, path: Path) -> list[ReadBack]:
         """Return the maps that a .mat file of this form has."""
         try:
-            content = content_of(path)
+            structs = structs_of(path)
         except FusionError:
             raise
         except Exception as error:  # of a damaged file scipy raises any of a dozen
             why = getattr(error, "strerror", None) or quote(error, 100)
             raise UnreadableFile(f"{path}: is no .mat file of version 5 ({why}); name one that was exported") from None
-        structs = [
-            item for item in content.values() if isinstance(item, dict) and "temperature" in item and "bias" in item
-        ]
-        if not structs:
+        maps = [fields for fields in structs.values() if "temperature" in fields and "bias" in fields]
+        if not maps:
             raise ConfigError(f"import {self.kind}: {path} has no struct with temperature and bias; name one that has")
-        method = str(content.get("driftlab", {}).get("interpolation", "linear"))
-        return [_read_back(item, method) for item in structs]
+        method = structs["driftlab"]["interpolation"].text if "driftlab" in structs else "linear"
+        return [_read_back(fields, method) for fields in maps]
 
     def _other(self, sensor: Calibrated, T: Array, bias: Array) -> str:
         """Return the loss of the other method than that of the settings, in words."""
@@ -158,86 +155,26 @@ def _without_date(path: Path) -> None:
         file.write(b"MATLAB 5.0 MAT-file, written by driftlab".ljust(116))
 
 
-def _read_back(item: dict[str, Any], method: str) -> ReadBack:
-    T, bias = np.atleast_1d(item["temperature"]), np.asarray(item["bias"], dtype=np.float64)
-    bias = bias.reshape(len(T), -1)
-    axes = tuple(str(axis) for axis in np.atleast_1d(item["axes"]))
-    unit = str(item["units"]["bias"])
+def _read_back(fields: Mapping[str, Variable], method: str) -> ReadBack:
+    T, bias = (np.asarray(fields[name].array, dtype=np.float64) for name in ("temperature", "bias"))
+    T, bias = T.ravel(), bias.reshape(T.size, -1)
+    axes = tuple(cell.text for cell in fields["axes"].cells)
+    unit = (fields["units"].fields or {})["bias"].text
     domain = (float(T[0]), float(T[-1]))
-    return ReadBack(str(item["channel"]), unit, axes, domain, between(T, bias, method), order=7)
+    return ReadBack(fields["channel"].text, unit, axes, domain, between(T, bias, method), order=7)
 
 
-MATRIX, COMPRESSED = 14, 15
-CELL, STRUCT = 1, 2
-READ = (CELL, STRUCT, 4, *range(6, 16))  # cells, structs, text and numbers
-
-
-def content_of(path: Path) -> dict[str, Any]:
-    """Return the variables of a file of version 5 to 7, structs as dictionaries.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ValueError
-        If it is damaged, of another version, or declares more than it holds.
-    """
-    from scipy.io import loadmat
-
-    data = read_whole(path)
-    if not data.startswith(b"MATLAB 5.0"):
-        raise ValueError("it does not begin as a MAT file of version 5 to 7 does")
-    order = ">" if data[126:128] == b"MI" else "<"
-    at, total = 128, 0
-    while at + 8 <= len(data):
-        kind, size, _ = _tag(data, at, order)
-        element = data[at : at + 8 + size]
-        if kind == COMPRESSED:
-            element = inflated(path, "a variable", zlib.decompressobj(), element[8:], FILE)
-        total += len(element)
-        if total > 4 * FILE:
-            raise UnreadableFile(f"{path}: its variables take more than {4 * FILE >> 20} MB, which is the limit")
-        _check(element, 0, len(element), order, 0)
-        at += 8 + size
-    content: dict[str, Any] = loadmat(io.BytesIO(data), simplify_cells=True)  # type: ignore[arg-type]
-    return content
-
-
-def _tag(data: bytes, at: int, order: str) -> tuple[int, int, int]:
-    """Return type and size of the element at a place, and where its content begins."""
-    first, second = np.frombuffer(data[at : at + 8], f"{order}u4").tolist()
-    return (first & 0xFFFF, first >> 16, at + 4) if first >> 16 else (first, second, at + 8)
-
-
-def _check(data: bytes, at: int, end: int, order: str, depth: int) -> None:
-    """Raise ValueError where a variable declares more values than it has bytes, or goes too deep."""
-    kind, size, begin = _tag(data, at, order)
-    if kind != MATRIX or begin + size > end or depth > DEEPEST:
-        raise ValueError(f"a variable is damaged, or more than {DEEPEST} deep")
-    if size == 0:
-        return
-    stop, at = begin + size, begin + 16
-    cls = int(np.frombuffer(data[begin + 8 : begin + 12], f"{order}u4")[0]) & 0xFF
-    _, size, begin = _tag(data, at, order)
-    count = math.prod(np.frombuffer(data[begin : begin + size], f"{order}i4").tolist())
-    at = _end_of(data, at, order)
-    at = _end_of(data, at, order)  # its name
-    fields = 1
-    if cls == STRUCT:
-        width = int(np.frombuffer(data[_tag(data, at, order)[2] :][:4], f"{order}i4")[0])
-        at = _end_of(data, at, order)
-        fields, at = _tag(data, at, order)[1] // max(width, 1), _end_of(data, at, order)
-    if cls not in READ or not 0 <= count * fields * (8 if cls in (CELL, STRUCT) else 1) <= stop - at:
-        raise ValueError(f"a variable of class {cls} declares {count} values in {stop - at} bytes")
-    while cls in (CELL, STRUCT) and at + 8 <= stop:
-        _check(data, at, stop, order, depth + 1)
-        at = _end_of(data, at, order)
-
-
-def _end_of(data: bytes, at: int, order: str) -> int:
-    """Return the place of the next element."""
-    _, size, begin = _tag(data, at, order)
-    return at + 8 if begin == at + 4 else begin + size + -size % 8
+def structs_of(path: Path) -> dict[str, Mapping[str, Variable]]:
+    """Return the structs of a file of version 5 to 7; raises what reading it raises."""
+    check_regular(path)
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if not file.read(10) == b"MATLAB 5.0":
+            raise ValueError("it does not begin as a MAT file of version 5 to 7 does")
+        check_size(path, "all of it", size, FILE)
+        elements = Elements(path, file, size)
+        variables = [elements.load(at) for _, at in elements.variables()]
+    return {variable.name: variable.fields for variable in variables if variable and variable.fields}
 
 
 @hookimpl

@@ -23,10 +23,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Detector, Sensor
+from fusion_core.fast import compiled, inlined
 from fusion_core.model import Flags
 from fusion_plugins.measurement_models import alignment
 from fusion_plugins.measurement_models.alignment import steepest
@@ -74,31 +74,31 @@ class RestDetector(Detector):
             rate = chunk.channels.get("temperature_rate", rate)
         memory = memory.copy()
         limit = (OUTLIER * self.density) ** 2
-        still, out = _look(chunk.t, chunk["tau"], x, T, rate, limit, steep, self.patience, memory)
+        means, rest = memory[: 7 * len(self.axes)].reshape(7, -1), memory[7 * len(self.axes) :]
+        still, out = _look(chunk.t, chunk["tau"], x, T, rate, limit, steep, self.patience, means, rest)
         return still, out, memory
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled
 def _look(
-    t: Array, tau: Array, x: Array, T: Array, rate: Array, limit: Array, steep: Array, patience: float, memory: Array
-) -> tuple[Flags, Flags]:
-    """Run the detector; the memory (7 D + 20) is changed in place.
+    t: Array, tau: Array, x: Array, T: Array, rate: Array, limit: Array, steep: Array, patience: float,
+    means: Array, rest: Array,
+) -> tuple[Flags, Flags]:  # fmt: skip
+    """Run the detector; the memory, means (7, D) and the rest (20,), is changed in place.
 
     For each axis the level's means over LEVEL and LONG, the same of another level, the mean over FAST, its weight and
     its age; then of the two levels what `_average` keeps, the temperature over FAST with its weight, what the
     thermometer scatters (variance, last reading), whether it moves, two counters in s, and the last time.
     """
     N, D = x.shape
-    means = memory[: 7 * D].reshape(7, D)
     level, other, fast = means[:2], means[2:4], means[4:]
-    rest = memory[7 * D :]
     of_level, of_other, warm, counters = rest[:6], rest[6:12], rest[12:16], rest[16:]
     still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
     moving, quiet, settled, last = counters[0] > 0.0, counters[1], counters[2], counters[3]
     for k in range(N):
         dt = t[k] - last
         if dt > FORGET:
-            memory[:-4] = 0.0
+            means[:], rest[:16] = 0.0, 0.0
             moving, quiet, settled, dt = False, 0.0, 0.0, tau[k]
             warm[3] = T[k]
         last = t[k]
@@ -118,8 +118,7 @@ def _look(
             _average(other, of_other, x, k, warm[0], tau[k])
             moving = settled < patience and quiet < HOLD
             if settled >= patience:
-                level[:], of_level[:] = other, of_other
-                fast[0], fast[1], fast[2] = other[0], of_other[0], of_other[2]
+                _settle(level, of_level, fast, other, of_other)
         if not moving:
             _average(level, of_level, x, k, warm[0], tau[k])
         still[k] = not moving
@@ -127,7 +126,17 @@ def _look(
     return still, out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
+def _settle(level: Array, of_level: Array, fast: Array, other: Array, of_other: Array) -> None:
+    """Take another level for the level; one by one, as to copy arrays would take seconds more to compile."""
+    for i in range(len(of_level)):
+        of_level[i] = of_other[i]
+    for j in range(level.shape[1]):
+        level[0, j], level[1, j] = other[0, j], other[1, j]
+        fast[0, j], fast[1, j], fast[2, j] = other[0, j], of_other[0], of_other[2]
+
+
+@inlined
 def _warm(warm: Array, T: float, tau: float) -> None:
     """Take a temperature into its mean over FAST (`warm`: mean, weight, variance of a reading, last reading)."""
     warm[1] = min(warm[1], FAST) + tau
@@ -136,7 +145,7 @@ def _warm(warm: Array, T: float, tau: float) -> None:
     warm[3] = T
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _fast(fast: Array, x: Array, k: int, tau: float, dt: float) -> None:
     """Take row k of x (N, D), which lasted tau s, into means over FAST, with weights and ages (3, D)."""
     before, share = -1.0, 0.0
@@ -149,7 +158,7 @@ def _fast(fast: Array, x: Array, k: int, tau: float, dt: float) -> None:
         fast[2, j] = (fast[2, j] + dt) * (1.0 - share)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _average(means: Array, of: Array, x: Array, k: int, T: float, tau: float) -> None:
     """Take row k of x (N, D) into means (2, D) over LEVEL and LONG; `of` has their weights, ages and temperatures."""
     of[0], of[1] = min(of[0], LEVEL) + tau, min(of[1], LONG) + tau
@@ -161,7 +170,7 @@ def _average(means: Array, of: Array, x: Array, k: int, T: float, tau: float) ->
         means[1, j] += less * (x[k, j] - means[1, j])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _departs(
     x: float, w: float, age: float, j: int, limit: float, steep: float, means: Array, of: Array, warm: Array,
     rate: float, tau: float,
@@ -190,7 +199,7 @@ def _departs(
     return bool(max(abs(off) - allowed, 0.0) ** 2 > limit * variance)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, fast: Array) -> bool:
     """Return True if all axes are as near their levels as noise alone takes them, or have none: nearly always."""
     if of[0] == 0:
@@ -206,7 +215,7 @@ def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, f
     return True
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _stands_out(
     x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
     rate: float, out: Flags,
@@ -223,7 +232,7 @@ def _stands_out(
     return stands
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@inlined
 def _leaves(
     x: Array, k: int, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
 ) -> bool:

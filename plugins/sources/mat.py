@@ -27,7 +27,7 @@ from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.mat_elements import Elements, Old, Variable
+from fusion_plugins.mat_elements import Elements, Old, Variable
 from fusion_plugins.sources.unpacked import translated
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")

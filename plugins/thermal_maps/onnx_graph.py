@@ -1,4 +1,4 @@
-"""The ONNX graph of a small network: written by skl2onnx, checked, and read back as a chain of layers.
+"""The ONNX graph of a small network: written, checked, and read back as a chain of layers.
 
 A chain is what a slope can be taken from: MatMul or Gemm, Add and Tanh, one after the other. A bias can be taken
 from any graph that gives a slope.
@@ -44,22 +44,22 @@ class NetworkFile(MapFile):
 
 def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | None = None) -> bytes:
     """Return the ONNX file of a network with its record; one of a slope has the bias (d,) at T_min too."""
-    from onnx import numpy_helper
-    from skl2onnx import convert_sklearn
-    from skl2onnx.common.data_types import DoubleTensorType
-    from sklearn.neural_network import MLPRegressor
+    from onnx import TensorProto, helper, numpy_helper
 
-    d = record.d
-    regressor = MLPRegressor(hidden_layer_sizes=tuple(len(a) for _, a in network[:-1]), activation="tanh")
-    regressor.coefs_, regressor.intercepts_ = [W for W, _ in network], [a for _, a in network]
-    regressor.n_layers_, regressor.n_outputs_, regressor.n_features_in_ = len(network) + 1, d, 1
-    regressor.out_activation_ = "identity"
-    model = convert_sklearn(regressor, "thermal_map", [("temperature", DoubleTensorType([None, 1]))], target_opset=17)
-    last = model.graph.node[-1]
-    for initializer in model.graph.initializer:  # its Reshape to (-1, 1) would give d axes as (d N, 1)
-        if last.op_type == "Reshape" and initializer.name == last.input[1]:
-            initializer.CopyFrom(numpy_helper.from_array(np.array([-1, d]), initializer.name))
-    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = d
+    nodes, constants, value = [], [], "temperature"
+    for k, layer in enumerate(network, 1):
+        names = [f"W_{k}", f"a_{k}"]
+        constants += [numpy_helper.from_array(array, name) for array, name in zip(layer, names, strict=True)]
+        steps = [("MatMul", [names[0]]), ("Add", [names[1]]), ("Tanh", [])][: 3 if k < len(network) else 2]
+        for operation, others in steps:
+            nodes.append(helper.make_node(operation, [value, *others], [f"{operation}_{k}"]))
+            value = f"{operation}_{k}"
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.DOUBLE, [None, width])
+        for name, width in (("temperature", 1), (value, record.d))
+    ]
+    graph = helper.make_graph(nodes, "thermal_map", ends[:1], ends[1:], constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     return described(model, record, constant)
 
 

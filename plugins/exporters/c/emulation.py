@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit
 
 from fusion_core.contracts.effect import Behind, Elapsed, Fading, Limited, PlayState, Product, Reading, Signal, Weighted
+from fusion_core.fast import compiled
 from fusion_plugins.exporters.c.program import LookupTable, Program, Single
 
 LONGEST = np.float32(1e6)  # s: of a step
@@ -91,7 +91,7 @@ def durations(dt: Single) -> Single:
     return np.asarray(np.minimum(known, LONGEST), dtype=np.float32)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def finite_readings(u: Single, last: np.float32, lowest: np.float32, highest: np.float32) -> Single:
     """Return u (N,) between two limits; a value that is not finite is the one before, `last` at first."""
     out = np.empty_like(u)
@@ -102,7 +102,7 @@ def finite_readings(u: Single, last: np.float32, lowest: np.float32, highest: np
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def share_gone(h: np.float32) -> np.float32:
     """Return 1 - exp(-h)."""
     if not h < _FAR:
@@ -120,7 +120,7 @@ def share_gone(h: np.float32) -> np.float32:
     return gone
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Single:
     """Return the part of u (N,) that a lag has not followed yet, `behind` at first."""
     out = np.empty_like(u)
@@ -140,7 +140,7 @@ def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Singl
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def playing(u: Single, half: np.float32) -> Single:
     """Return the place of a play of twice the half width in its loop, from the middle."""
     out = np.empty_like(u)
@@ -155,7 +155,7 @@ def playing(u: Single, half: np.float32) -> Single:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def ticking(dt: Single) -> Single:
     """Return the time since the first sample: whole seconds, and what is left of them."""
     out = np.empty_like(dt)

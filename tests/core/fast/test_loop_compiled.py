@@ -24,12 +24,13 @@ def compiled():
     from numba.core.registry import CPUDispatcher
 
     import driftlab
+    from fusion_core.fast import Compiled
 
     for package in [*PACKAGES, driftlab]:
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             module = importlib.import_module(info.name)
             for name, value in vars(module).items():
-                if isinstance(value, CPUDispatcher) and value.py_func.__module__ == info.name:
+                if isinstance(value, CPUDispatcher | Compiled) and value.py_func.__module__ == info.name:
                     yield name, value.py_func
 
 

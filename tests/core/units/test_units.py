@@ -1,4 +1,4 @@
-"""Quantities that a user writes, and the errors that answer."""
+"""What a user writes: quantities, and the errors that answer."""
 
 import copy
 import pickle

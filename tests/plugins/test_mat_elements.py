@@ -10,10 +10,10 @@ import pytest
 
 from fusion_core.errors import FusionError, UnreadableFile
 from fusion_core.faults import Faults
-from fusion_plugins.sources import mat_elements
+from fusion_plugins import mat_elements
 from fusion_plugins.sources.mat import Mat
 
-sys.path.append(str(Path(__file__).parents[2]))
+sys.path.append(str(Path(__file__).parents[1]))
 from torture import bombs_of_arrays as bombs
 
 CHANNELS = {"time": {"path": "time", "unit": "s"}, "gyro": {"path": "gyro", "unit": "rad/s"}}

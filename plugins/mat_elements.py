@@ -25,20 +25,26 @@ NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"
 }  # fmt: skip
 MATRIX, COMPRESSED = 14, 15
-STRUCT, OPAQUE, COMPLEX = 2, 17, 1 << 11
+ENCODINGS = {4: "utf-16-le", 17: "utf-16-le", 18: "utf-32-le"}  # of texts; the others are of UTF-8
+CELL, STRUCT, TEXT, OPAQUE, COMPLEX = 1, 2, 4, 17, 1 << 11
 KINDS = {1: "a cell array", 3: "an object of a class", 4: "text", 5: "a sparse matrix", 16: "a function"}
 OLD = ("f8", "f4", "i4", "i2", "u2", "u1")  # numbers of version 4
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable, or a field of one: an array of numbers, with `array` where it is loaded, or else `what` it is."""
+    """A variable, or a field of one: an array of numbers, with `array` where it is loaded, or else `what` it is.
+
+    A text that is loaded is in `text`, the cells of an array of them are in `cells`.
+    """
 
     name: str
     what: str = ""
     shape: tuple[int, ...] = (0, 0)
     array: NDArray[Any] | None = None
     fields: Mapping[str, Variable] | None = None
+    text: str = ""
+    cells: tuple[Variable, ...] = ()
 
 
 class Plain:
@@ -194,32 +200,42 @@ class Elements:
             return Variable(name, "a struct", shape, fields=self._fields(stream, load, depth))
         if flags & COMPLEX and kind not in KINDS:
             return Variable(name, "complex", shape)
+        if load and kind == TEXT:
+            tag, content = self._typed_element(stream)
+            return Variable(name, KINDS[kind], shape, text=content.decode(ENCODINGS.get(tag, "utf-8")))
+        if load and kind == CELL:
+            cells = tuple(self._inner(stream, load, depth) for _ in range(math.prod(shape)))
+            return Variable(name, KINDS[kind], shape, cells=cells)
         if kind in KINDS or not 6 <= kind <= 15:
             return Variable(name, KINDS.get(kind, f"of class {kind}"), shape)
         return Variable(name, "", shape, self._numbers(stream, shape) if load else None)
 
     def _fields(self, stream: Stream, load: bool, depth: int) -> Mapping[str, Variable]:
-        if depth >= DEEPEST:
-            raise ValueError(f"structs are within one another more than {DEEPEST} deep, which is the limit")
         width = int(np.frombuffer(self._element(stream), f"{self.order}i4")[0])
         names = self._element(stream, SHORT * 64)
         if width <= 0 or len(names) % width:
             raise ValueError("the names of a struct's fields are damaged")
         fields = {}
         for k in range(0, len(names), width):
-            self.fields += 1
-            if self.fields > NAMES:
-                raise ValueError(f"structs have more than {NAMES:,} fields, which is the limit")
-            kind, size, _ = self._tag(stream)
-            if kind != MATRIX:
-                raise ValueError(f"a field was expected, an element of type {kind} was found")
-            end = stream.at + size
-            field = self._matrix(stream, end, load, depth + 1)
-            if stream.at > end:
-                raise ValueError("a field is longer than it declares")
-            stream.skip(end - stream.at)
-            fields[names[k : k + width].partition(b"\0")[0].decode("latin-1")] = field
+            fields[names[k : k + width].partition(b"\0")[0].decode("latin-1")] = self._inner(stream, load, depth)
         return fields
+
+    def _inner(self, stream: Stream, load: bool, depth: int) -> Variable:
+        """Return the next field of a struct, or cell of an array of them."""
+        self.fields += 1
+        if self.fields > NAMES:
+            raise ValueError(f"structs have more than {NAMES:,} fields, which is the limit")
+        if depth >= DEEPEST:
+            raise ValueError(f"structs are within one another more than {DEEPEST} deep, which is the limit")
+        kind, size, _ = self._tag(stream)
+        if kind != MATRIX:
+            raise ValueError(f"a field was expected, an element of type {kind} was found")
+        end = stream.at + size
+        inner = self._matrix(stream, end, load, depth + 1)
+        if stream.at > end:
+            raise ValueError("a field is longer than it declares")
+        stream.skip(end - stream.at)
+        return inner
 
     def _numbers(self, stream: Stream, shape: tuple[int, ...]) -> NDArray[Any]:
         kind, size, short = self._tag(stream)
@@ -251,11 +267,15 @@ class Elements:
 
     def _element(self, stream: Stream, most: int = SHORT) -> bytes:
         """Return the content of the next element, which tells a variable."""
-        _, size, short = self._tag(stream)
+        return self._typed_element(stream, most)[1]
+
+    def _typed_element(self, stream: Stream, most: int = SHORT) -> tuple[int, bytes]:
+        """Return type and content of the next element, which is a short one."""
+        kind, size, short = self._tag(stream)
         if short is not None:
-            return short[:size]
+            return kind, short[:size]
         check_size(self.path, "what tells a variable", size, most)
-        return stream.read(size + -size % 8)[:size]
+        return kind, stream.read(size + -size % 8)[:size]
 
 
 class Old:
