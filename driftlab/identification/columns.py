@@ -27,6 +27,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from driftlab.identification.records import Evidence, map_inputs
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
+from fusion_core.fast import compiled
 
 Indices = NDArray[np.intp]
 
