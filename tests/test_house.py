@@ -244,7 +244,7 @@ BUDGET = {
     "driftlab": 583,
     "driftlab/commands": 2763,
     "driftlab/evaluation": 1289,
-    "driftlab/family": 2732,
+    "driftlab/family": 2733,
     "driftlab/filtering": 1198,
     "driftlab/identification": 2192,
     "driftlab/live": 777,
