@@ -251,7 +251,7 @@ BUDGET = {
     "driftlab/production": 2195,
     "driftlab/products": 6,
     "driftlab/recordings": 452,
-    "driftlab/reports": 2561,
+    "driftlab/reports": 2560,
     "driftlab/soak": 658,
     "driftlab/spc": 596,
     "driftlab/starter": 569,

@@ -11,11 +11,10 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import note_compiling, print_json, say_lines, session, terminal
+from driftlab.commands.console import note_compiling, print_json, say, session, terminal
 from driftlab.commands.estimates import PERIOD, EstimatesWriter
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.commands.run import RunResult, finish, show
@@ -42,11 +41,10 @@ TICK = 1.0  # s: how often the status is reported at least
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
 
-@dataclass(eq=False)
 class Live:
     """A live run.
 
-    Attributes
+    Parameters
     ----------
     config : Config
         With a live source.
@@ -60,37 +58,42 @@ class Live:
         Whether to replace a recording, and results that a device gave.
     soaking : GrowingMap or None
         A map that is fitted meanwhile, written at the end.
+
+    Attributes
+    ----------
     report : callable
         Called with the status at every chunk, and every second in which none comes: then by another thread.
     seen : callable
         Called with each segment of estimates.
-    stop : Event
-        Set it to end the run cleanly.
     """
 
-    config: Config
-    record: Path | None = None
-    duration: float | None = None
-    resume: bool = False
-    force: bool = False
-    soaking: GrowingMap | None = None
-    report: Callable[[Status], None] = lambda status: None
-    seen: Callable[[RunSegment], None] = lambda segment: None
-    stop: threading.Event = field(default_factory=threading.Event)
-    recorder: Recorder | None = None
-
-    def __post_init__(self) -> None:
-        source, model = self.config.source, self.config.filter
-        if source is None or not source.live:
-            kind = "none" if source is None else source.kind
+    def __init__(
+        self,
+        config: Config,
+        *,
+        record: Path | None = None,
+        duration: float | None = None,
+        resume: bool = False,
+        force: bool = False,
+        soaking: GrowingMap | None = None,
+    ) -> None:
+        if config.source is None or not config.source.live:
+            kind = "none" if config.source is None else config.source.kind
             raise ConfigError(f"source: a live one is needed and this is {kind}; use kind: serial, or `driftlab run`")
-        if self.resume and self.record is None:
+        if resume and record is None:
             raise ConfigError("--resume: a live run can only go on with its recording; add --record FILE")
-        self.source, self.status = source, Status(sensor=None if model is None else model.tracked)
+        self.config, self.source, self.record = config, config.source, record
+        self.duration, self.resume, self.force = duration, resume, force
+        self.report: Callable[[Status], None] = lambda status: None
+        self.seen: Callable[[RunSegment], None] = lambda segment: None
         self._reporting, self._reported = threading.Lock(), 0.0
-        if self.soaking is not None:
-            self._known(self.soaking.status)
-            self.soaking.publish = self._known
+        self.stop = threading.Event()  # set it to end the run cleanly
+        self.status = Status(sensor=None if config.filter is None else config.filter.tracked)
+        self.recorder: Recorder | None = None
+        self.soaking = soaking
+        if soaking is not None:
+            self._known(soaking.status)
+            soaking.publish = self._known
 
     def to_folder(self, out: Path) -> RunResult:
         """Run until stopped, and write the same files as `driftlab.commands.run.run` into the folder `out`.
@@ -109,7 +112,7 @@ class Live:
             recording=self.record,
             durable=True,
         )
-        with held as folder, self.doing(self.status.phase), ExitStack() as open:
+        with held as folder, self._ticking(), ExitStack() as open:
             if self.record is not None:
                 self.recorder = Recorder(self.record, self.config.as_yaml(), resume=self.resume, force=self.force)
                 open.callback(self.recorder.close)
@@ -121,7 +124,7 @@ class Live:
     def _run(self, folder: Path, open: ExitStack, out: Path) -> RunResult:
         journal, faults = RunLog(), self.status.faults
         estimates = EstimatesWriter(
-            folder, self.config, journal, recording=self.record, live=True, more=self._samples_made_safe
+            folder, self.config, journal, recording=self.record, live=True, more=self._before_checkpoint
         )
         open.callback(estimates.close)
         before = estimates.load_checkpoint() if self.resume else None
@@ -156,9 +159,8 @@ class Live:
         return finish(estimates, run.model, out, self.record)
 
     @contextmanager
-    def doing(self, phase: Phase) -> Iterator[None]:
-        """Report a phase at once, then every second until it is done, also where a source keeps the run waiting."""
-        self.status.phase = phase
+    def _ticking(self) -> Iterator[None]:
+        """Report at once, then every second, also while the filter is compiled or a source keeps the run waiting."""
         done = threading.Event()
 
         def tick() -> None:
@@ -175,6 +177,13 @@ class Live:
             done.set()
             thread.join()
 
+    @contextmanager
+    def doing(self, phase: Phase) -> Iterator[None]:
+        """Report a phase after the run, until it is done."""
+        self.status.phase = phase
+        with self._ticking():
+            yield
+
     def _known(self, status: GrowingMapStatus) -> None:
         """Take the status of the map."""
         self.status.map = status
@@ -186,7 +195,7 @@ class Live:
             self._reported = time.monotonic()
             self.report(self.status)
 
-    def _samples_made_safe(self) -> dict[str, Any]:
+    def _before_checkpoint(self) -> dict[str, Any]:
         """Make the samples safe that a checkpoint stands on, and return what else it holds."""
         if self.recorder is not None:
             self.recorder.flush()
@@ -285,7 +294,7 @@ def live(
         _write({"summary": result.summary, **({} if growing is None else {"map": growing.status.as_json()})})
     else:
         show(result, {"out": out})
-        say_lines(known if problem is None else ())
+        say("".join(f"{line}\n" for line in known if problem is None))
     if problem is not None:
         raise problem
 
@@ -381,27 +390,18 @@ def _ignored(number: int) -> bool:
 
 @contextmanager
 def _reporting(run: Live, json: bool, watch: LiveHistory | None) -> Iterator[None]:
-    """Report to the page at once, and to a program or a terminal now and then."""
+    def both(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
+        seldom = _every(period, run, report)
 
-    def now_and_then(period: float, show: Callable[[Status], Any]) -> Callable[[Status], None]:
-        last = -period
-
-        def report(status: Status) -> None:
-            nonlocal last
+        def report_to_both(status: Status) -> None:
             if watch is not None:
                 watch.report(status)
-            if time.monotonic() - last >= period:
-                last = time.monotonic()
-                try:
-                    show(status)
-                except OSError:  # no one reads it any more: the run ends, nothing measured is lost
-                    last = math.inf
-                    run.stop.set()
+            seldom(status)
 
-        return report
+        return report_to_both
 
     if json:
-        run.report = now_and_then(JSON_PERIOD, lambda status: _write(status.as_json()))
+        run.report = both(JSON_PERIOD, lambda status: _write(status.as_json()))
         yield
         return
     from rich.live import Live as Screen
@@ -409,11 +409,28 @@ def _reporting(run: Live, json: bool, watch: LiveHistory | None) -> Iterator[Non
     console = terminal()
     try:
         with Screen(console=console, auto_refresh=False) as live_screen:
-            run.report = now_and_then(SCREEN_PERIOD, lambda status: live_screen.update(screen(status), refresh=True))
+            run.report = both(SCREEN_PERIOD, lambda status: live_screen.update(screen(status), refresh=True))
             yield
     finally:
         if not console.is_terminal:  # a file gets the last screen, without the end of its line
             console.line()
+
+
+def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callable[[Status], None]:
+    """Return a report that is made seldom. When no one reads it any more, the run ends: nothing measured is lost."""
+    last = -period
+
+    def seldom(status: Status) -> None:
+        nonlocal last
+        if time.monotonic() - last >= period:
+            last = time.monotonic()
+            try:
+                report(status)
+            except OSError:
+                last = math.inf
+                run.stop.set()
+
+    return seldom
 
 
 def _write(content: dict[str, Any]) -> None:
