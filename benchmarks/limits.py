@@ -29,7 +29,7 @@ from driftlab.config import Limits
 from driftlab.evaluation.limits import Measured, check_limits
 from driftlab.evaluation.measurements import of_allan, of_coast, of_map
 from driftlab.evaluation.scores import score
-from driftlab.maps.assessment import judge as judge_map
+from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.residual import residual_of
 from driftlab.noise.allan import curve
 from driftlab.noise.allan_fit import fit
@@ -142,7 +142,7 @@ def of_play(rng: Rng, law: str, program: str, width: float) -> dict[str, Unit]:
     bias = bias + (T - played)[:, None] * slope
     settings = Spline()
     fitted = settings.fit(T, bias, {})
-    verdict = judge_map(fitted, settings, brief(T, bias, [0], DT), AXES)
+    verdict = MapVerdict(fitted, settings, brief(T, bias, [0], DT))
     return {"hysteresis": (of_map(verdict.map)["hysteresis"], 2 * width * np.abs(slope))}
 
 
@@ -154,7 +154,7 @@ def of_memory(rng: Rng, memory: str) -> dict[str, Unit]:
     one = foreign_soaks.draw(number, str(program), hours, str(noise), memory, size, interval=5.0)
     settings = Spline()
     fitted = settings.fit(one.T, one.bias, {})
-    verdict = judge_map(fitted, settings, brief(one.T, one.bias, [0], one.interval), AXES)
+    verdict = MapVerdict(fitted, settings, brief(one.T, one.bias, [0], one.interval))
     return {"hysteresis": (of_map(verdict.map)["hysteresis"], one.size)}
 
 

@@ -4,7 +4,7 @@ Of each unit and axis the curve and the figures of its record are compared with 
 (`driftlab.family.outlier_tests`). A unit's tests are taken together as Simes (1986) has it, Benjamini & Hochberg
 (1995) choose the units at FALSE, and of a chosen unit those tests are reported that pass at FALSE times the share of
 units that were chosen (Benjamini & Bogomolov 2014). A new unit of a family that is known is one more of that family's
-units, which are taken as ordinary. A lot that is off as a whole is reported as a lot (`find_odd_lots`): its units are
+units, which are taken as ordinary. A lot that is off as a whole is reported as a lot (`Outliers.lots`): its units are
 compared with one another.
 
 The reason of an odd curve is the hypothesis under which it is likeliest. Each is a law of the coefficients, and with

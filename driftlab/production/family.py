@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, Self, cast
 
 import numpy as np
+from pydantic import ValidationError
 
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
@@ -34,7 +35,7 @@ from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, quote
 
 NOTHING = SharedEffects()
 
@@ -94,8 +95,8 @@ def analyse(
         if known is None:
             family, common, units, why = _fitted(store, status, progress, each, until_analysed)
         else:
-            (family, common), why = _read(known, store, status), ""
-            units = until_analysed.enter_context(UnitSpool(store, common, each))
+            (family, common), why = _read(known, store, status) if records else (None, NOTHING), ""
+            units = until_analysed.enter_context(UnitSpool(store, common, each)) if records else None
         progress(Stage("what the line did"))
         levels = {} if family is None or units is None else _levels(family, units)
         before = None if known is None or family is None else {LEVEL: _level_law(family)}
@@ -150,9 +151,16 @@ def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, Sh
     family = load_family(path, channel=status.channel, bias_unit=status.bias_unit)
     try:
         family.information_of(next(iter(store))[0])
+        common = NOTHING if family.common_effects is None else SharedEffects.model_validate(family.common_effects)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ConfigError(
+            f"--family {path}: common_effects.{'.'.join(map(str, first['loc']))}: {quote(first['msg'])}; install the "
+            "plugin that the family was fitted with, or fit it again with driftlab fleet"
+        ) from None
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
-    return family, NOTHING if family.common_effects is None else SharedEffects.model_validate(family.common_effects)
+    return family, common
 
 
 def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:

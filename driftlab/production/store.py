@@ -181,7 +181,7 @@ class FleetFolder:
     def _replace(self, unit: str) -> None:
         place = self.unit(unit)
         new, old = (place.with_name(f".{unit}{ending}") for ending in (NEW, OLD))
-        if place.exists():
+        if os.path.lexists(place):
             os.rename(place, old)
         os.rename(new, place)
         _take_along(old, place)
@@ -189,9 +189,9 @@ class FleetFolder:
     def _finish(self) -> None:
         """Finish what a command that was killed had begun to replace."""
         for path in sorted(path for path in (self.path / UNITS).iterdir() if path.name[0] == "."):
-            place = path.with_name(path.name[1:].removesuffix(OLD).removesuffix(NEW))
             if path.name.endswith(OLD):
-                if place.exists():
+                place = path.with_name(path.name[1:].removesuffix(OLD))
+                if os.path.lexists(place):
                     _take_along(path, place)
                 else:
                     os.rename(path, place)
@@ -200,11 +200,13 @@ class FleetFolder:
 
     def close(self) -> None:
         """Give the folder back."""
-        self._journal.close()
-        if len(self.stamps) * 2 < sum(1 for _ in _stamps(self.path / STAMPS)):
-            lines = (json.dumps([unit, *known]) + "\n" for unit, known in self.stamps.items())
-            self.write(STAMPS, "".join(lines).encode())
-        self.lock.release()
+        try:
+            self._journal.close()
+            if len(self.stamps) * 2 < sum(1 for _ in _stamps(self.path / STAMPS)):
+                lines = (json.dumps([unit, *known]) + "\n" for unit, known in self.stamps.items())
+                self.write(STAMPS, "".join(lines).encode())
+        finally:
+            self.lock.release()
 
 
 def _content(record: UnitRecord) -> bytes:
@@ -218,7 +220,10 @@ def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
 
 def _take_along(old: Path, place: Path) -> None:
     """Remove a unit's folder that was replaced, but for what driftlab did not write so: that goes to the new one."""
-    if not old.exists():
+    if not os.path.lexists(old):
+        return
+    if old.is_symlink() or not old.is_dir():  # somebody's
+        os.rename(old, free(place / place.name))
         return
     for inside in INSIDE:
         folder = old / inside

@@ -136,7 +136,7 @@ def _settled(z: Array, a: Array, places: list[int], alpha: float) -> list[LevelS
         moved = [step.at for step in steps_at]
         weakest = max(steps_at, key=lambda step: step.p, default=None)
         if weakest is not None and weakest.p > alpha:
-            places = [at for at in moved if at != weakest.at]
+            places = sorted({step.at for step in steps_at if step is not weakest})
         elif moved == places or tuple(moved) in before:
             return sorted({step.at: step for step in steps_at}.values(), key=lambda step: step.at)
         else:

@@ -108,9 +108,11 @@ class Folder:
         self._check_can_be_computed_again(self.folder)
 
     def _names(self) -> list[str]:
-        names = [name for name in os.listdir(self.folder) if name != self.partial.name]
+        names = os.listdir(self.folder)
+        if not self.inside:
+            return names
         # what a file system brings along stays where it is
-        return [name for name in names if name != "lost+found" and name[0] != "."] if self.inside else names
+        return [name for name in names if name not in (self.partial.name, "lost+found") and name[0] != "."]
 
     def _check_can_be_computed_again(self, folder: Path) -> None:
         why = None if self.force else only_copy(folder, self.recording)
@@ -167,7 +169,8 @@ class Folder:
         if self.inside:
             self._move_in()
             self.lock.release()
-            shutil.rmtree(self.partial, ignore_errors=True)
+            with suppress(OSError):  # empty, if nobody has begun another one meanwhile
+                self.partial.rmdir()
             return
         before = self.partial / BEFORE
         if self.folder.exists():
@@ -201,13 +204,16 @@ class Folder:
             remove(self.folder / name)
         for name in sorted(set(os.listdir(self.partial)) - {LOCK, BEFORE}, key=first.__eq__):
             os.replace(self.partial / name, self.folder / name)
+        before.unlink()
 
     def _finish_moving(self) -> None:
         """Do the rest where a command was killed while it moved its files in."""
-        lock = Lock(self.partial / LOCK, self.subject)
+        lock, first = Lock(self.partial / LOCK, self.subject), FILES[self.command][0]
         try:
-            if written(self.partial / FILES[self.command][0]):
+            if written(self.partial / first):
                 self._move_in()
+            elif written(self.folder / first):  # the last of them had its place already
+                (self.partial / BEFORE).unlink()
         finally:
             lock.release(remove=False)
 

@@ -77,7 +77,9 @@ def put(new: Path, path: Path, command: str, subject: str) -> None:
         kept = place.with_name(f"{place.name}.partial")
         if new != kept:
             os.replace(new, kept := free(kept))
-        raise ConfigError(f"{error}; the new one is {path.with_name(kept.name)}") from None
+        raise ConfigError(
+            f"{error}; the new one is {kept if path.is_symlink() else path.with_name(kept.name)}"
+        ) from None
     os.replace(new, place)
 
 

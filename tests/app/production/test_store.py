@@ -9,6 +9,7 @@ from driftlab.errors import ConfigError, Unwritable
 from driftlab.family.record import UnitRecord
 from driftlab.production import store
 from driftlab.production.store import fleet_folder
+from driftlab.storage.folders import remove
 
 FAILED = {"key": "k", "state": "failed", "error": "none"}
 
@@ -193,3 +194,23 @@ def test_a_mark_that_is_edited_while_the_fleet_goes_on_is_put_aside(tmp_path):
     assert (tmp_path / "fleet" / "fleet.json.before-1").read_text() == "mine"
     with fleet_folder(tmp_path / "fleet") as folder:
         assert folder.mark["complete"]
+
+
+def test_a_link_in_the_place_of_a_unit_goes_along_each_time_that_the_unit_is_made_anew(tmp_path):
+    (tmp_path / "moved").mkdir()
+    with fleet_folder(tmp_path / "fleet") as folder:
+        for _ in range(2):
+            folder.unit("6").symlink_to(tmp_path / "moved")
+            folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+            assert (folder.unit("6") / "6").is_symlink()
+            remove(folder.unit("6"))
+
+
+def test_a_unit_called_new_is_found_again_after_a_kill(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(UnitRecord(unit="6", **FAILED), {"map.json": b"6"}, "stamp")
+        folder.put(UnitRecord(unit="6.new", **FAILED), {"map.json": b"6.new"}, "stamp")
+        folder.unit("6.new").rename(folder.unit(".6.new.old"))
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert (folder.unit("6.new") / "map.json").read_bytes() == b"6.new"
+        assert (folder.unit("6") / "map.json").read_bytes() == b"6"

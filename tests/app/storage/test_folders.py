@@ -171,7 +171,8 @@ def test_a_folder_that_cannot_be_renamed_is_written_to(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("before", [False, True], ids=["new", "replaced"])
-def test_a_kill_while_files_are_moved_in_one_by_one_is_made_up_for(tmp_path, monkeypatch, before):
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_kill_while_files_are_moved_in_one_by_one_is_made_up_for(tmp_path, monkeypatch, before, resume):
     """Before each change of a name: what is there then is refused to nobody but who edited it."""
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path / "out")
@@ -197,9 +198,23 @@ def test_a_kill_while_files_are_moved_in_one_by_one_is_made_up_for(tmp_path, mon
                 write(edited)
             assert (edited / "report.html").read_text() == "mine"
         monkeypatch.chdir(state)
-        write(state, "three")
+        write(state, "three", resume=resume)
         assert names(state) == ["estimates.h5", "report.html", "summary.json"]
         assert (state / "report.html").read_text() == page("three")
+
+
+def test_a_folder_that_a_command_works_in_is_not_taken_from_under_it(tmp_path, monkeypatch):
+    """One command has `--out .`, so its `out.partial` is in that folder; another one has `--out ../out`."""
+    write(tmp_path / "out")
+    monkeypatch.chdir(tmp_path / "out")
+    with output_folder(tmp_path / "out") as folder:
+        results(folder)
+        (folder / "report.html").write_text("under way")
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(ConfigError, match=r"holds out.partial of another command"):
+            write(tmp_path / "out")
+        assert (folder / "report.html").read_text() == "under way"
+        monkeypatch.chdir(tmp_path / "out")
 
 
 def test_a_run_that_fails_leaves_what_it_wrote_and_nothing_else(tmp_path):
