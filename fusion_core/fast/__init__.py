@@ -22,7 +22,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial, update_wrapper
+from threading import RLock
 from typing import Any
+
+LOCK = RLock()
 
 
 class Compiled:
@@ -43,9 +46,11 @@ class Compiled:
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Call the function; it is compiled first where it has not been for such arguments."""
-        if "dispatcher" not in vars(self):
-            names = self.py_func.__globals__
-            names.update({name: value.dispatcher for name, value in names.items() if isinstance(value, Compiled)})
+        names = self.py_func.__globals__
+        if isinstance(names.get(self.py_func.__name__), Compiled):  # the first of its module that is called
+            with LOCK:  # compiled code calls compiled code
+                own = [(name, value) for name, value in names.items() if isinstance(value, Compiled)]
+                names.update({name: value.dispatcher for name, value in own if value.py_func.__globals__ is names})
         return self.dispatcher(*given, **named)
 
 

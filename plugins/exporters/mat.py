@@ -86,7 +86,8 @@ class Mat(Exporter):
         maps = [fields for fields in structs.values() if "temperature" in fields and "bias" in fields]
         if not maps:
             raise ConfigError(f"import {self.kind}: {path} has no struct with temperature and bias; name one that has")
-        method = structs["driftlab"]["interpolation"].text if "driftlab" in structs else "linear"
+        interpolation = structs.get("driftlab", {}).get("interpolation")
+        method = "linear" if interpolation is None else interpolation.text
         return [_read_back(fields, method) for fields in maps]
 
     def _other(self, sensor: Calibrated, T: Array, bias: Array) -> str:
@@ -155,10 +156,18 @@ def _without_date(path: Path) -> None:
         file.write(b"MATLAB 5.0 MAT-file, written by driftlab".ljust(116))
 
 
+def _texts_of(variable: Variable) -> tuple[str, ...]:
+    """Return the texts of a cell array, or the rows of a matrix of characters, which is kept column by column."""
+    if variable.cells or not variable.text:
+        return tuple(cell.text for cell in variable.cells)
+    rows = variable.shape[0]
+    return tuple(variable.text[k::rows].rstrip() for k in range(rows))
+
+
 def _read_back(fields: Mapping[str, Variable], method: str) -> ReadBack:
     T, bias = (np.asarray(fields[name].array, dtype=np.float64) for name in ("temperature", "bias"))
     T, bias = T.ravel(), bias.reshape(T.size, -1)
-    axes = tuple(cell.text for cell in fields["axes"].cells)
+    axes = _texts_of(fields["axes"])
     unit = (fields["units"].fields or {})["bias"].text
     domain = (float(T[0]), float(T[-1]))
     return ReadBack(fields["channel"].text, unit, axes, domain, between(T, bias, method), order=7)

@@ -13,12 +13,14 @@ Where no sample is near enough a row has NaN, so that it is left out and counted
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.errors import UnreadableFile
 
 SLOWER = 2.0  # times the rows' interval: from there on a stream is drawn through, not picked from
 NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of that row
@@ -40,6 +42,14 @@ def taken_apart(path: str) -> FieldPath | None:
     """Return the parts of a path, None where it is none."""
     match = PATH.fullmatch(path)
     return None if match is None else FieldPath(match[1], None if match[2] is None else int(match[2]), match[3])
+
+
+def mapped(path: Path) -> NDArray[np.uint8]:
+    """Return the bytes of a log, read when they are asked for; raises UnreadableFile where they cannot be mapped."""
+    try:
+        return np.asarray(np.memmap(path, np.uint8, "r"))
+    except OSError as error:
+        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); free memory, or copy it again") from None
 
 
 def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:

@@ -12,6 +12,8 @@ dimensions the other way round. Rows are read in blocks; of a compressed file, t
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
@@ -31,6 +33,9 @@ from fusion_plugins.mat_elements import Elements, Old, Variable
 from fusion_plugins.sources.unpacked import translated
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
+DAMAGES = (
+    OSError, EOFError, ValueError, LookupError, TypeError, RuntimeError, ArithmeticError, struct.error, zlib.error,
+)  # fmt: skip
 HDF5 = b"\x89HDF\r\n\x1a\n"
 PLAIN = ["double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"]
 AS_STRUCT = "in MATLAB, S = table2struct(timetable2table(TT), 'ToScalar', true); save('FILE', 'S', '-v7')"
@@ -56,10 +61,10 @@ class Mat(FileSource):
         if first.startswith(HDF5) or first[512 : 512 + len(HDF5)] == HDF5:
             import h5py
 
-            with translated(path, Exception), h5py.File(path, "r") as file:
+            with translated(path, *DAMAGES), h5py.File(path, "r") as file:
                 yield Variables(path, Hdf5Groups(path, file), time)
         elif first.startswith(b"MATLAB 5.0") or first[124:128] in (b"\0\1IM", b"\1\0MI") or _version_4(first):
-            with translated(path, Exception), path.open("rb") as plain:
+            with translated(path, *DAMAGES), path.open("rb") as plain:
                 yield Variables(path, Loaded(path, plain, path.stat().st_size, old=_version_4(first)), time)
         else:
             raise foreign(path, first, self.kind)

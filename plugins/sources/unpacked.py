@@ -65,7 +65,7 @@ def translated(path: Path, *errors: type[BaseException]) -> Iterator[None]:
     """Turn the errors of a library, while it has a file open, into the error of a damaged one."""
     try:
         yield
-    except FusionError:
+    except (FusionError, MemoryError):
         raise
     except errors as error:
         raise damaged(path, " ".join(str(error).split()).strip("'\"")[:160]) from None

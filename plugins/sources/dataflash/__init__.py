@@ -16,13 +16,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from fusion_core.contracts import FileSource, Source, Table, foreign, head
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.joining import mapped
 
 SIGNATURE = b"\xa3\x95\x80"
 NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
@@ -49,7 +49,7 @@ class DataFlash(FileSource):
         from fusion_plugins.sources.dataflash.table import Messages
 
         first = head(path)
-        data = np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
+        data = mapped(path)
         if first.startswith(b"FMT, "):
             raise UnreadableFile(
                 f"{path}: is an ArduPilot log as text, a binary one (.bin) was expected; take the .bin from the "

@@ -37,7 +37,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
-from fusion_plugins.sources.joining import records
+from fusion_plugins.sources.joining import mapped, records
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
@@ -94,7 +94,7 @@ class Instance:
     def device(self) -> int | None:
         """The device number; None where the log has none."""
         numbers = self.samples.get("device_id", np.zeros(0))
-        return int(np.max(numbers)) or None if len(numbers) else None
+        return int(np.max(numbers)) or None if len(numbers) and numbers.dtype.kind in "iu" else None
 
     @property
     def temperature(self) -> float:
@@ -140,14 +140,14 @@ class LogFile:
         first = head(path)
         if not first.startswith(SIGNATURE):
             raise foreign(path, first, kind)
-        self.path, self.data = path, np.asarray(np.memmap(path, np.uint8, "r"))
+        self.path, self.data = path, mapped(path)
         self.parameters: dict[str, float] = {}
         self._formats: dict[str, list[tuple[str, int | None, str]]] = {}
         self._added: dict[int, tuple[str, int, np.dtype[np.void]]] = {}  # topic, number and fields by subscription
         self._lengths = np.array([[-1], [65535]]).repeat(IDS, axis=1)  # of a row; at least -1: not known
         self._dropouts: list[tuple[int, float]] = []  # place, and duration in ms
         self._lost, self._first_lost = 0, -1
-        self._fields = 0  # of all subscriptions
+        self._fields = self._names = 0  # of all subscriptions: numbers in a row, and characters of what they are called
         rows = self._messages(*_sections(path, first, len(self.data)))
         found = dict(self._found(rows))
         self.instances = {key: found[key] for key in sorted(found)}
@@ -200,6 +200,8 @@ class LogFile:
         """Take in a message: formats and parameters before the first subscription, dropouts behind it."""
         if kind == "A":
             number, topic = int.from_bytes(content[1:3], "little"), content[3:].decode(errors="ignore")
+            if self._added.get(number, ("",))[0]:  # it has rows of that form, and there are no others of its number
+                return
             self._added.setdefault(number, ("", 0, np.dtype([])))
             row, padding = self._row(topic)
             self._added[number] = topic, content[0], row
@@ -239,6 +241,8 @@ class LogFile:
                 self._fields = FIELDS if depth > DEEP else self._fields + 1
                 check_count(self.path, what, self._fields, FIELDS - 1)
                 path = f"{prefix}{name}" if count is None else f"{prefix}{name}[{k}]"
+                self._names += len(path)
+                check_size(self.path, "the list of its numbers", self._names, TEXTS)
                 if kind in NUMBERS:
                     yield path, NUMBERS[kind]
                 else:

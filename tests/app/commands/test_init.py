@@ -131,7 +131,6 @@ def test_parquet_and_mat_are_read_as_they_were_written(tmp_path):
 
 def test_an_autopilots_log_takes_three_lines(tmp_path):
     write_log(tmp_path / "vehicle.bin", UNIT.t + 1, [(UNIT.gyro, UNIT.accel, UNIT.temperature)])
-    pytest.importorskip("pyulog")
     topics = [sensor("sensor_gyro", 0, UNIT.t + 1, UNIT.gyro, UNIT.temperature, 1310988)]
     topics += [sensor("sensor_accel", 0, UNIT.t + 1, UNIT.accel, UNIT.temperature, 1310988)]
     write_ulog(tmp_path / "vehicle.ulg", topics)

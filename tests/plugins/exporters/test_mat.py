@@ -83,3 +83,16 @@ def test_what_is_no_table_is_refused(tmp_path):
     (tmp_path / "text.mat").write_text("no numbers\n")
     with pytest.raises(UnreadableFile, match=r"is no \.mat file of version 5"):
         Mat().read(tmp_path / "text.mat")
+
+
+@pytest.mark.parametrize("axes", [np.array(["x", "y", "z"], dtype=object), ["x", "y", "z"]])
+def test_a_table_that_somebody_made_is_read(axes, tmp_path):
+    """Axes in a cell array or as a matrix of characters, and nothing said of how to go between the rows."""
+    from scipy.io import savemat
+
+    T = np.linspace(0, 40, 21)
+    table = {"channel": "gyro", "axes": axes, "temperature": T[:, None], "bias": np.outer(T, [1.0, 2.0, 3.0])}
+    savemat(tmp_path / "made.mat", {"gyro": {**table, "units": {"bias": "rad/s"}}, "driftlab": {"serial": "1"}})
+    (found,) = Mat().read(tmp_path / "made.mat")
+    assert found.axes == ("x", "y", "z")
+    np.testing.assert_allclose(found.bias(np.array([5.0])), [[5, 10, 15]])

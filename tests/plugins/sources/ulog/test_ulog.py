@@ -347,3 +347,22 @@ def test_some_rows_are_the_first_and_then_each_so_many_th(rows):
     assert set(found) <= set(range(rows))
     assert len(found) <= 12 + rows / 1024
     assert rows == 0 or found[0] == 0
+
+
+def test_a_number_that_is_subscribed_again_keeps_its_form(log, tmp_path):
+    """As in two logs that were joined."""
+    again = b"".join(message("A", bytes([0, number, 0]) + b"sensor_mag") for number in range(6))
+    magnetometer = message("F", b"sensor_mag:uint64_t timestamp;float[9] field;")
+    whole = log.read_bytes()
+    (tmp_path / "again.ulg").write_bytes(whole[:16] + magnetometer + whole[16:] + again)
+    got, expected = read(tmp_path / "again.ulg"), read(log)
+    np.testing.assert_array_equal(got["gyro"], expected["gyro"])
+    np.testing.assert_array_equal(got.t, expected.t)
+
+
+def test_long_names_of_many_numbers_have_a_limit(log, tmp_path):
+    form = message("F", b"wide:uint64_t timestamp;uint8_t[60000] " + 9000 * b"n" + b";")
+    begin = log.read_bytes()
+    (tmp_path / "names.ulg").write_bytes(begin[:16] + form + message("A", b"\0\x09\0wide") + begin[16:])
+    with pytest.raises(UnreadableFile, match=r"the list of its numbers takes"):
+        read(tmp_path / "names.ulg")

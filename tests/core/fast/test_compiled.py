@@ -1,0 +1,55 @@
+"""Functions that numba compiles when they are first called."""
+
+import subprocess
+import sys
+import textwrap
+
+
+def test_a_function_of_another_module_is_compiled_whatever_was_called_first(tmp_path):
+    """In a process of its own, without numba's cache: what failed to compile once would fail for ever."""
+    (tmp_path / "first.py").write_text(
+        textwrap.dedent("""
+        from fusion_core.fast import compiled
+
+        @compiled
+        def deep(x):
+            return 2 * x
+
+        @compiled
+        def middle(x):
+            return deep(x) + 1
+    """)
+    )
+    (tmp_path / "second.py").write_text(
+        textwrap.dedent("""
+        from first import middle
+        from fusion_core.fast import compiled
+
+        @compiled
+        def own(x):
+            return x
+    """)
+    )
+    code = "import second, first; second.own(1.0); print(second.middle(2.0), first.middle(2.0))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "5.0 5.0\n", done.stderr
+
+
+def test_threads_that_compile_at_once_get_the_same(tmp_path):
+    """The first of them has not yet made all names of the module compiled ones when the others come."""
+    names = "abcdefgh"
+    lines = ["import sys, threading, time", "from fusion_core import fast", "from fusion_core.fast import compiled"]
+    lines += [f"@compiled\ndef {name}(x):\n    return x" for name in names]
+    lines += ["@compiled", "def total(x):", f"    return {' + '.join(f'{name}(x)' for name in names)}"]
+    lines += [
+        "made = fast.Compiled.dispatcher.func",
+        "def slowly(self):",
+        "    time.sleep(0.05)",
+        "    return made(self)",
+        "fast.Compiled.dispatcher.func = slowly",
+        "threads = [threading.Thread(target=lambda: sys.stdout.write(f'{total(1.0)}\\n')) for _ in range(4)]",
+        "[thread.start() for thread in threads]",
+    ]
+    (tmp_path / "threads.py").write_text("\n".join(lines))
+    done = subprocess.run([sys.executable, "threads.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split() == 4 * ["8.0"], done.stderr
