@@ -1,6 +1,7 @@
 """Fixtures that all tests share: the folder of measured recordings, and a browser."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,12 @@ LONG = (
 
 
 def pytest_configure(config):
-    """Leave the order to what follows: pytest-xdist would begin with the files that have most tests."""
+    """Leave the order to what follows: pytest-xdist would begin with the files that have most tests.
+
+    Commands are interrupted by tests, also where the suite runs in the background and shells have Ctrl-C ignored.
+    """
     config.option.loadscopereorder = False
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items):
