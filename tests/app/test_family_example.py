@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from example_modules import importable
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "06_family"
 PROOF = """
@@ -43,12 +44,12 @@ def test_odd_units_are_named_and_the_tables_say_so(proof):
     assert f"{len(set(odd) & set(planted))} of {len(planted)}" in said
 
 
-def test_a_shifted_lot_that_is_named_is_shown_as_found(monkeypatch):
+def test_a_shifted_lot_that_is_named_is_shown_as_found():
     """A lot that is off is a sentence of the family, not of the line's level: the table finds either."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-    import family
-    import planted
-    import run
+    with importable(FOLDER):
+        import family
+        import planted
+        import run
     from rich.console import Console
 
     line = planted.Line(family.deal(20, 1), [], "L07", 2.0, 0.8, Path())

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from example_modules import importable
 from scipy.stats import chi2
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "04_navigator"
@@ -13,16 +14,11 @@ FOLDER = Path(__file__).parent.parent.parent / "examples" / "04_navigator"
 
 @pytest.fixture(scope="module")
 def example():
-    sys.path.insert(0, str(FOLDER))
-    try:
+    with importable(FOLDER):
         import run
         import simulation
 
         yield run, simulation
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in ("run", "simulation", "navigator", "joint_solution"):
-            sys.modules.pop(name, None)
 
 
 @pytest.fixture(scope="module")
