@@ -20,6 +20,7 @@ from fusion_core.model import Flags, Measurement, State, Transition
 
 Shape = tuple[int, ...]
 ROUNDING = 1e-9  # of a covariance, relative to its deviations: less asymmetry is rounding
+FEW = 4096  # numbers, of which BLAS takes sums in one thread
 FLOAT = np.dtype(np.float64)
 KINDS = {"f": ("fiu", "numbers"), "b": ("b", "true or false")}
 
@@ -132,10 +133,14 @@ def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArr
     return array
 
 
+def all_finite(array: Array) -> bool:
+    """Return True if all numbers are finite; of few the sum of squares says so soonest, of many it takes threads."""
+    return (array.size < FEW and isfinite(np.vdot(array, array))) or bool(np.isfinite(array).all())
+
+
 def finite(name: str, array: Array) -> Array:
     """Return the array, or raise ValueError where it is not finite."""
-    # in one pass that never warns, but where squares are too large
-    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
+    if not all_finite(array):
         raise ValueError(f"estimate: {name} has NaN or infinity, numbers were expected; leave a sample out by used")
     return array
 

@@ -138,12 +138,9 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
 
 
 def _all_usable(values: Array, low: float, high: float) -> bool:
-    """Return True if no value is NaN or beyond the range; of LARGEST the sum of squares shows it in one pass."""
+    """Return True if no value is NaN or beyond the range."""
     flat = values.ravel()
-    if high < LARGEST:
-        return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool(np.dot(flat, flat) <= LARGEST**2)
+    return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN
 
 
 def _after(chunk: Chunk, keep: NDArray[np.bool_], faults: Faults) -> str:

@@ -17,7 +17,7 @@ from driftlab.filtering.coasting import Prediction
 from driftlab.filtering.segment import RunLog, RunSegment, runs
 from driftlab.filtering.setup import RunSetup, bias_steps, prior_again
 from driftlab.units import axis_name
-from fusion_core.checks import NotFinite, TooWide
+from fusion_core.checks import NotFinite, TooWide, all_finite
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.errors import BadValue
@@ -28,11 +28,10 @@ from fusion_core.model import Estimates, Flags
 def check_finite(estimates: Estimates, t: Array, when: Callable[[float], str]) -> None:
     """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
     sigma = estimates.sigma if estimates.sigma.strides[0] else estimates.sigma[:1]  # one row that stands for all
-    if np.isfinite(np.vdot(estimates.x, estimates.x) + np.vdot(sigma, sigma)):
-        return  # nearly always, and in one pass; what overflows is looked at below
+    if all_finite(estimates.x) and all_finite(sigma):
+        return
     good = np.all(np.isfinite(estimates.x) & np.isfinite(estimates.sigma), axis=1)
-    if not np.all(good):
-        raise not_finite(t[int(np.argmin(good))], when)
+    raise not_finite(t[int(np.argmin(good))], when)
 
 
 def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
