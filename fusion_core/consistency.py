@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from fusion_core.chunk import Array
 from fusion_core.fast import compiled
@@ -34,6 +33,8 @@ class NisTest:
 
 def gate_of(m: int, false_alarm: float) -> float:
     """Return the nis that a right model with m components exceeds with probability `false_alarm`."""
+    from scipy import special
+
     return float(special.chdtri(m, false_alarm))
 
 
@@ -42,6 +43,8 @@ def gates_of(gate: float, m: int) -> Array:
 
     A right model exceeds each with the same probability. Beyond what a double tells from zero all are `gate`.
     """
+    from scipy import special
+
     gates = np.full(m + 1, gate, dtype=np.float64)
     probability = float(special.chdtrc(m, gate)) if m else 0.0
     if probability > 0:
@@ -61,6 +64,8 @@ def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:
     """Compare the mean of N values of nis, given by their sum, with its two-sided bounds at `level`."""
     if N * m == 0:
         return NisTest(np.nan, np.nan, np.nan)
+    from scipy import special
+
     tail = (1 - level) / 2
     low, high = (float(special.chdtri(N * m, p)) / (N * m) for p in (1 - tail, tail))
     return NisTest(total / N / m, low, high)
@@ -116,6 +121,8 @@ class Whiteness:
         N, lags = self.N, min(self.lags, self.N // 4)
         if lags < 1:
             return np.full(len(self._total), np.nan)
+        from scipy import special
+
         weights = N * (N + 2) / (N - np.arange(1, lags + 1))
         return np.asarray(special.chdtrc(lags, weights @ self.autocorrelation()[:lags] ** 2))
 
