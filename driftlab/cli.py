@@ -121,7 +121,8 @@ def main() -> None:
     # a million objects come with the imports, and all of them stay: looking through them again and again, and once
     # more at the end, takes a third of a short run
     gc.set_threshold(100_000, 50, 50)
-    for library in ("OMP", "OPENBLAS", "MKL"):  # matrices are small: threads of BLAS would wait for those of the program
+    # matrices are small: threads of BLAS would wait for one another, and hold up those of the program
+    for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     from fusion_core.errors import ConfigError, FusionError, UnitError
 

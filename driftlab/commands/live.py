@@ -374,7 +374,8 @@ def _ended_by_signals(run: Live) -> Iterator[None]:
         sys.stderr.write(
             f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {os.getpid()}\n"
         )
-    numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if not _ignored(number)]
+    known = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]  # Windows has none
+    numbers = [number for number in known if not _ignored(number)]
     before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield

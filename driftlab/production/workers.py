@@ -13,6 +13,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -20,17 +21,19 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import islice
-from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from driftlab.errors import WorkersError
 from driftlab.family.parallel import BATCH
 from driftlab.production.store import UnitRef, UnitStore
+from driftlab.storage.system import has_posix_locks
 from fusion_core.errors import DataError, FusionError, describe_error
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext
 
 __all__ = ["Pool", "WorkerLost", "Workers", "available"]
 
@@ -54,11 +57,12 @@ class Worker:
     """One process, and the item that it works on; `result` when it has ended."""
 
     def __init__(self, module: str) -> None:
-        context = multiprocessing.get_context("forkserver")
-        _start_server(context, module)
+        context: Any = multiprocessing.get_context(_start_method())
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        with _without_main():
+        with _without_main(), _one_thread():
+            if _start_method() == "forkserver":
+                _start_server(context, module)
             self.process.start()
         theirs.close()
         self.ready, self.alive = False, True
@@ -107,13 +111,26 @@ def _death(status: int) -> str:
     return f"was ended by signal {-status}"
 
 
+def _start_method() -> str:
+    """Return how processes begin: forked from one that has what they need; on Windows on their own."""
+    return "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+
+
 def _start_server(context: ForkServerContext, module: str) -> None:
     """Start the process that workers are forked from, with what they need already loaded."""
+    from multiprocessing import forkserver
+
     context.set_forkserver_preload([__name__, module])
+    forkserver.ensure_running()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Start a process whose libraries have one thread; here they are loaded already."""
     before = dict(os.environ)
-    os.environ.update(ONE_THREAD)  # read when the libraries are loaded, there: here they are loaded already
+    os.environ.update(ONE_THREAD)
     try:
-        forkserver.ensure_running()
+        yield
     finally:
         for name in ONE_THREAD:
             if name in before:
@@ -175,16 +192,25 @@ def _limit_threads() -> None:
 
 def _end_with_parent() -> None:
     """Have the system end this process when the one ends that has begun it, whatever this one is doing then."""
-    import fcntl
-
     parent = multiprocessing.parent_process()
     assert parent is not None, "this is a worker"
     held = parent.sentinel  # of a pipe whose other end the parent alone has
+    if not has_posix_locks():
+        threading.Thread(target=_end_after, args=(held,), daemon=True).start()
+        return
+    import fcntl
+
     signal.signal(signal.SIGIO, signal.SIG_DFL)
     fcntl.fcntl(held, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(held, fcntl.F_SETFL, fcntl.fcntl(held, fcntl.F_GETFL) | os.O_ASYNC)
     if not parent.is_alive():
         os._exit(1)
+
+
+def _end_after(parent: int) -> None:
+    """End this process when the sentinel of the parent says that it has ended."""
+    wait([parent])
+    os._exit(1)
 
 
 class Workers(ABC):

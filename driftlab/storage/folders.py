@@ -31,7 +31,8 @@ from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
 
-from driftlab.storage.hdf5 import reading, reason, sync
+from driftlab.storage import system
+from driftlab.storage.hdf5 import reading, reason
 from driftlab.storage.ownership import check_folder, foreign, is_as, sign, written
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
@@ -125,6 +126,8 @@ class Folder:
         """Raise OSError where the rename at the end would fail."""
         for place in {home, self.folder} if self.folder.exists() else {home}:
             check_writable(place)
+        if not hasattr(os, "geteuid"):
+            return
         user, above = os.geteuid(), home.stat()
         sticky = self.folder.exists() and not self.inside and above.st_mode & stat.S_ISVTX
         if sticky and user not in (0, above.st_uid, self.folder.stat().st_uid):
@@ -175,6 +178,7 @@ class Folder:
         before = self.partial / BEFORE
         if self.folder.exists():
             os.rename(self.folder, before)
+        self.lock.let_rename()
         try:
             os.rename(self.partial, self.folder)
         except OSError:
@@ -245,7 +249,7 @@ def check_writable(folder: Path) -> None:
     """Raise OSError where nothing can be written into a folder."""
     if os.access(folder, os.W_OK | os.X_OK):
         return
-    number = errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES
+    number = errno.EROFS if system.is_read_only(folder) else errno.EACCES
     raise OSError(number, os.strerror(number), str(folder))
 
 
@@ -296,11 +300,11 @@ def output_folder(
         sign(held.partial, first, [n for n in os.listdir(held.partial) if n != first and not matches(n, WORKING)])
         if durable:
             for path in (*held.partial.iterdir(), held.partial):
-                sync(path)
+                system.sync(path)
         held.publish()
         done = True
         if durable:
-            sync(held.folder.parent)
+            system.sync(held.folder.parent)
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -387,28 +391,27 @@ class Lock:
     """
 
     def __init__(self, path: Path, what: str) -> None:
-        import fcntl
-
         self.path = path
         self.left_over = path.exists()  # by a process that was killed, if this one gets the lock
         while True:
-            self._number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            number = os.open(path, os.O_RDWR | os.O_CREAT | system.PLAIN, 0o666)
             try:
-                fcntl.flock(self._number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                system.lock(number)
             except BlockingIOError:
-                holder = _holder(os.pread(self._number, 4096, 0))
-                os.close(self._number)
+                holder = _holder(system.read_owner(number))
+                os.close(number)
                 raise ConfigError(f"{what}: is being written by {holder}; wait for its end, or name another") from None
             except OSError:  # of a file system that knows no locks
                 pass
             with suppress(FileNotFoundError):
-                if os.path.samestat(os.stat(path), os.fstat(self._number)):
+                if os.path.samestat(os.stat(path), os.fstat(number)):
                     break
-            os.close(self._number)  # the owner before has removed it meanwhile
-        mark = os.pread(self._number, 4096, 0)
+            os.close(number)  # the owner before has removed it meanwhile
+        mark = system.read_owner(number)
         if mark and b'"program": "driftlab"' not in mark:
-            os.close(self._number)
+            os.close(number)
             raise ConfigError(f"{what}: {path} is in the way, and not of driftlab; move it, or name another")
+        self._number: int | None = number
 
     def sign(self) -> None:
         """Write the lock's owner into the file; raises OSError."""
@@ -419,14 +422,27 @@ class Lock:
             "host": socket.gethostname(),
             "since": datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
         }
-        os.ftruncate(self._number, 0)
-        os.pwrite(self._number, json.dumps(mark).encode(), 0)
+        assert self._number is not None, "it is held"
+        system.write_owner(self._number, json.dumps(mark).encode())
+
+    def let_rename(self) -> None:
+        """Give the lock back early on Windows, where nothing that holds an open file can be renamed."""
+        if not system.has_posix_locks():
+            self._close()
 
     def release(self, path: Path | None = None, *, remove: bool = True) -> None:
         """Give the lock back and remove its file, which may have moved to `path`."""
-        if remove:
-            (path or self.path).unlink(missing_ok=True)
-        os.close(self._number)
+        if not system.has_posix_locks():
+            self._close()
+        with suppress(PermissionError):  # on Windows, where another one has opened it since
+            if remove:
+                (path or self.path).unlink(missing_ok=True)
+        self._close()
+
+    def _close(self) -> None:
+        if self._number is not None:
+            os.close(self._number)
+            self._number = None
 
 
 def _holder(mark: bytes) -> str:

@@ -14,13 +14,14 @@ import re
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.storage.system import has_posix_locks, sync
 from fusion_core.budget import check_regular
 from fusion_core.data_sets import DataSetRows, check_rows
 from fusion_core.errors import UnreadableFile
@@ -174,8 +175,8 @@ class GrowingFile:
             self.settle()
 
     def settle(self) -> None:
-        """Give the file its name, in one step, in the place of an earlier file."""
-        if self._beside is not None:
+        """Give the file its name, in one step, in the place of an earlier file; on Windows once it is closed."""
+        if self._beside is not None and (has_posix_locks() or not self._file):
             with named(self.path):
                 if not self._early:  # rows are in it that are safe under the name already
                     sync(self._beside)
@@ -207,19 +208,6 @@ def _one_by_one(parts: list[NDArray[Any]], dtype: np.dtype[Any]) -> NDArray[Any]
 def beside(path: Path) -> Path:
     """Return the name of a file until it can be read."""
     return path.with_name(path.name + ".new")
-
-
-def sync(path: Path) -> None:
-    """Have a file or a folder reach the disk, where its file system can be asked to."""
-    number = os.open(path, os.O_RDONLY)
-    try:
-        with suppress(PermissionError, InterruptedError):
-            os.fsync(number)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of folders on some network file systems
-            raise
-    finally:
-        os.close(number)
 
 
 def reason(error: BaseException) -> str:

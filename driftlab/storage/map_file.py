@@ -10,8 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from driftlab.storage.folders import check_writable, refusals
-from driftlab.storage.hdf5 import sync
 from driftlab.storage.ownership import check_own, put, seal, seal_of
+from driftlab.storage.system import sync
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, MapError
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from driftlab import __version__
+from driftlab.storage.system import PLAIN
 from fusion_core.budget import COPIED, read_whole
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import json_text
@@ -156,7 +157,7 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
     Of a large file it is that of sums, which takes a third of the time; `sums` says whether, where that is known.
     """
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        with open(os.open(path, os.O_RDONLY | PLAIN), "rb") as file:
             if sums or (sums is None and os.fstat(file.fileno()).st_size >= LARGE):
                 return SUMS + _sums(file)
             if not own:

@@ -22,8 +22,9 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.storage.folders import Lock, check_writable, refusals
-from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, sync
+from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading
 from driftlab.storage.ownership import check_own, put, seal, seal_of
+from driftlab.storage.system import sync
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Source, head
 from fusion_core.data_sets import attribute

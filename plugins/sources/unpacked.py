@@ -87,7 +87,7 @@ def _standard_input() -> tuple[io.BufferedReader, IO[bytes], Lock]:
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
     stream = sys.stdin.buffer
-    with suppress(OSError, ValueError):
+    with suppress(AttributeError, OSError, ValueError):  # the first on Windows
         os.set_blocking(stream.fileno(), True)  # else nothing yet looks like the end
     try:
         return stream, tempfile.TemporaryFile(), Lock()  # type: ignore[return-value]

@@ -240,7 +240,9 @@ class Port:
         try:
             number = port.fileno()
         except (io.UnsupportedOperation, AttributeError):
-            data = port.read(1)  # of what pyserial plays itself, as loop://
+            data = port.read(
+                max(1, getattr(port, "in_waiting", 1))
+            )  # on Windows, or of what pyserial plays itself, as loop://
             return data, time.monotonic()
         if not select.select([number], [], [], PATIENCE)[0]:
             return b"", 0.0
