@@ -112,7 +112,7 @@ def _death(status: int) -> str:
 
 
 def _start_method() -> str:
-    """Return how processes begin: forked from one that has what they need; on Windows on their own."""
+    """Return the way in which processes begin: forked from one that has what they need; on Windows on their own."""
     return "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
