@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator autopilot family paper tools test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family paper tools test torture wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -83,6 +83,11 @@ test: $(TEST_VENV)/ready
 # it also mounts small disks, and unmounts them). Failed cases are written to torture_failures
 torture: $(VENV)/ready
 	$(VENV)/bin/python tests/torture/campaign.py
+
+# before a release: the wheel of what is committed on three Pythons, each from nothing to C code; it is then in dist/
+PYTHONS ?= python3.11 python3.12 python3.13
+wheels: $(VENV)/ready
+	$(VENV)/bin/python packaging/try_wheel.py $(PYTHONS)
 
 lint: $(VENV)/ready
 	$(VENV)/bin/ruff check .
