@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.framings.field import channel
+from fusion_plugins.framings.field import channel, counts
 
 SYNC = b"\xfa\xff\x36"
 LONGEST = 4096  # bytes of a message; the length of what looks like a longer one is damaged
@@ -89,6 +89,24 @@ class XsensMtdata2(Framing):
             garbage, at = garbage + keep - at, keep
         frames, held = self._frames(stream, messages, held, {GARBAGE: garbage, DAMAGED: rejected})
         return frames, (stream[at:], held)
+
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return the messages of samples, in single precision, with the temperature in each."""
+        identifier, code = CLOCKS[self.clock]
+        items = [(identifier, np.dtype(code), counts(self.device_counter, chunk.t, begun))]
+        items += [
+            (IDENTIFIERS[name], np.dtype((">f4", (AXES[name],))), chunk[name].reshape(len(chunk), -1))
+            for name in sorted(self.channels, key=IDENTIFIERS.__getitem__)
+        ]
+        length = sum(3 + number.itemsize for _, number, _ in items)
+        parts = [np.tile(np.frombuffer(SYNC + bytes([length]), np.uint8), (len(chunk), 1))]
+        for name, number, values in items:
+            head = np.frombuffer(name.to_bytes(2, "big") + bytes([number.itemsize]), np.uint8)
+            data = np.ascontiguousarray(values, number.base).view(np.uint8).reshape(len(chunk), -1)
+            parts += [np.tile(head, (len(chunk), 1)), data]
+        whole = np.concatenate(parts, axis=1)
+        total = np.sum(whole[:, 1:], axis=1, dtype=np.int64)
+        return np.column_stack([whole, (-total % 256).astype(np.uint8)]).tobytes()
 
     def _frames(
         self, stream: bytes, whole: list[tuple[int, int]], held: Mapping[str, Array], rejected: dict[str, int]

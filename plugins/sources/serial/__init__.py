@@ -73,6 +73,8 @@ class Serial(Source):
     """Bytes kept for a filter that is late."""
     silent_after: Annotated[float, Unit("s", positive=True, example="5 s")] = Quantity(5.0, "5 s")
     """Longest silence of the device before it is reported."""
+    speed: Annotated[float, Field(gt=0)] = 1.0
+    """Pace of the device's clock, in that of the host: more than 1 in a rehearsal (`simulate --serve --speed`)."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -109,7 +111,7 @@ class Serial(Source):
                     where = f"after {seconds(max(clock.t, 0.0))}"
                     for what, count in frames.rejected.items():
                         faults.add(what, count, where)
-                    t = clock.stamp(frames.N, frames.count, arrived.at)
+                    t = clock.stamp(frames.N, frames.count, arrived.at * self.speed)
                     if frames.N:
                         spoke, whole_at, unused = now, now, 0
                     whole = Chunk(t, frames.channels)
