@@ -90,7 +90,7 @@ class PseudoTerminal:
 
 @contextmanager
 def served_at(link: Path | None) -> Iterator[PseudoTerminal]:
-    """Give a pseudo-terminal, which is called `link` too as long as it lasts; raises ConfigError where that is taken."""
+    """Give a pseudo-terminal, which a link leads to as long as it lasts; raises ConfigError where that is taken."""
     terminal = PseudoTerminal()
     try:
         if link is not None:
