@@ -19,7 +19,7 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import count, takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 from zipfile import ZipFile
 
 import numpy as np
@@ -29,7 +29,7 @@ from driftlab.storage.folders import Lock, check_writable, refusals
 from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, sync
 from driftlab.storage.ownership import check_own, put, seal, seal_of
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Framing, Source, head
+from fusion_core.contracts import FileSource, Framing, Source, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile
@@ -258,11 +258,15 @@ def _format_of(out: Path) -> Callable[[Path, str], RecordingWriter]:
     """Return the function that begins a recording of the format that a name ends in; raises ConfigError."""
     known, suffix = dict(TABLES), out.suffix.lower()
     for cls in registry().classes(Source).values():
-        for ending in getattr(cls, "written", ()):
-            known[ending] = lambda path, _, cls=cls: cls.writer(path, suffix, seal_of("simulate"))
+        if issubclass(cls, FileSource):
+            known |= dict.fromkeys(cls.written, partial(_begun, cls, suffix))
     if suffix not in known:
         raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in one of {', '.join(known)}")
     return known[suffix]
+
+
+def _begun(cls: type[FileSource], suffix: str, path: Path, settings: str) -> RecordingWriter:
+    return cls.writer(path, suffix, seal_of("simulate"))
 
 
 @contextmanager
@@ -285,7 +289,7 @@ def _locked_partial(out: Path, named: Path) -> Iterator[Path]:
 class Hdf5Writer:
     """One data set a channel, each with its `unit`; time is the first axis."""
 
-    names = ()
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str) -> None:
         attributes = {"sha256": seal_of("simulate"), "program": f"{SIMULATED_MARK} {__version__}", "settings": settings}
@@ -303,7 +307,7 @@ class Hdf5Writer:
 class CsvWriter:
     """One column an axis, below comments with the config that reads them."""
 
-    names = ()
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str) -> None:
         self.settings, self.file = settings, path.open("wb")
@@ -354,7 +358,7 @@ MOST_ROWS = 1_048_575  # of a sheet, below its heads
 class XlsxWriter:
     """A spreadsheet: one column an axis, its unit in its head; what it was made from is on a second sheet."""
 
-    names = ()
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str) -> None:
         if find_spec("openpyxl") is None:
@@ -391,7 +395,7 @@ class XlsxWriter:
 class FramingWriter:
     """The bytes that a device sends, one sample behind the other."""
 
-    names = ()
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str, *, framing: Framing) -> None:
         self._file, self._framing, self._sent = path.open("wb"), framing, 0

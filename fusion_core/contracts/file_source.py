@@ -42,7 +42,7 @@ Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI 
 class RecordingWriter(Protocol):
     """A recording that is being written."""
 
-    names: tuple[str, ...]
+    names: ClassVar[tuple[str, ...]]
     """The channels that it has a place for; none where it takes all."""
 
     def append(self, chunk: Chunk) -> None:

@@ -93,7 +93,9 @@ class XsensMtdata2(Framing):
     def encode(self, chunk: Chunk, begun: int) -> bytes:
         """Return the messages of samples, in single precision, with the temperature in each."""
         identifier, code = CLOCKS[self.clock]
-        items = [(identifier, np.dtype(code), counts(self.device_counter, chunk.t, begun))]
+        items: list[tuple[int, np.dtype[Any], Array | NDArray[np.uint64]]] = [
+            (identifier, np.dtype(code), counts(self.device_counter, chunk.t, begun))
+        ]
         items += [
             (IDENTIFIERS[name], np.dtype((">f4", (AXES[name],))), chunk[name].reshape(len(chunk), -1))
             for name in sorted(self.channels, key=IDENTIFIERS.__getitem__)
