@@ -1,7 +1,7 @@
 """A device that is not there: samples go out of a pseudo-terminal at the pace at which they would be measured.
 
 The other end is opened as a serial port is, by any program. The first sample is sent when one has opened it. What is
-sent while nobody listens, or faster than it is taken, is lost, as on a wire.
+sent while nobody listens, or is not taken in time, is lost, as on a wire.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from fusion_core.chunk import Chunk
@@ -19,6 +19,8 @@ from fusion_core.errors import ConfigError
 
 LOOK = 0.02  # s between looks at whether the device was opened
 SETTLE = 0.2  # s from its opening to the first byte, and from the last byte to its end
+PATIENCE = 0.2  # s that bytes wait for room
+WAIT = 1e-3  # s between looks at whether there is room
 PIECE = 0.02  # s of the listener: samples that are sent together
 
 
@@ -62,11 +64,13 @@ class PseudoTerminal:
         time.sleep(SETTLE)
 
     def send(self, data: bytes) -> None:
-        """Send bytes; those that find no room are lost."""
-        sent = 0
-        with suppress(BlockingIOError):
-            while self.heard and sent < len(data):
+        """Send bytes; those that find no room in time are lost."""
+        sent, until = 0, time.monotonic() + PATIENCE
+        while sent < len(data) and self.heard and time.monotonic() < until:
+            try:
                 sent += os.write(self._master, data[sent:])
+            except BlockingIOError:
+                time.sleep(WAIT)
         self.lost += len(data) - sent
 
     def play(self, chunk: Chunk, framing: Framing, begun: int, speed: float, zero: float) -> None:

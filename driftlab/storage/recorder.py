@@ -395,10 +395,9 @@ class XlsxWriter:
 class FramingWriter:
     """The bytes that a device sends, one sample behind the other."""
 
-    names: ClassVar[tuple[str, ...]] = ()
-
     def __init__(self, path: Path, settings: str, *, framing: Framing) -> None:
         self._file, self._framing, self._sent = path.open("wb"), framing, 0
+        self.names = tuple(framing.decode(b"", None)[0].channels)
 
     def append(self, chunk: Chunk) -> None:
         """Add the samples of a chunk."""

@@ -42,8 +42,9 @@ Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI 
 class RecordingWriter(Protocol):
     """A recording that is being written."""
 
-    names: ClassVar[tuple[str, ...]]
-    """The channels that it has a place for; none where it takes all."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The channels that it has a place for; none where it takes all."""
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk, which has all of `names`; what else it has is left out."""
