@@ -31,13 +31,10 @@ from fusion_core.host.registry import registry
 
 ROWS = 65_536  # of a chunk made at once
 PLAYED = 256  # of one that is played
+COLUMNS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "temperature": ["T"]}
 LINES = {  # of text, as a device sends that has no framing of its own
-    "columns": ["n", "gx", "gy", "gz", "ax", "ay", "az", "T"],
-    "channels": {
-        "gyro": {"path": ["gx", "gy", "gz"], "unit": "rad/s"},
-        "accel": {"path": ["ax", "ay", "az"], "unit": "m/s^2"},
-        "temperature": {"path": "T", "unit": "degC"},
-    },
+    "columns": ["n", *chain(*COLUMNS.values())],
+    "channels": {name: {"path": names, "unit": SIMULATED_UNITS[name]} for name, names in COLUMNS.items()},
     "counter": {"field": "n", "modulo": 65536},
 }
 
@@ -272,10 +269,8 @@ def _served(
     step = float(first.t[1] - first.t[0]) if len(first) > 1 else 1.0
     with served_at(link) as terminal:
         if opened is not None:
-            said = {"kind": framing.kind, **framing.model_dump(mode="json", exclude_unset=True)}
-            pace = {"speed": speed} if speed != 1 else {}
-            port = str(link or terminal.device)
-            opened({"kind": "serial", "port": port, "interval": f"{step:.9g} s", **pace, "framing": said})
+            said = {"kind": "serial", "port": str(link or terminal.device), "interval": f"{step:.9g} s", "speed": speed}
+            opened({**said, "framing": {"kind": framing.kind, **framing.model_dump(mode="json", exclude_unset=True)}})
         with suppress(KeyboardInterrupt):
             terminal.wait()
             zero = time.monotonic() - float(first.t[0]) / speed

@@ -10,7 +10,7 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from fusion_core.chunk import Chunk
@@ -48,13 +48,13 @@ class PseudoTerminal:
         self.device, self.lost = os.ttyname(slave), 0
         os.close(slave)  # so that the system tells whether another has it open
         os.set_blocking(self._master, False)
+        self._poll = select.poll()
+        self._poll.register(self._master, 0)
 
     @property
     def heard(self) -> bool:
-        """Whether a program has the device open."""
-        poll = select.poll()
-        poll.register(self._master, 0)
-        return not poll.poll(0)
+        """True while a program has the device open."""
+        return not self._poll.poll(0)
 
     def wait(self) -> None:
         """Wait until a program has opened the device."""
@@ -95,19 +95,17 @@ class PseudoTerminal:
 @contextmanager
 def served_at(link: Path | None) -> Iterator[PseudoTerminal]:
     """Give a pseudo-terminal, which a link leads to as long as it lasts; raises ConfigError where that is taken."""
-    terminal = PseudoTerminal()
-    try:
-        if link is not None:
-            if link.is_symlink() and not link.exists():  # of one that was killed
-                link.unlink()
-            try:
-                link.symlink_to(terminal.device)
-            except OSError as error:
-                raise ConfigError(f"--out {link}: cannot be linked ({error.strerror}); name another") from None
+    with closing(PseudoTerminal()) as terminal:
+        if link is None:
+            yield terminal
+            return
+        if link.is_symlink() and not link.exists():  # of one that was killed
+            link.unlink()
+        try:
+            link.symlink_to(terminal.device)
+        except OSError as error:
+            raise ConfigError(f"--out {link}: cannot be linked ({error.strerror}); name another") from None
         try:
             yield terminal
         finally:
-            if link is not None:
-                link.unlink(missing_ok=True)
-    finally:
-        terminal.close()
+            link.unlink(missing_ok=True)

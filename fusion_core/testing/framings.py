@@ -65,7 +65,7 @@ def what_is_no_frame_is_passed_over(framing: Framing, stream: bytes) -> None:
 
 
 def what_is_encoded_is_decoded(framing: Framing, stream: bytes) -> None:
-    """Where a framing can be written, encoded samples are decoded as they were; the first may be lost as torn."""
+    """Encoded samples are decoded as they were, where a framing can encode; the first may be lost as torn."""
     frames, _ = framing.decode(stream, None)
     if type(framing).encode is Framing.encode or not frames.N:
         return

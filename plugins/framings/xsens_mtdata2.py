@@ -93,22 +93,17 @@ class XsensMtdata2(Framing):
     def encode(self, chunk: Chunk, begun: int) -> bytes:
         """Return the messages of samples, in single precision, with the temperature in each."""
         identifier, code = CLOCKS[self.clock]
-        items: list[tuple[int, np.dtype[Any], Array | NDArray[np.uint64]]] = [
-            (identifier, np.dtype(code), counts(self.device_counter, chunk.t, begun))
-        ]
-        items += [
-            (IDENTIFIERS[name], np.dtype((">f4", (AXES[name],))), chunk[name].reshape(len(chunk), -1))
-            for name in sorted(self.channels, key=IDENTIFIERS.__getitem__)
-        ]
-        length = sum(3 + number.itemsize for _, number, _ in items)
-        parts = [np.tile(np.frombuffer(SYNC + bytes([length]), np.uint8), (len(chunk), 1))]
-        for name, number, values in items:
-            head = np.frombuffer(name.to_bytes(2, "big") + bytes([number.itemsize]), np.uint8)
-            data = np.ascontiguousarray(values, number.base).view(np.uint8).reshape(len(chunk), -1)
-            parts += [np.tile(head, (len(chunk), 1)), data]
-        whole = np.concatenate(parts, axis=1)
-        total = np.sum(whole[:, 1:], axis=1, dtype=np.int64)
-        return np.column_stack([whole, (-total % 256).astype(np.uint8)]).tobytes()
+        items = {identifier: counts(self.device_counter, chunk.t, begun)[:, None].astype(code)}
+        for name in sorted(self.channels, key=IDENTIFIERS.__getitem__):
+            items[IDENTIFIERS[name]] = chunk[name].reshape(len(chunk), -1).astype(">f4")
+        parts = []
+        for identifier, values in items.items():
+            data = values.view(np.uint8)
+            parts += [_repeated(identifier.to_bytes(2, "big") + bytes([data.shape[1]]), len(chunk)), data]
+        body = np.concatenate(parts, axis=1)
+        head = _repeated(SYNC + bytes([body.shape[1]]), len(chunk))
+        total = np.sum(head[:, 1:], axis=1, dtype=np.int64) + np.sum(body, axis=1, dtype=np.int64)
+        return np.column_stack([head, body, (-total % 256).astype(np.uint8)]).tobytes()
 
     def _frames(
         self, stream: bytes, whole: list[tuple[int, int]], held: Mapping[str, Array], rejected: dict[str, int]
@@ -144,6 +139,10 @@ class XsensMtdata2(Framing):
         if item is None or item.size != np.dtype(code).itemsize:
             return None
         return _view(messages, item, np.dtype(code))[:, 0].astype(np.int64)
+
+
+def _repeated(data: bytes, N: int) -> Bytes:
+    return np.tile(np.frombuffer(data, np.uint8), (N, 1))
 
 
 def _length(stream: bytes, at: int) -> int | None:

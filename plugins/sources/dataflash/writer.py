@@ -25,7 +25,7 @@ UNITS = {"-": "", "s": "s", "E": "rad/s", "o": "m/s/s", "O": "degC", "z": "Hz", 
 MULTIPLIERS = {"-": 0.0, "0": 1.0, "F": 1e-6}
 
 
-class Message(NamedTuple):
+class LoggedMessage(NamedTuple):
     """A kind of message: its number, the letters and labels of its fields, their units and multipliers."""
 
     type: int
@@ -50,13 +50,13 @@ class Message(NamedTuple):
 
 
 MESSAGES = {
-    "FMT": Message(128, "BBnNZ", "Type,Length,Name,Format,Columns", "-b---", "-----"),
-    "UNIT": Message(177, "QbZ", "TimeUS,Id,Label", "s--", "F--"),
-    "MULT": Message(178, "Qbd", "TimeUS,Id,Mult", "s--", "F--"),
-    "FMTU": Message(179, "QBNN", "TimeUS,FmtType,UnitIds,MultIds", "s---", "F---"),
-    "PARM": Message(64, "QNff", "TimeUS,Name,Value,Default", "s---", "F---"),
-    "NOTE": Message(220, "QZZ", "TimeUS,Begin,End", "s--", "F--"),
-    "IMU": Message(
+    "FMT": LoggedMessage(128, "BBnNZ", "Type,Length,Name,Format,Columns", "-b---", "-----"),
+    "UNIT": LoggedMessage(177, "QbZ", "TimeUS,Id,Label", "s--", "F--"),
+    "MULT": LoggedMessage(178, "Qbd", "TimeUS,Id,Mult", "s--", "F--"),
+    "FMTU": LoggedMessage(179, "QBNN", "TimeUS,FmtType,UnitIds,MultIds", "s---", "F---"),
+    "PARM": LoggedMessage(64, "QNff", "TimeUS,Name,Value,Default", "s---", "F---"),
+    "NOTE": LoggedMessage(220, "QZZ", "TimeUS,Begin,End", "s--", "F--"),
+    "IMU": LoggedMessage(
         138, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz", "s#EEEooo--O--zz",
         "F-000000-----00",
     ),
@@ -80,19 +80,16 @@ class DataFlashWriter:
         parts += [mult(Id=ord(key), Mult=size_of_one) for key, size_of_one in MULTIPLIERS.items()]
         parts += [fmtu(FmtType=m.type, UnitIds=m.units, MultIds=m.multipliers) for m in MESSAGES.values()]
         parts += [parm(Name=name, Value=value) for name, value in PARAMETERS.items()]
-        parts.append(MESSAGES["NOTE"].rows(Begin=text[:size], End=text[size:]))
         self._file = path.open("wb")
-        self._file.write(b"".join(parts))
+        self._file.write(b"".join(parts) + MESSAGES["NOTE"].rows(Begin=text[:size], End=text[size:]))
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
-        axes = {f"{name}{axis}": k for name in ("Gyr", "Acc") for k, axis in enumerate("XYZ")}
-        of = {"Gyr": chunk["gyro"], "Acc": chunk["accel"]}
-        columns = {label: of[label[:3]][:, k] for label, k in axes.items()}
+        pairs = {"Gyr": chunk["gyro"], "Acc": chunk["accel"]}
+        columns = {f"{name}{axis}": values[:, k] for name, values in pairs.items() for k, axis in enumerate("XYZ")}
         stamps = np.rint((BOOT + chunk.t) * 1e6)
-        healthy = {"GH": 1, "AH": 1, "GHz": 2000, "AHz": 2000}
-        imu = MESSAGES["IMU"].rows(len(chunk), TimeUS=stamps, T=chunk["temperature"], **columns, **healthy)
-        self._file.write(imu)
+        columns |= {"TimeUS": stamps, "T": chunk["temperature"]}
+        self._file.write(MESSAGES["IMU"].rows(len(chunk), **columns, GH=1, AH=1, GHz=2000, AHz=2000))
 
     def close(self) -> None:
         """Finish the log."""

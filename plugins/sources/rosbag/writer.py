@@ -27,8 +27,7 @@ from fusion_core.chunk import Array, Chunk
 BEGAN = 1_767_225_600  # s since 1970, of the first sample: 2026-01-01
 SECOND = 10**9
 FRAME = "imu_link"
-TOPICS = {"/imu/data": "sensor_msgs/msg/Imu", "/imu/temperature": "sensor_msgs/msg/Temperature"}
-NUMBERS = {"/imu/data": 37, "/imu/temperature": 2}  # float64 behind the header
+TOPICS = (("/imu/data", "sensor_msgs/msg/Imu"), ("/imu/temperature", "sensor_msgs/msg/Temperature"))
 NOTE = ("/note", "std_msgs/msg/String")
 
 
@@ -53,18 +52,18 @@ class BagWriter:
         said, text = self._bag.add_connection(*NOTE, typestore=types), types.types[NOTE[1]](note)
         raw = types.serialize_ros1(text, NOTE[1]) if ros1 else types.serialize_cdr(text, NOTE[1])
         self._bag.write(said, BEGAN * SECOND, raw)
-        self._topics = {name: self._bag.add_connection(name, kind, typestore=types) for name, kind in TOPICS.items()}
+        self._topics = [self._bag.add_connection(*topic, typestore=types) for topic in TOPICS]
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
-        imu, temperature = np.zeros((len(chunk), NUMBERS["/imu/data"])), np.zeros((len(chunk), 2))
+        imu, temperature = np.zeros((len(chunk), 37)), np.zeros((len(chunk), 2))
         imu[:, 3], imu[:, 4] = 1.0, -1.0
         imu[:, 13:16], imu[:, 25:28], temperature[:, 0] = chunk["gyro"], chunk["accel"], chunk["temperature"]
         stamps = BEGAN * SECOND + np.rint(chunk.t * SECOND).astype(np.int64)
-        rows = {"/imu/data": self._messages(stamps, imu), "/imu/temperature": self._messages(stamps, temperature)}
+        rows = self._messages(stamps, imu), self._messages(stamps, temperature)
         for k, stamp in enumerate(stamps.tolist()):
-            for topic, messages in rows.items():
-                self._bag.write(self._topics[topic], stamp, messages[k].tobytes())
+            for topic, messages in zip(self._topics, rows, strict=True):
+                self._bag.write(topic, stamp, messages[k].tobytes())
         self._sent += len(chunk)
 
     def _messages(self, stamps: NDArray[np.int64], numbers: Array) -> NDArray[np.void]:

@@ -227,7 +227,7 @@ def test_a_spreadsheet_has_the_recording_with_units_in_its_heads(config, tmp_pat
     made, table = whole(config.source), np.array(rows)
     np.testing.assert_array_equal(table[:, 0], made.t)
     np.testing.assert_allclose(table[:, 1:4], made["gyro"], rtol=1e-15)  # a cell has 16 digits
-    np.testing.assert_array_equal(table[:, heads.index("temperature [degC]")], made["temperature"])
+    np.testing.assert_allclose(table[:, heads.index("temperature [degC]")], made["temperature"], rtol=1e-15)
     assert settings["seed"] == 3
     out.write_bytes(out.read_bytes().replace(b"PK", b"PQ", 1))
     with pytest.raises(ConfigError, match="was changed since `driftlab simulate` wrote it"):
