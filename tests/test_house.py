@@ -260,7 +260,7 @@ BUDGET = {
     "fusion_core/contracts": 1685,
     "fusion_core/fast": 725,
     "fusion_core/host": 691,
-    "fusion_core/testing": 932,
+    "fusion_core/testing": 935,
     "fusion_core/thermal": 973,
     "fusion_core/units": 419,
     "plugins": 302,

@@ -77,6 +77,9 @@ def what_is_encoded_is_decoded(framing: Framing, stream: bytes) -> None:
     assert lost in (0, 1), f"{again.N} of {frames.N} encoded samples are found"
     for name, values in frames.channels.items():
         np.testing.assert_allclose(again.channels[name], values[lost:], rtol=1e-6, atol=1e-12, err_msg=name)
+    if (counter := framing.device_counter) is not None and again.count is not None:
+        step = 1.0 if counter.tick is None else np.diff(t[lost:]) / counter.tick
+        np.testing.assert_allclose(np.diff(again.count) % counter.modulo, step % counter.modulo, atol=1, rtol=0)
 
 
 def the_memory_stays_small(framing: Framing, stream: bytes) -> None:

@@ -83,13 +83,13 @@ class Kvh1775(Framing):
             {"name": "sequence", "type": "uint8"},
             {"name": "temperature", "type": "int16", "unit": "degC" if celsius else "degF", "scale": number},
         ]
-        counted = "timestamp" if self.message == "B" else "sequence"
+        counted = {"field": "timestamp", "tick": "1 us"} if self.message == "B" else {"field": "sequence"}
         return Binary.model_validate({
             "sync": HEADERS[self.message],
             "byte_order": "big",
             "fields": fields,
             "checksum": {"kind": "CRC-32/MPEG-2"},
-            "counter": {"field": counted, "modulo": self.device_counter.modulo},
+            "counter": {**counted, "modulo": self.device_counter.modulo},
         })  # fmt: skip
 
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
