@@ -266,18 +266,25 @@ def _served(
     tally, sent = _Tally(), 0
     chunks = tally.chunks(source, progress, PLAYED)
     first = next(chunks)
+    tally.last = tally.first
     step = float(first.t[1] - first.t[0]) if len(first) > 1 else 1.0
     with served_at(link) as terminal:
-        if opened is not None:
-            said = {"kind": "serial", "port": str(link or terminal.device), "interval": f"{step:.9g} s", "speed": speed}
-            opened({**said, "framing": {"kind": framing.kind, **framing.model_dump(mode="json", exclude_unset=True)}})
+        said: dict[str, Any] = {
+            "kind": "serial",
+            "port": str(link or terminal.device),
+            "interval": f"{step:.9g} s",
+            "speed": speed,
+        }
+        said["framing"] = {"kind": framing.kind, **framing.model_dump(mode="json", exclude_unset=True)}
         with suppress(KeyboardInterrupt):
+            if opened is not None:
+                opened(said)
             terminal.wait()
             zero = time.monotonic() - float(first.t[0]) / speed
             for chunk in chain([first], chunks):
                 terminal.play(chunk, framing, sent, speed, zero)
-                sent += len(chunk)
-        tally.lost = terminal.lost
+                sent, tally.last = sent + len(chunk), float(chunk.t[-1])
+        tally.rows, tally.lost = sent, terminal.lost
     return SimulateResult(source, config, tally, None, link)
 
 
@@ -300,7 +307,8 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 def show(result: SimulateResult, given: Mapping[str, Any]) -> None:
     """Print what was written, or sent."""
     first, last = result.span
-    say(f"{result.name}: {result.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    span = f", t = {first:g} to {last:.10g} s" if result.rows else ""
+    say(f"{result.name}: {result.rows:,} rows{span}\n")
     say_lines(result.lines(), "note: ")
     if not given.get("serve"):
         say(f"written to {result.path}: {', '.join(result.channels)}\n")

@@ -1,6 +1,9 @@
 """Simulated recordings: written, read back by the sources, and used by the other commands as any recording is."""
 
 import json
+import signal
+import subprocess
+import sys
 import threading
 
 import h5py
@@ -312,3 +315,17 @@ def test_a_config_reads_what_is_served(config, tmp_path):
     np.testing.assert_allclose(got.t, made.t[first:] - made.t[first], atol=1e-9)
     for name in ("gyro", "accel", "temperature"):
         np.testing.assert_array_equal(got[name], made[name][first:])
+
+
+def test_a_device_that_nobody_opened_ends_by_ctrl_c(config, tmp_path):
+    command = [sys.executable, "-m", "driftlab", "simulate", "twin.yaml", "--serve", "--out", "port", "--json"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    first = json.loads(process.stdout.readline())["source"]
+    assert (first["kind"], first["port"], first["interval"], first["framing"]["kind"]) == (
+        "serial", "port", "0.05 s", "text",
+    )  # fmt: skip
+    assert (tmp_path / "port").exists()
+    process.send_signal(signal.SIGINT)
+    said = json.loads(process.communicate()[0])
+    assert (process.returncode, said["rows"]) == (0, 0)
+    assert not (tmp_path / "port").is_symlink()
