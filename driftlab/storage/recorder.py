@@ -363,7 +363,7 @@ class XlsxWriter:
     def __init__(self, path: Path, settings: str) -> None:
         if find_spec("openpyxl") is None:
             raise ConfigError(
-                "--out: the package openpyxl is not installed, it was expected for .xlsx; pip install 'driftlab[xlsx]'"
+                "--out: the package openpyxl is not installed, it was expected for .xlsx; pip install 'driftlab[excel]'"
             )
         from openpyxl import Workbook
 

@@ -247,7 +247,7 @@ def test_a_spreadsheet_that_is_too_long_is_refused(config, tmp_path, monkeypatch
 
 @pytest.mark.parametrize(
     ("ending", "package", "extra"),
-    [("xlsx", "openpyxl", "xlsx"), ("bag", "rosbags", "ros"), ("mcap", "rosbags", "ros")],
+    [("xlsx", "openpyxl", "excel"), ("bag", "rosbags", "ros"), ("mcap", "rosbags", "ros")],
 )
 def test_a_package_that_is_missing_is_named(config, tmp_path, monkeypatch, ending, package, extra):
     for module in (recorder, rosbag):
