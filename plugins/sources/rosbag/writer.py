@@ -15,8 +15,8 @@ An orientation that is not known has -1 for its first covariance. Source: sensor
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 import numpy as np
@@ -44,9 +44,9 @@ class BagWriter:
 
         types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         self._path, self._ros1, self._sent = path, ros1, 0
-        self._folder = path.with_name(f"{path.name}.bag")  # of ROS 2, whose bag is a folder of files
+        self._beside = TemporaryDirectory(prefix=".driftlab-", dir=path.parent)
+        self._folder = Path(self._beside.name) / "bag"  # of ROS 2, whose bag is a folder of files
         path.unlink(missing_ok=True)
-        shutil.rmtree(self._folder, ignore_errors=True)
         self._bag: Any = Ros1(path) if ros1 else Ros2(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._bag.open()
         said, text = self._bag.add_connection(*NOTE, typestore=types), types.types[NOTE[1]](note)
@@ -81,5 +81,5 @@ class BagWriter:
         """Finish the bag."""
         self._bag.close()
         if not self._ros1:
-            os.replace(next(self._folder.glob("*.mcap")), self._path)
-            shutil.rmtree(self._folder)
+            os.replace(self._folder / "bag.mcap", self._path)
+        self._beside.cleanup()
