@@ -86,7 +86,7 @@ COMMANDS = (
     Command(
         "plan", "planning", options={"effects": Option("--effects KIND,...", kind=str, default=None), "json": JSON}
     ),
-    Command("simulate", "simulating", metavars={"out": "FILE"}, defaults={"out": NEEDED}),
+    Command("simulate", "simulating", metavars={"out": "FILE", "framing": "CONFIG", "speed": "N"}),
     Command("live", options={}, kind=WithPort),
     Command("check", "reading"),
     Command("init", "reading", metavars={"out": "CONFIG"}),

@@ -3,8 +3,9 @@
 That of a live source (`driftlab live --record FILE.h5`) has a data set for each channel, in SI and bit by bit the
 samples of the filter, so that `driftlab run` with the same config and the file gives the live estimates again.
 
-A simulated one is HDF5 with units as attributes, or CSV with units in comments, in SI, temperatures in degC. It has its
-final name only when it is whole.
+A simulated one is HDF5 with units as attributes, CSV with units in comments, or a spreadsheet with units in its heads,
+in SI, temperatures in degC; a log or a bag, written by the source that reads it; or a device's bytes. It has its final
+name only when it is whole.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from functools import partial
+from importlib.util import find_spec
 from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -26,7 +30,8 @@ from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading
 from driftlab.storage.ownership import check_own, put, seal, seal_of
 from driftlab.storage.system import sync
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Source, head
+from fusion_core.contracts import FileSource, Framing, Source, head
+from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.escaping import comment, yaml_text
@@ -226,11 +231,12 @@ SIMULATED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature"
 
 
 @contextmanager
-def recording_file(out: Path, settings: str) -> Iterator[Hdf5Writer | CsvWriter]:
-    """Give a file to append chunks to, which is called `out` (.h5, .hdf5 or .csv) when all went well.
+def recording_file(out: Path, settings: str, framing: Framing | None = None) -> Iterator[RecordingWriter]:
+    """Give a file to append chunks to, which is called `out` when all went well.
 
-    A recording that was simulated before, and is as it was written, is replaced; any other file is refused. `settings`
-    are kept in it, and its SHA-256.
+    Its ending says what it is, unless it is to hold the bytes of a `framing`. A recording that was simulated before,
+    and is as it was written, is replaced; any other file is refused. `settings` are kept in it where there is a place
+    for them, and its SHA-256.
 
     Raises
     ------
@@ -239,16 +245,29 @@ def recording_file(out: Path, settings: str) -> Iterator[Hdf5Writer | CsvWriter]
     Unwritable
         If the disk is full, or the like.
     """
-    kind = WRITERS.get(out.suffix.lower())
-    if kind is None:
-        raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
+    begin = _format_of(out) if framing is None else partial(FramingWriter, framing=framing)
     check_own(out, "simulate", f"--out {out}", "name another file")
-    with _locked_partial(Path(os.path.realpath(out)), out) as partial:
-        writer = kind(partial, settings)
-        with closing(writer.file):  # also of a program that stops: rows that were written are whole
+    with _locked_partial(Path(os.path.realpath(out)), out) as unfinished:
+        writer = begin(unfinished, settings)
+        with closing(writer):  # also of a program that stops: rows that were written are whole
             yield writer
-        seal(partial)
-        put(partial, out, "simulate", f"--out {out}")
+        seal(unfinished)
+        put(unfinished, out, "simulate", f"--out {out}")
+
+
+def _format_of(out: Path) -> Callable[[Path, str], RecordingWriter]:
+    """Return the function that begins a recording of the format that a name ends in; raises ConfigError."""
+    known, suffix = dict(TABLES), out.suffix.lower()
+    for cls in registry().classes(Source).values():
+        if issubclass(cls, FileSource):
+            known |= dict.fromkeys(cls.written, partial(_begun, cls, suffix))
+    if suffix not in known:
+        raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in one of {', '.join(known)}")
+    return known[suffix]
+
+
+def _begun(cls: type[FileSource], suffix: str, path: Path, settings: str) -> RecordingWriter:
+    return cls.writer(path, suffix, seal_of("simulate"))
 
 
 @contextmanager
@@ -271,6 +290,8 @@ def _locked_partial(out: Path, named: Path) -> Iterator[Path]:
 class Hdf5Writer:
     """One data set a channel, each with its `unit`; time is the first axis."""
 
+    names: ClassVar[tuple[str, ...]] = ()
+
     def __init__(self, path: Path, settings: str) -> None:
         attributes = {"sha256": seal_of("simulate"), "program": f"{SIMULATED_MARK} {__version__}", "settings": settings}
         self.file = GrowingFile(path, attributes, {name: {"unit": unit} for name, unit in SIMULATED_UNITS.items()})
@@ -279,21 +300,29 @@ class Hdf5Writer:
         """Add the rows of a chunk."""
         self.file.append(_columns(chunk))
 
+    def close(self) -> None:
+        """Finish the file."""
+        self.file.close()
+
 
 class CsvWriter:
     """One column an axis, below comments with the config that reads them."""
 
-    axes: ClassVar[str] = "xyz"
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str) -> None:
         self.settings, self.file = settings, path.open("wb")
+
+    def close(self) -> None:
+        """Finish the file."""
+        self.file.close()
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
         import polars as pl
 
         columns = _columns(chunk)
-        table = {name: self._names(name, values) for name, values in columns.items()}
+        table = {name: names_of_axes(name, values) for name, values in columns.items()}
         begun = self.file.tell() > 0
         if not begun:
             self.file.write(self._comments(table).encode())
@@ -303,12 +332,6 @@ class CsvWriter:
             for column, part in zip(table[name], np.atleast_2d(values.T), strict=True)
         ]
         self.file.write(pl.DataFrame(flat).write_csv(include_header=not begun).encode())
-
-    def _names(self, name: str, values: Array) -> list[str]:
-        if values.ndim == 1:
-            return [name]
-        count = values.shape[1]
-        return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
 
     def _comments(self, table: dict[str, list[str]]) -> str:
         lines = [f"{seal_of('simulate')}; to read it:", "source:", "  kind: csv", "  channels:"]
@@ -330,8 +353,75 @@ def written_units(path: Path) -> dict[str, str]:
     return {}
 
 
-WRITERS: dict[str, type[Hdf5Writer | CsvWriter]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}
+MOST_ROWS = 1_048_575  # of a sheet, below its heads
+
+
+class XlsxWriter:
+    """A spreadsheet: one column an axis, its unit in its head; what it was made from is on a second sheet."""
+
+    names: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, path: Path, settings: str) -> None:
+        if find_spec("openpyxl") is None:
+            raise ConfigError(
+                "--out: the package openpyxl is not installed, it was expected for .xlsx; pip install 'driftlab[excel]'"
+            )
+        from openpyxl import Workbook
+
+        self._path, self._book, self._rows = path, Workbook(write_only=True), 0
+        self._sheet = self._book.create_sheet("recording")
+        self._book.create_sheet("settings").append([settings])
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the rows of a chunk; raises ConfigError where a sheet cannot hold them."""
+        columns = _columns(chunk)
+        if not self._rows:
+            heads = [
+                (head, SIMULATED_UNITS.get(name)) for name in columns for head in names_of_axes(name, columns[name])
+            ]
+            self._sheet.append([f"{head} [{unit}]" if unit else head for head, unit in heads])
+        self._rows += len(chunk)
+        if self._rows > MOST_ROWS:
+            raise ConfigError(f"--out: more than {MOST_ROWS:,} rows, as many as a sheet holds; write .csv or .h5")
+        for row in np.column_stack(list(columns.values())).tolist():
+            self._sheet.append(row)
+
+    def close(self) -> None:
+        """Finish the file: its seal is the comment of the archive that a spreadsheet is."""
+        self._book.save(self._path)
+        with ZipFile(self._path, "a") as archive:
+            archive.comment = seal_of("simulate").encode()
+
+
+class FramingWriter:
+    """The bytes that a device sends, one sample behind the other."""
+
+    def __init__(self, path: Path, settings: str, *, framing: Framing) -> None:
+        self._file, self._framing, self._sent = path.open("wb"), framing, 0
+        self.names = tuple(framing.decode(b"", None)[0].channels)
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the samples of a chunk."""
+        self._file.write(self._framing.encode(chunk, self._sent))
+        self._sent += len(chunk)
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._file.close()
+
+
+TABLES: dict[str, Callable[[Path, str], RecordingWriter]] = {
+    ".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter, ".xlsx": XlsxWriter,
+}  # fmt: skip
 
 
 def _columns(chunk: Chunk) -> dict[str, Array]:
     return {"time": chunk.t, **chunk.channels}
+
+
+def names_of_axes(name: str, values: Array) -> list[str]:
+    """Return the names of the columns of a channel."""
+    if values.ndim == 1:
+        return [name]
+    count = values.shape[1]
+    return [f"{name}_{axis}" for axis in ("xyz"[:count] if count <= len("xyz") else range(count))]

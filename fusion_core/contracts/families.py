@@ -44,6 +44,7 @@ SOURCES: Answers = {
 }
 FRAMINGS: Answers = {
     "decode": with_memory("decode", checks.frames),
+    "encode": instance("encode", bytes),
     "device_counter": instance("device_counter", Counter, optional=True),
 }
 EFFECTS: Answers = {

@@ -20,7 +20,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Protocol, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, field_serializer, model_validator
@@ -39,11 +39,26 @@ from fusion_core.units import Unit, convert
 Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI unit of each path of a channel
 
 
+class RecordingWriter(Protocol):
+    """A recording that is being written."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The channels that it has a place for; none where it takes all."""
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the rows of a chunk, which has all of `names`; what else it has is left out."""
+
+    def close(self) -> None:
+        """Finish the file: rows that were added are whole in it."""
+
+
 class FileSource(Source):
     """A file of samples. A subclass names its `kind` and gives `open`; `--input` works for every one of them."""
 
     signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
     suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
+    written: ClassVar[tuple[str, ...]] = ()  # suffixes of those that `writer` writes
     product: ClassVar[str | None] = None  # what a config of such a file extends, where its channels are always the same
 
     _title: str = PrivateAttr("")  # name of the recording, where `path` is of a copy of it
@@ -104,6 +119,20 @@ class FileSource(Source):
         UnreadableFile
             If the file cannot be read; also at the end of the block, where it is found damaged while it is open.
         """
+
+    @classmethod
+    def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
+        """Begin a recording as a device of this kind writes it, for rehearsals: of a source that has `written`.
+
+        `path` is to be written, whatever it is called; its name will end in `suffix`, one of `written`. `note`, at
+        most 128 characters, is to stand in the file as it is: it tells the file from one that was measured.
+
+        Raises
+        ------
+        ConfigError
+            If a package is needed that is not installed.
+        """
+        raise NotImplementedError
 
     def about(self, channel: str) -> Mapping[str, str]:
         """Return the properties of a channel's device that the file holds."""

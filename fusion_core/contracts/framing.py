@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.errors import ConfigError
 
 GARBAGE = "bytes that belong to no frame, left out"
 DAMAGED = "frames whose checksum or constants are wrong, left out"
@@ -74,3 +75,11 @@ class Framing(Plugin):
         `memory` is None where the stream begins, or was interrupted: in the middle of a frame, as likely as not.
         It stays small whatever the stream holds.
         """
+
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return samples as the device sends them, before which `begun` were sent; by default ConfigError.
+
+        The chunk is in SI, its time counts from the first sample that is sent. What `decode` makes of the bytes is the
+        same samples, to the resolution of the device's numbers.
+        """
+        raise ConfigError(f"{self.kind}: is a framing that can only be read; serve lines of text instead")

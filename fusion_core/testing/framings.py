@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Frames, Framing
 
 MAX_MEMORY = 1 << 18  # bytes of a memory that is small
@@ -62,6 +62,24 @@ def what_is_no_frame_is_passed_over(framing: Framing, stream: bytes) -> None:
             except Exception as error:
                 raise AssertionError(f"{what}: {type(error).__name__}: {error}") from error
         assert not n or count >= n // 2, f"after {what}, {count} of {n} samples are found"
+
+
+def what_is_encoded_is_decoded(framing: Framing, stream: bytes) -> None:
+    """Encoded samples are decoded as they were, where a framing can encode; the first may be lost as torn."""
+    frames, _ = framing.decode(stream, None)
+    if type(framing).encode is Framing.encode or not frames.N:
+        return
+    t = frames.channels.get("time", np.arange(frames.N, dtype=np.float64))
+    samples = Chunk(t, frames.channels)
+    encoded = b"".join(framing.encode(samples.part(k, min(k + 7, frames.N)), k) for k in range(0, frames.N, 7))
+    again, _ = framing.decode(encoded, None)
+    lost = frames.N - again.N
+    assert lost in (0, 1), f"{again.N} of {frames.N} encoded samples are found"
+    for name, values in frames.channels.items():
+        np.testing.assert_allclose(again.channels[name], values[lost:], rtol=1e-6, atol=1e-12, err_msg=name)
+    if (counter := framing.device_counter) is not None and again.count is not None:
+        step = 1.0 if counter.tick is None else np.diff(t[lost:]) / counter.tick
+        np.testing.assert_allclose(np.diff(again.count) % counter.modulo, step % counter.modulo, atol=1, rtol=0)
 
 
 def the_memory_stays_small(framing: Framing, stream: bytes) -> None:

@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings, nearest
-from fusion_plugins.framings.field import DeviceCounter, channel, check_channel
+from fusion_plugins.framings.field import VALID, DeviceCounter, channel, check_channel, counts, sent
 
 Bytes = NDArray[np.uint8]
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
@@ -71,6 +71,11 @@ class Checksum(Settings):
         for k in range(self.size):
             value = value << 8 | sent[:, k]
         return np.asarray(value == self._of(body), dtype=np.bool_)
+
+    def sent(self, body: Bytes, order: Literal["big", "little"]) -> Bytes:
+        """Return the checksums (N, size) that stand behind frames (N, L)."""
+        value = self._of(body[:, self.start :]).astype(">i8").reshape(-1, 1).view(np.uint8)[:, -self.size :]
+        return value if (self.byte_order or order) == "big" else value[:, ::-1]
 
     def _of(self, body: Bytes) -> NDArray[np.int64]:
         if self.kind == "xor8":
@@ -149,6 +154,12 @@ class BinaryField(Settings):
             check_channel(self.name, self.unit, self.count)
         return self
 
+    def numbers(self, values: Array) -> Array:
+        """Return values in `unit` as the numbers that are sent, held at the ends of what the type can hold."""
+        raw = (values - self.offset) / self.scale
+        kind = np.dtype(TYPES[self.type])
+        return raw if kind.kind == "f" else np.clip(np.rint(raw), np.iinfo(kind).min, np.iinfo(kind).max)
+
 
 class Binary(Framing):
     """Frames of a fixed layout between sync bytes and a checksum."""
@@ -202,6 +213,27 @@ class Binary(Framing):
     @property
     def _size(self) -> int:
         return int(self._layout.itemsize)
+
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return the frames of samples; a field that is no channel is what it must equal, or zero."""
+        frames = np.zeros(len(chunk), self._layout)
+        frames["sync"] = np.void(self.sync)
+        for k, field in enumerate(self.fields):
+            if self.counter is not None and field.name == self.counter.field:
+                frames[f"f{k}"] = counts(self.counter.as_counter(), chunk.t, begun)[:, None]
+            elif field.name is None or (field.name == VALID and VALID not in chunk.channels):
+                frames[f"f{k}"] = (field.name == VALID) if field.equals is None else field.equals
+            else:
+                values = chunk.t if field.name == "time" else chunk[field.name]
+                frames[f"f{k}"] = field.numbers(sent(field.name, values, field.unit))
+        if self.end:
+            frames["end"] = np.void(self.end)
+        if self.checksum is not None:
+            raw = frames.view(np.uint8).reshape(len(frames), self._size)
+            stop = self._size - len(self.end)
+            at = stop - self.checksum.size
+            raw[:, at:stop] = self.checksum.sent(raw[:, :at], self.byte_order)
+        return frames.tobytes()
 
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
         """Return the frames that end in `data`; the memory is what may be the beginning of the next one."""

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from fusion_core.chunk import Array
@@ -53,6 +54,18 @@ def channel(name: str, columns: Array, unit: str | None = None) -> Array:
     values = columns if slope == 1 and zero == 0 else columns * slope + zero
     triad = name in USUAL and USUAL[name].axes == 3
     return values if triad or values.shape[1] > 1 else np.ascontiguousarray(values[:, 0])
+
+
+def sent(name: str, values: Array, unit: str | None = None) -> Array:
+    """Return a channel in SI, (N,) or (N, d), as the (N, d) columns that `channel` makes it of."""
+    zero, slope = _factors(name, unit)
+    return (values.reshape(len(values), -1) - zero) / slope
+
+
+def counts(counter: Counter, t: Array, first: int) -> NDArray[np.uint64]:
+    """Return the numbers (N,) that a device's counter shows at t, where samples are counted from `first`."""
+    number = first + np.arange(len(t)) if counter.tick is None else np.rint(t / counter.tick).astype(np.int64)
+    return (number % counter.modulo).astype(np.uint64)
 
 
 @cache

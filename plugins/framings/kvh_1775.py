@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import Counter, Frames, Framing
@@ -82,13 +83,13 @@ class Kvh1775(Framing):
             {"name": "sequence", "type": "uint8"},
             {"name": "temperature", "type": "int16", "unit": "degC" if celsius else "degF", "scale": number},
         ]
-        counted = "timestamp" if self.message == "B" else "sequence"
+        counted = {"field": "timestamp", "tick": "1 us"} if self.message == "B" else {"field": "sequence"}
         return Binary.model_validate({
             "sync": HEADERS[self.message],
             "byte_order": "big",
             "fields": fields,
             "checksum": {"kind": "CRC-32/MPEG-2"},
-            "counter": {"field": counted, "modulo": self.device_counter.modulo},
+            "counter": {**counted, "modulo": self.device_counter.modulo},
         })  # fmt: skip
 
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
@@ -97,6 +98,12 @@ class Kvh1775(Framing):
         channels = {name: frames.channels[name] for name in ("gyro", "accel", "temperature")}
         channels[VALID] = (frames.channels["status"] == ALL_VALID).astype(np.float64)
         return Frames(frames.N, channels, frames.count, frames.rejected), memory
+
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return the messages of samples, all of them valid."""
+        number = begun + np.arange(len(chunk))
+        more = {"status": np.full(len(chunk), ALL_VALID), "sequence": number % 128}
+        return self._binary.encode(Chunk(chunk.t, {**chunk.channels, **more}), begun)
 
 
 @hookimpl

@@ -20,12 +20,13 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import Channel, Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.errors import MissingChannel
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.framings.field import DeviceCounter, channel, check_channel
+from fusion_plugins.framings.field import DeviceCounter, channel, check_channel, counts, sent
 
 LONGEST = 4096  # bytes of a line
 UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before the stream, within it, too far back
@@ -92,6 +93,25 @@ class Text(Framing):
         rejections = {GARBAGE: garbage, DAMAGED: damaged}
         frames = self._frames(rows, {what: n for what, n in rejections.items() if n})
         return frames, (state, rest, columns)
+
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return the lines of samples; before the first one, the columns' names where the config does not fix them."""
+        names = self.columns or tuple(self._needed)
+        cells = np.full((len(chunk), len(names)), "0", dtype=object)
+        for name, column in self.channels.items():
+            values = chunk.t if name == "time" else chunk[name]
+            for path, numbers in zip(column.paths, sent(name, values, column.unit).T, strict=True):
+                cells[:, names.index(path)] = list(map(repr, numbers.tolist()))
+        if self.counter is not None:
+            count = counts(self.counter.as_counter(), chunk.t, begun)
+            cells[:, names.index(self.counter.field)] = list(map(str, count.tolist()))
+        rows = cells.tolist() if self.columns or begun else [names, *cells.tolist()]
+        return "".join(self._line(row) for row in rows).encode()
+
+    def _line(self, cells: Sequence[str]) -> str:
+        text = self.prefix + self.separator.join(cells)
+        check = "" if self.checksum is None else f"*{reduce(xor, text[1:].encode(), 0):02X}"
+        return f"{text}{check}\r\n"
 
     def _payload(self, line: bytes) -> tuple[str | None, bool | None]:
         """Return the cells' text and whether the checksum is right; (None, None) where it is no line of the device."""

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.framings.field import channel
+from fusion_plugins.framings.field import channel, counts
 
 SYNC = b"\xfa\xff\x36"
 LONGEST = 4096  # bytes of a message; the length of what looks like a longer one is damaged
@@ -90,6 +90,21 @@ class XsensMtdata2(Framing):
         frames, held = self._frames(stream, messages, held, {GARBAGE: garbage, DAMAGED: rejected})
         return frames, (stream[at:], held)
 
+    def encode(self, chunk: Chunk, begun: int) -> bytes:
+        """Return the messages of samples, in single precision, with the temperature in each."""
+        identifier, code = CLOCKS[self.clock]
+        items = {identifier: counts(self.device_counter, chunk.t, begun)[:, None].astype(code)}
+        for name in sorted(self.channels, key=IDENTIFIERS.__getitem__):
+            items[IDENTIFIERS[name]] = chunk[name].reshape(len(chunk), -1).astype(">f4")
+        parts = []
+        for identifier, values in items.items():
+            data = values.view(np.uint8)
+            parts += [_repeated(identifier.to_bytes(2, "big") + bytes([data.shape[1]]), len(chunk)), data]
+        body = np.concatenate(parts, axis=1)
+        head = _repeated(SYNC + bytes([body.shape[1]]), len(chunk))
+        total = np.sum(head[:, 1:], axis=1, dtype=np.int64) + np.sum(body, axis=1, dtype=np.int64)
+        return np.column_stack([head, body, (-total % 256).astype(np.uint8)]).tobytes()
+
     def _frames(
         self, stream: bytes, whole: list[tuple[int, int]], held: Mapping[str, Array], rejected: dict[str, int]
     ) -> tuple[Frames, dict[str, Array]]:
@@ -124,6 +139,10 @@ class XsensMtdata2(Framing):
         if item is None or item.size != np.dtype(code).itemsize:
             return None
         return _view(messages, item, np.dtype(code))[:, 0].astype(np.int64)
+
+
+def _repeated(data: bytes, N: int) -> Bytes:
+    return np.tile(np.frombuffer(data, np.uint8), (N, 1))
 
 
 def _length(stream: bytes, at: int) -> int | None:

@@ -7,16 +7,17 @@ last name that is mentioned before it; recordings that a page does not make are 
 import json
 import re
 import shlex
-from contextlib import chdir
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, chdir, contextmanager
 from pathlib import Path
 
-import dataflash_writer
 import h5py
 import jsonschema
 import numpy as np
 import planted
 import pytest
-import ulog_writer
 from command_line import driftlab
 from other_formats import write_formats
 from typer.testing import CliRunner
@@ -67,6 +68,21 @@ def commands(text):
     return [line[: line.index(">")] if ">" in line else line for line in words]
 
 
+@contextmanager
+def in_background(folder, *args):
+    """Run a command of a page that ends in `&`, until the end of the page; what it is to make is there."""
+    process = subprocess.Popen([sys.executable, "-m", "driftlab", *args], cwd=folder, stdout=subprocess.DEVNULL)
+    try:
+        out = folder / args[args.index("--out") + 1]
+        while not out.exists():
+            assert process.poll() is None, f"driftlab {shlex.join(args)}: ended with {process.returncode}"
+            time.sleep(0.01)
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
 def name_of(text, before):
     """Return what a config is called, None where the page does not say, or shows a piece of it."""
     first = re.match(r"# (\S+\.yaml)\b", text)
@@ -91,24 +107,12 @@ def bench(tmp_path_factory):
                 file[column].attrs["unit"] = label
         if name == "run.h5":
             write_formats(folder, unit)
-        if name in ("soak.h5", "run.h5"):
-            write_logs(folder / name, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
     config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
     (folder / "unit.yaml").write_text(config)
     run_in(folder, "fit-map", "unit.yaml", "--input", "soak.h5")
     return folder
-
-
-def write_logs(path, unit):
-    """Write the logs of a PX4 and an ArduPilot vehicle beside a recording, switched on 20 s before it begins."""
-    t, number = unit.t - unit.t[0] + 20, 2490378
-    sensors = [("sensor_gyro", unit.gyro), ("sensor_accel", unit.accel)]
-    topics = [ulog_writer.sensor(name, 0, t, xyz, unit.temperature, number) for name, xyz in sensors]
-    ulog_writer.write_ulog(path.with_suffix(".ulg"), topics, {"CAL_GYRO0_ID": number, "TC_G_ENABLE": 0})
-    values = {"AHRS_ORIENTATION": 0, "INS_TCAL1_ENABLE": 0}
-    dataflash_writer.write_log(path.with_suffix(".bin"), t, [(unit.gyro, unit.accel, unit.temperature)], values)
 
 
 def run_in(folder, *args):
@@ -129,6 +133,11 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
             (tmp_path / path.name).symlink_to(path.resolve())
     if page.stem == "calibrate_a_production_line":
         planted.make(tmp_path, count=14, hours=0.25, fresh=2)
+    with ExitStack() as running:
+        follow(page, tmp_path, running)
+
+
+def follow(page, tmp_path, running):
     for kind, text, before in blocks(page):
         if kind == "yaml" and (name := name_of(text, before)) and read(text).keys() <= TOP:
             (tmp_path / name).unlink(missing_ok=True)
@@ -140,7 +149,11 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
                 exec(compile(text, page.name, "exec"), {})
         elif kind == "shell":
             for command in commands(text):
-                if command not in ELSEWHERE:
+                if command[0] == "simulate" and (made := tmp_path / command[command.index("--out") + 1]).is_symlink():
+                    made.unlink()  # the page makes a recording of its own
+                if command[-1] == "&":
+                    running.enter_context(in_background(tmp_path, *command[:-1]))
+                elif command not in ELSEWHERE:
                     run_in(tmp_path, *command)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import polars as pl
 import scipy.io
 
+import driftlab
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
 from fusion_plugins.sources.csv import Csv
@@ -54,6 +55,13 @@ def channels(**more):
 
 def read(source, size=1000, faults=None):
     return concatenate(list(source.chunks(size, Faults() if faults is None else faults)))
+
+
+def simulated_as(path):
+    """A minute of a simulated unit as `simulate` writes it to a path, and its arrays; return both."""
+    config = {"source": {"kind": "synthetic", "rate": "20 Hz", "duration": "60 s", "seed": 4, "roll": "180 deg"}}
+    driftlab.simulate(config, out=path)
+    return path, driftlab.simulate(config)
 
 
 def text(tmp_path, content, name="r.csv"):

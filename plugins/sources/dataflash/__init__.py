@@ -19,6 +19,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from fusion_core.contracts import FileSource, Source, Table, foreign, head
+from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -33,6 +34,7 @@ class DataFlash(FileSource):
 
     signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
     suffixes: ClassVar[tuple[str, ...]] = (".bin", ".BIN")
+    written: ClassVar[tuple[str, ...]] = (".bin",)
     product: ClassVar[str | None] = "ardupilot_log"
 
     kind: Literal["dataflash"] = "dataflash"
@@ -62,6 +64,13 @@ class DataFlash(FileSource):
         log = DataFlashMessages(path, data, wanted | {"IMU"}, faults)
         of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
         yield Messages(log, self.imu, self.compensated, faults, of_rows)
+
+    @classmethod
+    def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
+        """Begin a log."""
+        from fusion_plugins.sources.dataflash.writer import DataFlashWriter
+
+        return DataFlashWriter(path, note)
 
 
 @hookimpl

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import COPIED, check_count, keep, temporary_folder, unpacked_at_most
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -50,6 +51,7 @@ class Rosbag(FileSource):
 
     signatures: ClassVar[tuple[bytes, ...]] = (ros1.SIGNATURE, mcap.SIGNATURE, b"SQLite format 3\0")
     suffixes: ClassVar[tuple[str, ...]] = (".bag", ".mcap", ".db3")
+    written: ClassVar[tuple[str, ...]] = (".bag", ".mcap")
 
     kind: Literal["rosbag"] = "rosbag"
     stamp: Literal["header", "log"] = "header"
@@ -58,14 +60,25 @@ class Rosbag(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""
-        if find_spec("rosbags") is None:
-            raise ConfigError(
-                "rosbag: the package rosbags is not installed, it was expected for ROS bags; "
-                "pip install 'driftlab[ros]'"
-            )
+        _check_installed()
         leading = self.channels.get("time") or self.channels.get("gyro") or next(iter(self.channels.values()))
         with storages(path, self.kind, faults) as files:
             yield Topics(path, files, leading.paths[0], self.stamp, faults)
+
+    @classmethod
+    def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
+        """Begin a bag of ROS 1 or an MCAP file of ROS 2; raises ConfigError without rosbags."""
+        _check_installed()
+        from fusion_plugins.sources.rosbag.writer import BagWriter
+
+        return BagWriter(path, ros1=suffix == ".bag", note=note)
+
+
+def _check_installed() -> None:
+    if find_spec("rosbags") is None:
+        raise ConfigError(
+            "rosbag: the package rosbags is not installed, it was expected for ROS bags; pip install 'driftlab[ros]'"
+        )
 
 
 class Topics(Table):

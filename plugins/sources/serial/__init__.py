@@ -31,7 +31,7 @@ from pydantic import Field, model_validator
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
 from fusion_core.contracts.file_source import problem
-from fusion_core.contracts.framing import Framing
+from fusion_core.contracts.framing import Counter, Framing
 from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl
@@ -73,6 +73,8 @@ class Serial(Source):
     """Bytes kept for a filter that is late."""
     silent_after: Annotated[float, Unit("s", positive=True, example="5 s")] = Quantity(5.0, "5 s")
     """Longest silence of the device before it is reported."""
+    speed: Annotated[float, Field(gt=0)] = 1.0
+    """Pace of the device's clock, in that of the host: more than 1 in a rehearsal (`simulate --serve --speed`)."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -93,8 +95,10 @@ class Serial(Source):
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield samples as they come, without an end; an empty chunk every second in which none comes."""
         counter = self.framing.device_counter
+        if counter is not None and counter.tick is not None:
+            counter = Counter(counter.modulo, counter.tick / self.speed)  # by the host's clock
         kind = self.clock or ("host" if counter is None else "device")
-        clock = SampleClock(self.interval, counter, kind, self.window, faults)
+        clock = SampleClock(self.interval / self.speed, counter, kind, self.window, faults)
         memory = None
         heard = spoke = whole_at = time.monotonic()
         silent, unused = False, 0  # bytes since the last frame
@@ -109,7 +113,7 @@ class Serial(Source):
                     where = f"after {seconds(max(clock.t, 0.0))}"
                     for what, count in frames.rejected.items():
                         faults.add(what, count, where)
-                    t = clock.stamp(frames.N, frames.count, arrived.at)
+                    t = clock.stamp(frames.N, frames.count, arrived.at) * self.speed
                     if frames.N:
                         spoke, whole_at, unused = now, now, 0
                     whole = Chunk(t, frames.channels)

@@ -27,6 +27,7 @@ from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
+    from fusion_core.contracts.file_source import RecordingWriter
     from fusion_plugins.sources.ulog.file import Instance, LogFile
     from fusion_plugins.sources.ulog.table import ULogTopics
 
@@ -53,6 +54,7 @@ class Ulog(FileSource):
 
     signatures: ClassVar[tuple[bytes, ...]] = (b"ULog\x01\x125",)
     suffixes: ClassVar[tuple[str, ...]] = (".ulg",)
+    written: ClassVar[tuple[str, ...]] = (".ulg",)
     product: ClassVar[str | None] = "px4_log"
 
     kind: Literal["ulog"] = "ulog"
@@ -93,6 +95,13 @@ class Ulog(FileSource):
             for note in table.notes([path for channel in self.channels.values() for path in channel.paths]):
                 faults.note(note)
         yield table
+
+    @classmethod
+    def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
+        """Begin a log."""
+        from fusion_plugins.sources.ulog.writer import ULogWriter
+
+        return ULogWriter(path, note)
 
     def _gyro(self, log: LogFile) -> Instance | None:
         """Return the gyro that the settings name."""

@@ -1,18 +1,26 @@
 """Simulated recordings: written, read back by the sources, and used by the other commands as any recording is."""
 
 import json
+import signal
+import subprocess
+import sys
+import threading
 
 import h5py
 import numpy as np
 import pytest
 import yaml
+from bench import some
 from command_line import driftlab
 
 from driftlab.commands.simulate import simulate, simulation
-from driftlab.config import load_config
+from driftlab.config import load_config, understood
+from driftlab.storage import recorder
 from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.faults import Faults
+from fusion_core.host.config import document_of
+from fusion_plugins.sources import rosbag
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
 
@@ -90,7 +98,7 @@ def test_a_wrong_seed_or_duration_is_named(config, seed, duration, message):
         simulation(config, seed, duration)
 
 
-@pytest.mark.parametrize("name", ["twin.h5", "twin.csv"])
+@pytest.mark.parametrize("name", ["twin.h5", "twin.csv", "twin.ulg", "twin.bin", "twin.bag", "twin.mcap"])
 def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, name):
     out = tmp_path / name
     simulate(config, out=out)
@@ -106,6 +114,9 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     with pytest.raises(ConfigError, match="exists, and has no SHA-256 by which `driftlab simulate` knows what"):
         simulate(config, out=out)
     assert out.read_text() == "time,gx\n0,1\n"
+
+
+def test_a_simulated_file_of_hdf5_that_was_edited_stays(config, tmp_path):
     simulate(config, out=tmp_path / "edited.h5")
     with h5py.File(tmp_path / "edited.h5", "r+") as file:
         file["gyro"][3] = 9.0
@@ -129,7 +140,7 @@ def test_a_run_that_dies_leaves_the_final_name_alone(config, tmp_path):
 
 
 def test_what_cannot_be_written_is_said(config, tmp_path):
-    with pytest.raises(ConfigError, match=r"ends in '.mat'; write a name that ends in .h5, .hdf5 or .csv"):
+    with pytest.raises(ConfigError, match=r"ends in '.mat'; write a name that ends in one of .h5, .hdf5, .csv, .*.ulg"):
         simulate(config, out=tmp_path / "twin.mat")
     (tmp_path / "file").write_text("")
     with pytest.raises(FusionError, match="cannot be written"):
@@ -204,3 +215,117 @@ def test_the_filter_runs_on_the_simulation_itself(tmp_path):
     done = driftlab("run", "twin.yaml", "--out", "out", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert 0.8 < json.loads(done.stdout)["nis"]["mean_per_component"] < 1.2
+
+
+def test_a_spreadsheet_has_the_recording_with_units_in_its_heads(config, tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    out = tmp_path / "twin.xlsx"
+    simulate(config, out=out)
+    simulate(config, out=out)
+    book = openpyxl.load_workbook(out, read_only=True)
+    heads, *rows = book["recording"].values
+    settings = json.loads(next(book["settings"].values)[0])
+    book.close()
+    assert heads[:4] == ("time [s]", "gyro_x [rad/s]", "gyro_y [rad/s]", "gyro_z [rad/s]")
+    made, table = whole(config.source), np.array(rows)
+    np.testing.assert_array_equal(table[:, 0], made.t)
+    np.testing.assert_allclose(table[:, 1:4], made["gyro"], rtol=1e-15)  # a cell has 16 digits
+    np.testing.assert_allclose(table[:, heads.index("temperature [degC]")], made["temperature"], rtol=1e-15)
+    assert settings["seed"] == 3
+    out.write_bytes(out.read_bytes().replace(b"PK", b"PQ", 1))
+    with pytest.raises(ConfigError, match="was changed since `driftlab simulate` wrote it"):
+        simulate(config, out=out)
+
+
+def test_a_spreadsheet_that_is_too_long_is_refused(config, tmp_path, monkeypatch):
+    pytest.importorskip("openpyxl")
+    monkeypatch.setattr(recorder, "MOST_ROWS", 599)
+    with pytest.raises(ConfigError, match=r"more than 599 rows, as many as a sheet holds; write .csv or .h5"):
+        simulate(config, out=tmp_path / "twin.xlsx")
+    assert not (tmp_path / "twin.xlsx").exists()
+
+
+@pytest.mark.parametrize(
+    ("ending", "package", "extra"),
+    [("xlsx", "openpyxl", "excel"), ("bag", "rosbags", "ros"), ("mcap", "rosbags", "ros")],
+)
+def test_a_package_that_is_missing_is_named(config, tmp_path, monkeypatch, ending, package, extra):
+    for module in (recorder, rosbag):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=rf"package {package} is not installed, .*pip install 'driftlab\[{extra}\]'"):
+        simulate(config, out=tmp_path / f"twin.{ending}")
+    assert list(tmp_path.glob("twin.*")) == [tmp_path / "twin.yaml"]
+
+
+DEVICE = """
+source:
+  kind: serial
+  port: twin_port
+  interval: 50 ms
+  framing: {kind: kvh_1775, message: B, interval: 50 ms}
+"""
+
+
+def test_a_file_holds_the_bytes_of_a_device(config, tmp_path):
+    (tmp_path / "device.yaml").write_text(DEVICE)
+    written = simulate(config, out=tmp_path / "twin.bin", framing=tmp_path / "device.yaml")
+    assert written.lines() == ["bias_truth: has no place in the file; the same seed gives it in .h5"]
+    got, made = whole(load_config(tmp_path / "device.yaml").source.of_file(tmp_path / "twin.bin")), whole(config.source)
+    np.testing.assert_allclose(got.t, made.t, atol=1e-9)
+    np.testing.assert_allclose(got["gyro"], made["gyro"], rtol=1e-6)
+    np.testing.assert_allclose(got["accel"], made["accel"], rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(got["temperature"], np.rint(made["temperature"]))
+    simulate(config, out=tmp_path / "vn.bin", framing="vectornav_imu")
+    assert len((tmp_path / "vn.bin").read_bytes()) == 600 * 44
+
+
+def test_what_serves_nothing_is_named(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"--framing .*twin.yaml: its source has no framing"):
+        simulate(config, out=tmp_path / "twin.bin", framing=tmp_path / "twin.yaml")
+    with pytest.raises(ConfigError, match=r"--speed: is of a recording that is played; add --serve"):
+        simulate(config, out=tmp_path / "twin.h5", speed=2.0)
+    with pytest.raises(ConfigError, match=r"--speed 0: more than 0 was expected"):
+        simulate(config, serve=True, speed=0.0)
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(ConfigError, match=r"--out .*taken: cannot be linked \(File exists\); name another"):
+        simulate(config, serve=True, out=tmp_path / "taken")
+    done = driftlab("simulate", "twin.yaml", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (
+        2, "driftlab: --out: is missing; name a file, as FILE.h5, or play it out of a device with --serve\n",
+    )  # fmt: skip
+
+
+def test_a_config_reads_what_is_served(config, tmp_path):
+    """The `source` that is said reads all samples, in the order and at the times at which they were simulated."""
+    begun, chunks = threading.Event(), []
+
+    def listen(said):
+        source = understood(document_of({"source": dict(said)})).source
+        reader = threading.Thread(target=lambda: chunks.append(some(source.chunks(1000, Faults()), 599)))
+        reader.start()
+        begun.reader = reader
+
+    served = simulate(config, serve=True, speed=30.0, out=tmp_path / "port", opened=listen)
+    begun.reader.join()
+    got, made = chunks[0], whole(config.source)
+    assert (served.rows, served.lost, served.path) == (600, 0, tmp_path / "port")
+    assert not (tmp_path / "port").is_symlink()
+    first = 600 - len(got)  # the line that nobody saw begin
+    assert first <= 1
+    np.testing.assert_allclose(got.t, made.t[first:] - made.t[first], atol=1e-9)
+    for name in ("gyro", "accel", "temperature"):
+        np.testing.assert_array_equal(got[name], made[name][first:])
+
+
+def test_a_device_that_nobody_opened_ends_by_ctrl_c(config, tmp_path):
+    command = [sys.executable, "-m", "driftlab", "simulate", "twin.yaml", "--serve", "--out", "port", "--json"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    first = json.loads(process.stdout.readline())["source"]
+    assert (first["kind"], first["port"], first["interval"], first["framing"]["kind"]) == (
+        "serial", "port", "0.05 s", "text",
+    )  # fmt: skip
+    assert (tmp_path / "port").exists()
+    process.send_signal(signal.SIGINT)
+    said = json.loads(process.communicate()[0])
+    assert (process.returncode, said["rows"]) == (0, 0)
+    assert not (tmp_path / "port").is_symlink()

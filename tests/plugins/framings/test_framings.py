@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from fusion_core.chunk import Chunk
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Frames, Framing
-from fusion_core.errors import MissingChannel
+from fusion_core.errors import ConfigError, MissingChannel
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Registry, registry
 
@@ -357,3 +358,38 @@ def test_a_control_character_in_a_line_is_damage_and_no_space(code):
     decoder = framing(kind="text", columns=["a", "b"], channels={"gyro": {"path": "b", "unit": "rad/s"}})
     frames, _ = decoder.decode(b"0,0\n1,2\n3,4" + bytes([code]) + b"\n5,6\n", None)
     assert frames.channels["gyro"].ravel().tolist() == [2.0, 6.0]
+
+
+def test_a_framing_that_encodes_nothing_says_so():
+    class OnlyRead(Framing):
+        kind: Literal["only_read"] = "only_read"
+
+        def decode(self, data, memory):
+            raise NotImplementedError
+
+    with pytest.raises(ConfigError, match="only_read: is a framing that can only be read; serve lines of text instead"):
+        OnlyRead().encode(Chunk(np.arange(3.0), {}), 0)
+
+
+def test_numbers_that_a_type_cannot_hold_stay_at_its_ends():
+    fields = [{"name": "temperature", "type": "int8", "unit": "degC"}]
+    device = framing(kind="binary", sync="A5 5A", fields=fields, checksum={"kind": "sum8"}, end="0D 0A")
+    T = np.array([-300.0, -5.4, 21.6, 300.0])
+    frames, _ = device.decode(device.encode(Chunk(np.arange(4.0), {"temperature": T}), 0), None)
+    np.testing.assert_array_equal(frames.channels["temperature"], [-128, -5, 22, 127])
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_lines_are_encoded_as_a_config_names_them(separator):
+    columns, channels = ["n", "T", "other"], {"temperature": {"path": "T", "unit": "degF"}}
+    device = framing(
+        kind="text", separator=separator, columns=columns, prefix="$IMU,", checksum="nmea", channels=channels,
+        counter={"field": "n", "modulo": 4},
+    )  # fmt: skip
+    samples = Chunk(np.arange(6.0), {"temperature": np.array([0.0, 10.0, 20.0, -40.0, 100.0, 37.0])})
+    encoded = device.encode(samples.part(0, 2), 0) + device.encode(samples.part(2, 6), 2)
+    frames, _ = device.decode(encoded, None)
+    np.testing.assert_allclose(frames.channels["temperature"], samples["temperature"], atol=1e-12)
+    np.testing.assert_array_equal(frames.count, [0, 1, 2, 3, 0, 1])
+    assert encoded.startswith(f"$IMU,0{separator}32.0".encode())
+    assert not frames.rejected
