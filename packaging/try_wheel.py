@@ -41,6 +41,7 @@ def call(*command: object, folder: Path) -> None:
 
 
 def main(pythons: list[str]) -> None:
+    """Build the wheel, try it on each Python, and put it into dist/."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         source = folder / "source"

@@ -99,8 +99,8 @@ def served_at(link: Path | None) -> Iterator[PseudoTerminal]:
         if link is None:
             yield terminal
             return
-        if link.is_symlink() and not link.exists():  # of one that was killed
-            link.unlink()
+        if link.is_symlink() and os.readlink(link).startswith("/dev/pts/") and not link.exists():
+            link.unlink()  # of one that was killed
         try:
             link.symlink_to(terminal.device)
         except OSError as error:

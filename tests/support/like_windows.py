@@ -20,7 +20,7 @@ import types
 LIBRARIES = ("h5py", "numba.core.caching", "onnx", "onnxruntime", "pint", "polars", "rich.console", "scipy.special")
 LACKS = ("fcntl", "termios", "tty", "pty", "resource", "pwd", "grp", "readline")
 CALLS = ("pread", "pwrite", "geteuid", "getgid", "statvfs", "fork", "mkfifo", "killpg", "fchmod", "O_NOFOLLOW",
-         "O_NONBLOCK", "ST_RDONLY", "posix_fallocate", "register_at_fork", "set_blocking", "mknod", "chown")  # fmt: skip
+         "O_NONBLOCK", "ST_RDONLY", "posix_fallocate", "register_at_fork", "set_blocking", "mknod")  # fmt: skip
 SIGNALS = ("SIGHUP", "SIGIO", "SIGALRM", "SIGUSR1", "pthread_sigmask", "setitimer")
 RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?$|.*[<>:\"|?*\x00-\x1f]|.*[. ]$")
 
