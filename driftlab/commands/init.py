@@ -83,7 +83,7 @@ def _guess(file: Path, path: str, units: Mapping[str, str]) -> Starter:
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
-            columns = columns_of(file, cls)
+            columns = columns_of(file, cls, {})
         except DataError as error:
             check_all()
             errors.append(error)
@@ -107,8 +107,8 @@ def _of_columns(file: Path, path: str, columns: FileColumns, units: Mapping[str,
             f"{file}: no {columns.noun} is called like a gyro or an accelerometer; it has {_listed(columns.names)}; "
             "write a config with the channels' paths, or rename them, as in gyro_x"
         )
-    if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
-        channels = replace(channels, noise={held: noise})
+    if held is not None and (noise := noise_of_column(columns, held.path, channels.found.get("time"))) is not None:
+        channels = replace(channels, noise={held.path: noise})
     return config_text.of_columns(path, file.name, columns, channels, _map_name(file))
 
 

@@ -8,7 +8,6 @@ is in SI.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
@@ -16,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise, noise_of
-from driftlab.starter.names import UNITS, Name, leading, named, read_name
+from driftlab.starter.names import Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
@@ -57,8 +56,6 @@ def channels_of(columns: FileColumns, given: Mapping[str, str], written: Mapping
     stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
     if stream is not None:  # that the sensor is a part of: a topic stands for its time
         groups["time"] = [stream]
-    if "time" in groups and not _rises(columns.values[groups["time"][0].path]):
-        del groups["time"]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
     channels: dict[str, GuessedChannel] = {}
@@ -103,10 +100,11 @@ def noise_of_column(columns: FileColumns, path: str, time: GuessedChannel | None
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
-    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
-    if unit is None or name.quantity is None or not same_dimension(unit, unit):
+    """Return a name; with the quantity of the file's unit where the name has another, as a thermometer's time."""
+    known = None if unit is None else known_unit(unit.split(" since ")[0])
+    if unit is None or known is None or (name.quantity is not None and _understood(unit, name.quantity)):
         return name
-    return name if _understood(unit, name.quantity) else replace(name, quantity=None)
+    return replace(name, quantity=None if name.quantity else quantity_of(known))
 
 
 def _by_values(
@@ -132,7 +130,8 @@ def _group(field: str, names: list[Name], columns: FileColumns, beside: str) -> 
     ):
         width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
         most = USUAL[field].axes or 1
-        if width <= most and np.any(np.isfinite(_values(group, columns))):
+        values = _values(group, columns)
+        if width <= most and np.any(np.isfinite(values)) and (field != "time" or _rises(values[:, 0])):
             return group
     return None
 
@@ -157,8 +156,8 @@ def _stated(
 def _understood(text: str, field: str) -> str | None:
     """Return a unit that a file writes in its own way (`C`, `seconds since 2021-09-20`) as one that is known."""
     si = USUAL[field].si
-    word = re.sub(r"[^a-z0-9]", "", text.split(" since ")[0].lower())
-    return next((unit for unit in (text, UNITS.get(word, "")) if unit and same_dimension(unit, si)), None)
+    known = (text, known_unit(text.split(" since ")[0]))
+    return next((unit for unit in known if unit and same_dimension(unit, si)), None)
 
 
 def _values(group: list[Name], columns: FileColumns) -> Array:
@@ -167,7 +166,7 @@ def _values(group: list[Name], columns: FileColumns) -> Array:
 
 def _rises(t: Array) -> bool:
     finite = t[np.isfinite(t)] if t.ndim == 1 else np.empty(0)
-    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and finite[-1] > finite[0])
+    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and np.median(np.diff(finite)) > 0)
 
 
 def _seconds(time: GuessedChannel | None) -> Array | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from driftlab.noise.quick import QuickNoise
 from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
+from driftlab.starter.names import Name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
 from fusion_core.escaping import line, yaml_text
@@ -43,10 +44,10 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines.append("  channels:")
     lines += [_channel(field, channel) for field, channel in channels.found.items()]
     if held is not None:
-        unit = held if _is_unit(held) else "1"
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
-        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {unit}}}   {note}")
-    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
+        place = f"{{path: {yaml_text(held.path)}, unit: {_held_unit(held)}}}"
+        lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
+    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
     return _starter(lines, asked)
@@ -93,7 +94,7 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 
 
-def _questions(channels: Channels, held: str | None) -> Iterator[str]:
+def _questions(channels: Channels, held: Name | None) -> Iterator[str]:
     for field, channel in channels.found.items():
         if channel.unit is None:
             yield f"the unit of {field} ({channel.why})"
@@ -171,12 +172,18 @@ def _stretch(noise: QuickNoise) -> str:
     return f"quietest stretch, {noise.seconds:.4g} s from {noise.start:.4g} s on"
 
 
-def held_of(columns: FileColumns, channels: Channels) -> str | None:
+def held_of(columns: FileColumns, channels: Channels) -> Name | None:
     """Return the column that a `held` filter may take, where the file has neither gyro nor accelerometer."""
     if any(sensor in channels.found for sensor in SENSORS) or "temperature" not in channels.found:
         return None
-    candidates = [n.path for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1]
-    return candidates[0] if candidates else None
+    others = (n for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1)
+    return next((name for name in others if _measures(columns.values[name.path])), None)
+
+
+def _measures(values: Array) -> bool:
+    """Tell a reading from a constant, a counter, and a column that is mostly empty."""
+    steps = np.diff(values[np.isfinite(values)])
+    return len(steps) > len(values) / 2 and bool(np.ptp(steps) > 0)
 
 
 def _is_unit(text: str) -> bool:
@@ -184,12 +191,15 @@ def _is_unit(text: str) -> bool:
     return same_dimension(text, text)
 
 
-def _held_filter(held: str, channels: Channels) -> Iterator[str]:
-    unit = held if _is_unit(held) else "1"
-    noise = channels.noise.get(held)
+def _held_unit(held: Name) -> str:
+    return held.unit or (held.path if _is_unit(held.path) else "1")
+
+
+def _held_filter(held: Name, channels: Channels) -> Iterator[str]:
+    unit, noise = _held_unit(held), channels.noise.get(held.path)
     yield "filter:"
     yield "  kind: held"
-    yield f"  channel: {yaml_text(_key(held))}"
+    yield f"  channel: {yaml_text(_key(held.path))}"
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 300 s            # at the beginning"
     if noise is None:

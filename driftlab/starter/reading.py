@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ WIDEST = 1024  # values of an array that is a channel
 GZIP = b"\x1f\x8b"
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
-SEPARATORS = (",", ";", "\t")
 
 
 @dataclass(frozen=True)
@@ -68,31 +67,18 @@ def _file_sources() -> dict[str, type[FileSource]]:
     return {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
 
 
-def columns_of(path: Path, cls: type[FileSource]) -> FileColumns:
-    """Read the first rows of every column; raises DataError where the source cannot."""
-    found, errors = list[FileColumns](), list[FusionError]()
-    for given in [{"separator": text} for text in SEPARATORS] if "separator" in cls.model_fields else [{}]:
-        try:
-            found.append(_read(path, cls, given))
-        except DataError as error:
-            check_all()
-            errors.append(error)
-    if not found:
-        raise errors[0]
-    return max(found, key=lambda columns: len(columns.names))
-
-
-def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> FileColumns:
+def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any]) -> FileColumns:
+    """Read the first rows of every column; `known` are settings of the user. Raises DataError where it cannot."""
+    settings = dict(cls.settings_for(path, known))
     # a log's rows are those of the first channel; which column is a time, the names will tell
-    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
-    default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
+    source = cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
-    return FileColumns(source.kind, noun, default, names, values, units, more)
+    return FileColumns(source.kind, noun, settings, names, values, units, more)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:

@@ -20,7 +20,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, field_serializer, model_validator
@@ -91,6 +91,17 @@ class FileSource(Source):
         """The path, with ::START:STOP where a range is set."""
         start, stop = ("" if value is None else f"{value:.12g}" for value in (self.start, self.stop))
         return f"{self._title or self.path or self.kind}" + (f"::{start}:{stop}" if start or stop else "")
+
+    @classmethod
+    def settings_for(cls, path: Path, known: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings beside the channels under which a file can be read, by its beginning; `known` are some.
+
+        Raises
+        ------
+        UnreadableFile
+            If the file cannot be read.
+        """
+        return {key: value for key, value in known.items() if key in cls.model_fields}
 
     @abstractmethod
     def open(self, path: Path, faults: Faults) -> AbstractContextManager[Table]:

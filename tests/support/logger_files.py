@@ -37,7 +37,7 @@ class Truth:
         self.t = np.arange(ROWS) / rate
         self.gyro = DEG * ([0.31, -0.22, 0.08] + 0.005 * np.sqrt(RATE) * rng.standard_normal((ROWS, 3)))
         self.accel = [0.11, -0.23, 9.79] + 1.5e-3 * np.sqrt(RATE) * rng.standard_normal((ROWS, 3))
-        self.temperature = 22 + 9 * (1 - np.exp(-np.arange(ROWS) / 800)) + 0.02 * rng.standard_normal(ROWS)
+        self.temperature = 22 + 2 * (1 - np.exp(-np.arange(ROWS) / 800)) + 0.02 * rng.standard_normal(ROWS)
 
 
 @cache
@@ -334,7 +334,7 @@ def _(u):
     return text([f"{name:>16}" for name in head], rows, " ", before=["IMU_Demo output data", ""])
 
 
-@logger_file("novatel.asc", "NovAtel OEM7 reference, RAWIMUSA: messages, not rows", refused="messages|no head|numbers")
+@logger_file("novatel.asc", "NovAtel OEM7 reference, RAWIMUSA: messages, not rows", refused="--column gyro=")
 def _(u):
     return "".join(
         f"%RAWIMUSA,2408,{t:.3f};2408,{t:.9f},00000077,{a[2]:.0f},{-a[1]:.0f},{a[0]:.0f},{g[2]:.0f},{-g[1]:.0f},"
