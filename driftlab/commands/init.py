@@ -13,10 +13,10 @@ from driftlab.commands.inputs import Place
 from driftlab.starter import config_text
 from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
 from driftlab.starter.config_text import Starter
-from driftlab.starter.reading import FileColumns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.starter.reading import HEAD, FileColumns, beginning, columns_of, file_sources, framing_of, nothing_reads, samples_of
 from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
-from fusion_core.contracts import Channel, head
+from fusion_core.contracts import Channel
 from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
 from fusion_core.thermal.map_file import write_whole
 
@@ -78,7 +78,7 @@ def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | No
 
 
 def _guess(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
+    first, errors = b"" if file.is_dir() else beginning(file, HEAD), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))

@@ -45,7 +45,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines += [_channel(field, channel) for field, channel in channels.found.items()]
     if held is not None:
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
-        place = f"{{path: {yaml_text(held.path)}, unit: {_held_unit(held)}}}"
+        place = f"{{path: {yaml_text(held.path)}, unit: {yaml_text(_held_unit(held))}}}"
         lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]

@@ -32,7 +32,7 @@ UNITS = {
     "mrads": "mrad/s", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC",
     "kelvin": "K", "degf": "degF", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "ms": "ms",
     "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
-    "f": "degF", "v": "V", "vdc": "V", "ohms": "ohm",
+    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm",
 }  # fmt: skip
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
 FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1
@@ -149,11 +149,9 @@ def _quantity(words: Sequence[str], *, axis: bool) -> str | None:
     if not words or NO_SENSOR & set(words):
         return None
     ends = {"".join(words[k:]) for k in range(len(words))}
-    for quantity, known in WORDS.items():
-        letters = LETTERS.get(quantity, ())
-        if known & (set(words) | ends) or (axis and (words[-1] in letters or words[0] in letters)):
-            return quantity
-    return "time" if list(words) == ["t"] else None
+    spoken = (quantity for quantity, known in WORDS.items() if known & (set(words) | ends))
+    lettered = (q for word in (words[-1], words[0]) for q, letters in LETTERS.items() if axis and word in letters)
+    return next(spoken, None) or next(lettered, None) or ("time" if list(words) == ["t"] else None)
 
 
 def _fits(unit: str, quantity: str) -> bool:

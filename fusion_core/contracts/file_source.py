@@ -236,7 +236,7 @@ FORMATS = {  # the first bytes of a file: what it is, and what to do with it whe
     b"\x89MCAP0\r\n": ("an MCAP file", "install a source for it"),
     b"SQLite format 3\0": ("an SQLite database, as in a ROS 2 bag", f"install a source for it, or {AS_CSV}"),
     b"PK\x03\x04": ("a zip archive or a spreadsheet", f"unpack it, or {AS_CSV}"),
-    b"\x1f\x8b": ("a gzip archive", "use kind: csv for text, or unpack it first"),
+    b"\x1f\x8b": ("a gzip archive", "unpack it first"),
 }
 
 

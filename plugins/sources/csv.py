@@ -149,7 +149,8 @@ class CsvLines(Table):
     @property
     def names(self) -> Sequence[str]:
         """The columns' names."""
-        return [name for name in dict.fromkeys([*self.columns, *self.settings.dates]) if name]
+        dates, columns = self.settings.dates, [name for name in self.columns if name and name not in self.texts]
+        return [*columns, *dates]
 
     def unit(self, path: str) -> str | None:
         """Return s of a date; of another column what the line below its name says."""
@@ -213,7 +214,8 @@ class CsvLines(Table):
         cells = self._fields(self._next_line().rstrip("\r\n"))
         if len(cells) == len(names) + 1 and not cells[-1].strip():
             return [*names, ""]
-        return names[:-1] if len(cells) == len(names) - 1 > 0 and not names[-1] else names
+        spare = not names[-1] or self.settings.header is not None  # a column of comments, which no row has
+        return names[:-1] if len(cells) == len(names) - 1 > 0 and spare else names
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""

@@ -22,6 +22,7 @@ from fusion_core.contracts import FileSource, Source, Table, foreign, head
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.unpacked import unpacking
 from fusion_plugins.sources.joining import mapped
 
 SIGNATURE = b"\xa3\x95\x80"
@@ -41,6 +42,7 @@ class DataFlash(FileSource):
     compensated: Literal["undo", "refuse", "keep"] = "undo"
     """Of what the autopilot corrected: undo it, refuse a log with a learned polynomial, or keep all as logged."""
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""
