@@ -142,6 +142,8 @@ def _stated(
     """Return the unit of a channel that the user, the file, its comments, or the columns' names state."""
     if field in given:
         return Guess(given[field], "")
+    if group[0].path == TICKS and np.median(np.diff(columns.values[TICKS])) < RATES["us"][1] / 100:
+        return Guess("0.1 ms", "as MT Manager writes it")
     texts = {columns.units.get(name.path) for name in group}
     for text in texts:
         if len(texts) == 1 and text is not None and (unit := _understood(text, field)) is not None:
@@ -176,6 +178,7 @@ def _seconds(time: GuessedChannel | None) -> Array | None:
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
 YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
 RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
+TICKS = "SampleTimeFine"  # of Xsens: in us where its steps are those of a slow device
 G = {"g": 1.0, "m/s^2": 9.80665, "mg": 1000.0, "Gal": 980.665}
 NEAR = 0.15  # of g: bias and scale of accelerometers without calibration
 QUIET_DEG, QUIET_RAD = 1.5e-3, 1e-4  # noise densities that only gyros in deg/s have, and only those in rad/s

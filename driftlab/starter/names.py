@@ -57,7 +57,7 @@ def read_name(path: str) -> Name:
     if len(path) > LONGEST:
         return Name(path, None, None, None, (path,))
     bare, unit = _in_brackets(path)
-    words = [word.lower() for word in re.findall(r"[^\W\d_][a-zäöüé]+|[^\W\d_]+(?![a-zäöüé])|\d+", bare)]
+    words = [word.lower() for word in re.findall(r"[A-ZÄÖÜ]?[a-zäöüéèß]+|[A-ZÄÖÜ]+(?![a-zäöü])|\d+", bare)]
     letter = re.split(r"[./_\s]", re.split(r"[./]", bare)[-1].strip())[0]
     if letter == "T" or (letter == "t" and words[-1] == "t"):
         return Name(path, "time" if letter == "t" else "temperature", None, unit, (bare,))

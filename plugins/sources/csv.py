@@ -26,7 +26,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fusion_core.budget import COPIED, TEXTS, keep, size_of
+from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
 from fusion_core.contracts.file_source import problem
@@ -77,7 +77,7 @@ class Csv(FileSource):
     @classmethod
     def settings_for(cls, path: Path, known: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings under which a text can be read, by its first lines."""
-        with cls._lines_of(path) as file:
+        with cls.model_construct(**known).lines_of(path) as file:
             data = file.read(GUESSED)
         if data.lstrip()[:1] in (b"{", b"<"):
             what = "JSON" if data.lstrip()[:1] == b"{" else "XML"
@@ -101,28 +101,35 @@ class Csv(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind."""
-        with self._lines_of(path) as file:
+        with self.lines_of(path) as file:
             yield CsvLines(path, file, self, faults)
 
-    @classmethod
     @contextmanager
-    def _lines_of(cls, path: Path) -> Iterator[Stream]:
+    def lines_of(self, path: Path) -> Iterator[Stream]:
         """Open the text of a file, in UTF-8 where it is in UTF-16."""
         with opened(path) as file:
             first = beginning(file, path)
             if recognised(first):
-                raise foreign(path, first, cls.model_fields["kind"].default)
+                raise foreign(path, first, self.kind)
             if encoding := next((name for mark, name in MARKS.items() if first.startswith(mark)), None):
                 decoder = codecs.getincrementaldecoder(encoding)("replace")
-                with tempfile.TemporaryFile() as text:
-                    while data := file.read(COPIED):
-                        keep(path, decoder.decode(data).encode(), text)
-                    text.seek(0)
-                    yield io.BufferedReader(text.raw)  # type: ignore[attr-defined, misc]
+                with kept(path, (decoder.decode(data) for data in iter(partial(file.read, COPIED), b""))) as text:
+                    yield text
                 return
             if b"\0" in first.partition(b"\n")[0]:
                 raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
             yield file
+
+
+@contextmanager
+def kept(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
+    """Open a temporary file with the texts that a file is turned into, as far as the budget allows."""
+    with tempfile.TemporaryFile() as file:
+        for text in texts:
+            check_all()
+            keep(path, text.encode(), file)
+        file.seek(0)
+        yield io.BufferedReader(file.raw)  # type: ignore[attr-defined, misc]
 
 
 def decoded(data: bytes) -> str:

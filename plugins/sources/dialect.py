@@ -60,7 +60,7 @@ def dialect_of(lines: Sequence[str], known: Mapping[str, Any]) -> Dialect | None
     separators = [known["separator"]] if "separator" in known else SEPARATORS
     signs = [known["decimal"]] if "decimal" in known else list(NUMBER)
     found = [one for s in separators for d in signs if s != d and (one := _read(lines, s, d)) is not None]
-    return max(found, key=lambda one: round(one.share, 2), default=None)
+    return max(found, key=lambda one: (round(one.share, 2), one.header > 0), default=None)
 
 
 def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
@@ -76,7 +76,7 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     if not usual:
         return None
     first = _longest_run(usual, lines)
-    share = sum(good[k] for k in usual) / sum(len(cells) for cells in cut[first:] if cells)
+    share = sum(good[k] for k in usual) / sum(len(bare(cells)) for cells in cut[first:] if cells)
     header = _header(lines, first, width, separator, decimal)
     names = names_of(lines[header], separator) if header is not None else [str(k + 1) for k in range(width)]
     texts = {
