@@ -89,7 +89,12 @@ COMMANDS = (
     Command("simulate", "simulating", metavars={"out": "FILE"}, defaults={"out": NEEDED}),
     Command("live", options={}, kind=WithPort),
     Command("check", "reading"),
-    Command("init", "reading", metavars={"out": "CONFIG"}),
+    Command(
+        "init",
+        "reading",
+        metavars={"out": "CONFIG"},
+        options={"go": Option("--go", "Run fit-map with it at once, and show its page."), "json": JSON},
+    ),
     Command("export", "exporting", metavars={"out": "PATH"}),
     Command("import_map", "importing", title="import", metavars={"out": "MAP"}),
     Command("plugins", module="driftlab.commands.check", options={}),

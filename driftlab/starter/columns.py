@@ -19,7 +19,8 @@ from driftlab.starter.names import Name, known_unit, leading, named, quantity_of
 from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
-from fusion_core.units import convert, same_dimension
+from fusion_core.errors import ConfigError
+from fusion_core.units import convert, same_dimension, to_si
 
 V = TypeVar("V")
 SENSORS = ("gyro", "accel")
@@ -48,30 +49,64 @@ class Channels:
     step: float | None  # between rows [s]
 
 
-def channels_of(columns: FileColumns, given: Mapping[str, str], written: Mapping[str, str]) -> Channels:
-    """Return the channels; `given` are units by channel of the user, `written` those of the file's comments."""
+@dataclass(frozen=True)
+class Answers:
+    """The choices of the user, by channel where they are of one: columns, units, interval between rows, decimal sign."""
+
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+    interval: str | None = None
+    decimal: str | None = None
+
+
+def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]) -> Channels:
+    """Return the channels by what the user says, then by names and values; `written` are units of its comments."""
     names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
-    beside = leading(names) or ""
-    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
+    chosen = {field: _chosen(field, text, names) for field, text in given.columns.items()}
+    taken = {name.path for group in chosen.values() for name in group}
+    names = [name for name in names if name.path not in taken]
+    beside = leading([*chosen.get("gyro", ()), *names]) or ""
+    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None} | chosen
+    if given.interval is not None:
+        groups.pop("time", None)
     stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
-    if stream is not None:  # that the sensor is a part of: a topic stands for its time
+    if stream is not None and "time" not in chosen and given.interval is None:  # that the sensor is a part of: a topic stands for its time
         groups["time"] = [stream]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
     channels: dict[str, GuessedChannel] = {}
     noise: dict[str, QuickNoise] = {}
-    t: Array | None = None
+    t = _regular(given.interval, columns)
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
         if field in SENSORS and t is not None and (quick := noise_of(t, values)):
             noise[field] = quick
-        stated = _stated(field, group, columns, given, written)
+        stated = _stated(field, group, columns, given.units, written)
         guess = stated or _by_values(field, values, channels, noise)
         axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
         paths = tuple(name.path for name in group)
         channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)
-        t = _seconds(channels.get("time"))
+        t = _seconds(channels.get("time")) if "time" in channels else t
     return Channels(_in_order(channels), _in_order(noise), others, _step(t))
+
+
+def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
+    """Return the columns that the user names for a channel, whole or by their beginnings, one an axis."""
+    by_path = {name.path: name for name in names}
+    group = []
+    for word in [text] if text in by_path else [part.strip() for part in text.split(",")]:
+        alike = [path for path in by_path if path.lower().startswith(word.lower())]
+        if word not in by_path and len(alike) != 1:
+            like = f"{len(alike)} columns begin so" if alike else f"no column of numbers is called so, there are {', '.join(by_path)}"
+            raise ConfigError(f"--column {field}={text}: '{word}': {like}; write the whole name of one")
+        group.append(by_path[word if word in by_path else alike[0]])
+    return [replace(name, axis=axis) for name, axis in zip(group, "xyz", strict=False)] if len(group) > 1 else group
+
+
+def _regular(interval: str | None, columns: FileColumns) -> Array | None:
+    """Return the times of rows that are an interval apart, s."""
+    rows = len(next(iter(columns.values.values()), ()))
+    return None if interval is None else to_si(interval, "s") * np.arange(rows)
 
 
 def channels_in(samples: Chunk) -> Channels:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,24 +23,41 @@ DENSITIES = {
     "gyro": ("deg/h", "deg/s", 36.0),
     "accel": ("ug", "mg", 1000.0),
 }  # small unit, large one, and from where on
+UNITS_OF = {
+    "time": ("s", "ms", "us", "ns"), "gyro": ("deg/s", "rad/s", "deg/h", "mdeg/s"), "accel": ("g", "m/s^2", "mg"),
+    "temperature": ("degC", "degF", "K"),
+}  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
+
+
+class Question(NamedTuple):
+    """A question to the user: the option that answers it, of which channel, its words, and answers, the guess first."""
+
+    option: str
+    field: str
+    text: str
+    choices: tuple[str, ...]
+    needed: bool = True
 
 
 @dataclass(frozen=True)
 class Starter:
-    """A config as text, and the places to be filled in, a sentence each."""
+    """A config as text, and the places to be filled in, a sentence each; `questions` a person can be asked."""
 
     text: str
     asked: tuple[str, ...]
+    questions: tuple[Question, ...] = ()
 
 
 def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
-    asked = list(_questions(channels, held))
+    questions = tuple(_questions(columns, channels))
+    asked = [question.text for question in questions if question.needed]
+    asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
     lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
-    if "time" not in channels.found:
+    if "time" not in channels.found and "interval" not in columns.settings:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
     lines += [_channel(field, channel) for field, channel in channels.found.items()]
@@ -50,7 +68,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return _starter(lines, asked)
+    return replace(_starter(lines, asked), questions=questions)
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
@@ -94,14 +112,16 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 
 
-def _questions(channels: Channels, held: Name | None) -> Iterator[str]:
+def _questions(columns: FileColumns, channels: Channels) -> Iterator[Question]:
     for field, channel in channels.found.items():
-        if channel.unit is None:
-            yield f"the unit of {field} ({channel.why})"
-    if "time" not in channels.found:
-        yield "the interval between rows: no column is a time"
-    if held is None:
-        yield from _noises(channels)
+        if channel.guessed:
+            usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
+            choices = tuple(filter(None, [channel.unit, *usual]))
+            yield Question(
+                "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
+            )
+    if "time" not in channels.found and "interval" not in columns.settings:
+        yield Question("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 
 
 def _noises(channels: Channels) -> Iterator[str]:
