@@ -163,7 +163,7 @@ def _of_columns(file: Path, path: str, columns: FileColumns, given: Answers) -> 
     held = config_text.held_of(columns, channels)
     if held is None and "gyro" not in channels.found:
         raise _no_sensor(file, columns)
-    if held is not None and (noise := noise_of_column(columns, held.path, channels.found.get("time"))) is not None:
+    if held is not None and (noise := noise_of_column(columns, held.path, channels.found)) is not None:
         channels = replace(channels, noise={held.path: noise})
     return config_text.of_columns(path, file.name, columns, channels, _map_name(file))
 

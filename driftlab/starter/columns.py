@@ -79,7 +79,8 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     t = _regular(given.interval, columns)
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
-        if field in SENSORS and t is not None and (quick := noise_of(t, values)):
+        T = channels["temperature"].values[:, 0] if "temperature" in channels else None
+        if field in SENSORS and t is not None and (quick := noise_of(t, values, T)):
             noise[field] = quick
         stated = _stated(field, group, columns, given.units, written)
         guess = stated or _by_values(field, values, channels, noise)
@@ -115,7 +116,8 @@ def channels_in(samples: Chunk) -> Channels:
     for field in (field for field in FIELDS if field in samples.channels):
         values = samples[field].reshape(len(samples), -1)
         channels[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
-    pairs = ((field, noise_of(samples.t, channels[field].values)) for field in SENSORS if field in channels)
+    T = samples.channels.get("temperature")
+    pairs = ((field, noise_of(samples.t, channels[field].values, T)) for field in SENSORS if field in channels)
     return Channels(channels, {field: noise for field, noise in pairs if noise is not None}, (), _step(samples.t))
 
 
@@ -128,10 +130,10 @@ def _step(t: Array | None) -> float | None:
     return None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
 
 
-def noise_of_column(columns: FileColumns, path: str, time: GuessedChannel | None) -> QuickNoise | None:
-    """Return the noise of one column, in its unit."""
-    t = _seconds(time)
-    return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
+def noise_of_column(columns: FileColumns, path: str, found: Mapping[str, GuessedChannel]) -> QuickNoise | None:
+    """Return the noise of one column beside the temperature, in its unit."""
+    t = _seconds(found.get("time"))
+    return None if t is None else noise_of(t, columns.values[path][:, None], found["temperature"].values[:, 0])
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:

@@ -162,7 +162,7 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
             continue
         white, walk = _in_units(sensor, noise, channel.unit)
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
-        yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+        yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # {_walk(noise)}"
         if sensor == "gyro" and "temperature" in channels.found:
             fitted = f"{{kind: spline, path: {yaml_text(map_name)}}}"
             yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
@@ -186,6 +186,12 @@ def _per_axis(values: Array, unit: str) -> str:
     if np.ptp(values) < 0.2 * np.max(values):
         return f"{float(np.max(values)):.3g} {unit}"
     return f"[{', '.join(f'{float(value):.3g} {unit}' for value in values)}]"
+
+
+def _walk(noise: QuickNoise) -> str:
+    if np.all(noise.known):
+        return "guess: the likeliest beside the temperature"
+    return "unknown: at most so, by these rows; better: `driftlab allan` on a night at rest"
 
 
 def _stretch(noise: QuickNoise) -> str:
@@ -228,7 +234,7 @@ def _held_filter(held: Name, channels: Channels) -> Iterator[str]:
         return
     white, walk = _per_axis(noise.white, f"{unit}/sqrt(Hz)"), _per_axis(noise.walk, f"{unit}/sqrt(s)")
     yield f"  noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
-    yield f"  bias: {{kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+    yield f"  bias: {{kind: random_walk, walk: {walk}}}   # {_walk(noise)}"
 
 
 def _key(path: str) -> str:
