@@ -65,7 +65,7 @@ COMMANDS = (
         options=SIZES | LIMITED,
         several=True,
     ),
-    Command("allan", "reading", options=LIMITED),
+    Command("allan", "reading", options=LIMITED, measuring=True),
     Command(
         "compare",
         "comparing",

@@ -103,6 +103,8 @@ class Command:
         Where they differ; `NEEDED` for what the command line cannot do without.
     several : bool
         Whether it takes several recordings.
+    measuring : bool
+        Whether the noise of its config is what it measures.
     kind : type, optional
         Of typer's command.
     indent : int
@@ -117,6 +119,7 @@ class Command:
     options: Mapping[str, Option] = field(default_factory=lambda: {"json": JSON})
     defaults: Mapping[str, Any] = field(default_factory=dict)
     several: bool = False
+    measuring: bool = False
     kind: type[TyperCommand] | None = None
     indent: int = 2
 
@@ -161,7 +164,9 @@ class Command:
         arguments = {name: value for name, value in given.items() if name in known and value is not None}
         if "config" in arguments:
             recordings = [] if self.several else arguments.pop("data", [])
-            arguments["config"] = load(arguments["config"], recordings, arguments.get("channel"))
+            arguments["config"] = load(
+                arguments["config"], recordings, arguments.get("channel"), measuring=self.measuring
+            )
             check_limits(arguments["config"], options.get("enforce_limits", False))
         for name, form in PAIRS.items():
             if isinstance(arguments.get(name), list):

@@ -2,11 +2,12 @@
 
 The white noise is the Allan deviation at the shortest averaging times. The walk is the likeliest one in means of all
 that is quiet, beside any smooth curve of the temperature, and of how fast it moves: a bias that follows a ramp is no
-walk. It is known where the limits of 95 % of its likelihood are within a factor of it; else its upper limit is given.
+walk. It is known where the limits of 99 % of its likelihood are within a factor of it; else its upper limit is given.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,8 @@ COLUMNS = 16  # of curves over the temperature, at most
 BEND = 4.0  # K: in less, no curve bends
 LAG = 300.0  # s, of what follows the temperature
 RATIOS = np.geomspace(1e-8, 1e4, 73)  # of the walk's variance from mean to mean to that of their white noise
-LIMIT = 3.84  # of -2 log likelihood at 95 %
+DEPENDENT = 1e-9  # of the largest singular value: columns that are combinations of others
+LIMIT = 6.63  # of -2 log likelihood at 99 %
 FACTOR = 2.0  # between the walk and its limits, at most, where it is known
 
 
@@ -75,34 +77,41 @@ def _walk(t: Array, values: Array, temperature: Array | None) -> tuple[Array, Fl
     times, means, y = (np.mean(x, axis=1) for x in cut)
     scatter = _scatter(cut[2]) if n >= MIN_IN_MEAN else np.ones((K, 1))
     moving = np.any(scatter > STILL * np.median(scatter, axis=0), axis=1)
-    X = _curves(times[:, 0], means[:, 0])
     step = float(np.median(np.diff(times[:, 0])))
     dt = np.concatenate([[np.inf], np.maximum(np.diff(times[:, 0]) / step, 0.0)])
     white = np.where(moving, np.inf, 1.0)
-    costs, scales = LevelLikelihood([(np.hstack([X, y - y[:1]]), white, dt)], X.shape[1]).over(RATIOS)
-    walks = np.sqrt(RATIOS[:, None] * scales / step)
-    best, d = np.argmin(costs, axis=0), np.arange(y.shape[1])
-    likely = np.where(costs - costs[best, d] <= LIMIT, walks, np.nan)
-    low, high = np.nanmin(likely, axis=0), np.nanmax(likely, axis=0)
-    walk = walks[best, d]
-    known = (high <= FACTOR * walk) & (FACTOR * low >= walk) & (temperature is not None)
-    return np.where(known, walk, high), known
+    found = []
+    for X in _curves(times[:, 0], means[:, 0]):
+        costs, scales = LevelLikelihood([(np.hstack([X, y - y[:1]]), white, dt)], X.shape[1]).over(RATIOS)
+        walks = np.sqrt(RATIOS[:, None] * scales / step)
+        likely = np.where(costs - np.min(costs, axis=0) <= LIMIT, walks, np.nan)
+        best = walks[np.argmin(costs, axis=0), np.arange(y.shape[1])]
+        found.append((np.nanmin(likely, axis=0), best, np.nanmax(likely, axis=0)))
+    walk, all_found = found[0][1], np.array(found)
+    known = (np.max(all_found, axis=(0, 1)) <= FACTOR * walk) & (FACTOR * np.min(all_found, axis=(0, 1)) >= walk)
+    known &= temperature is not None
+    return np.where(known, walk, np.max(all_found, axis=(0, 1))), known
 
 
-def _curves(t: Array, T: Array) -> Array:
-    """Return columns (K, q) that any smooth curve of the temperature is made of, and how it moves, orthonormal."""
+def _curves(t: Array, T: Array) -> Iterator[Array]:
+    """Yield columns (K, q) of any smooth curve of the temperature and how it moves, then without that, orthonormal.
+
+    Through the noise of the thermometer a steep curve looks like a walk, to each of the two in another size.
+    """
+    from scipy.interpolate import BSpline
+
     span = float(np.ptp(T))
     if span == 0:
-        return np.empty((len(t), 0))
-    knots = np.linspace(T.min(), T.max(), int(np.clip(span / BEND, 1, COLUMNS)) + 1)
-    slow = T[0] + np.zeros_like(T)
+        yield np.empty((len(t), 0))
+        return
+    slow = T.copy()
     for k in range(1, len(T)):
         slow[k] = slow[k - 1] + (T[k] - slow[k - 1]) * -np.expm1(-(t[k] - t[k - 1]) / LAG)
-    cubes = np.maximum((T[:, None] - knots[:-1]) / span, 0.0) ** 3
-    v = (T - T.mean()) / span
-    columns = np.column_stack([v, v**2, v**3, cubes[:, 1:], T - slow])
-    left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
-    return np.asarray(left[:, sizes > 1e-6 * sizes[0]])
+    knots = np.linspace(T.min(), T.max(), int(np.clip(span / BEND, 1, COLUMNS)) + 1)
+    cubic = BSpline.design_matrix(T, np.concatenate([knots[[0] * 3], knots, knots[[-1] * 3]]), 3).toarray()
+    for columns in (np.column_stack([cubic, (T - slow) / span]), cubic):
+        left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
+        yield np.asarray(left[:, sizes > DEPENDENT * sizes[0]])
 
 
 def _quietest(t: Array, values: Array) -> slice | None:
