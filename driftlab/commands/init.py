@@ -14,7 +14,7 @@ from driftlab.commands.console import load, say, say_lines
 from driftlab.commands.inputs import Place, config_of
 from driftlab.config import with_recording
 from driftlab.starter import config_text
-from driftlab.starter.columns import FIELDS, SENSORS, Answers, channels_in, channels_of, noise_of_column
+from driftlab.starter.columns import FIELDS, Answers, channels_in, channels_of, noise_of_column
 from driftlab.starter.config_text import Question, Starter
 from driftlab.starter.problems import problems_of
 from driftlab.starter.reading import (
@@ -157,7 +157,9 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
 
 def _of_columns(file: Path, path: str, columns: FileColumns, given: Answers) -> Starter:
     if not any(map(len, columns.values.values())):
-        raise EmptyRecording(f"{file}: has the {columns.noun}s {_listed(columns.names)} and no rows of numbers; record anew")
+        raise EmptyRecording(
+            f"{file}: has the {columns.noun}s {_listed(columns.names)} and no rows of numbers; record anew"
+        )
     written = written_units(file) if columns.kind == "csv" else {}
     channels = channels_of(columns, given, written)
     held = config_text.held_of(columns, channels)
@@ -170,8 +172,8 @@ def _of_columns(file: Path, path: str, columns: FileColumns, given: Answers) -> 
 
 def _no_sensor(file: Path, columns: FileColumns) -> NoSensor:
     error = NoSensor(
-        f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name the {columns.noun}s of "
-        "its axes, as in --column gyro=wx,wy,wz"
+        f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name those of its axes, "
+        "as in --column gyro=wx,wy,wz"
     )
     error.names = tuple(columns.values)
     return error

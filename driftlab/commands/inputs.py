@@ -80,9 +80,7 @@ def recordings_of(data: DataLike, units: Units | None, title: str) -> list[str]:
     return [recording_of(data, units, title)]
 
 
-def config_with(
-    config: ConfigLike, data: DataLike | None, units: Units | None, *, measuring: bool = False
-) -> Config:
+def config_with(config: ConfigLike, data: DataLike | None, units: Units | None, *, measuring: bool = False) -> Config:
     """Return the config with the recording that is given, if one is, as its source; raises as `config_of`."""
     loaded = config_of(config, measuring=measuring)
     if data is None:

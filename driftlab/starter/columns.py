@@ -51,7 +51,7 @@ class Channels:
 
 @dataclass(frozen=True)
 class Answers:
-    """The choices of the user, by channel where they are of one: columns, units, interval between rows, decimal sign."""
+    """The choices of the user: columns and units by channel, the interval between rows, the decimal sign."""
 
     columns: Mapping[str, str]
     units: Mapping[str, str]
@@ -70,7 +70,9 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     if given.interval is not None:
         groups.pop("time", None)
     stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
-    if stream is not None and "time" not in chosen and given.interval is None:  # that the sensor is a part of: a topic stands for its time
+    if (
+        stream is not None and "time" not in chosen and given.interval is None
+    ):  # that the sensor is a part of: a topic stands for its time
         groups["time"] = [stream]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
@@ -98,7 +100,11 @@ def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
     for word in [text] if text in by_path else [part.strip() for part in text.split(",")]:
         alike = [path for path in by_path if path.lower().startswith(word.lower())]
         if word not in by_path and len(alike) != 1:
-            like = f"{len(alike)} columns begin so" if alike else f"no column of numbers is called so, there are {', '.join(by_path)}"
+            like = (
+                f"{len(alike)} columns begin so"
+                if alike
+                else f"no column of numbers is called so, there are {', '.join(by_path)}"
+            )
             raise ConfigError(f"--column {field}={text}: '{word}': {like}; write the whole name of one")
         group.append(by_path[word if word in by_path else alike[0]])
     return [replace(name, axis=axis) for name, axis in zip(group, "xyz", strict=False)] if len(group) > 1 else group
@@ -107,7 +113,7 @@ def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
 def _regular(interval: str | None, columns: FileColumns) -> Array | None:
     """Return the times of rows that are an interval apart, s."""
     rows = len(next(iter(columns.values.values()), ()))
-    return None if interval is None else to_si(interval, "s") * np.arange(rows)
+    return None if interval is None else to_si(interval, "s") * np.arange(rows, dtype=np.float64)
 
 
 def channels_in(samples: Chunk) -> Channels:

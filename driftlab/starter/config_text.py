@@ -117,9 +117,7 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[Question]:
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
             choices = tuple(filter(None, [channel.unit, *usual]))
-            yield Question(
-                "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
-            )
+            yield Question("units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None)
     if "time" not in channels.found and "interval" not in columns.settings:
         yield Question("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 

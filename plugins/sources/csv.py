@@ -96,7 +96,7 @@ class Csv(FileSource):
             "dates": found.dates,
         }
         defaults = {name: cls.model_fields[name].default for name in settings}
-        return {**{k: v for k, v in settings.items() if v and v != defaults[k] or v == 0}, **known}
+        return {**{k: v for k, v in settings.items() if v == 0 or (v and v != defaults[k])}, **known}
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
@@ -129,7 +129,7 @@ def kept(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
             check_all()
             keep(path, text.encode(), file)
         file.seek(0)
-        yield io.BufferedReader(file.raw)  # type: ignore[attr-defined, misc]
+        yield io.BufferedReader(file.raw)
 
 
 def decoded(data: bytes) -> str:
@@ -168,10 +168,11 @@ class CsvLines(Table):
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of about `BLOCK` bytes, in order."""
-        for path in (part for path in paths for part in self._parts(path)):
-            if (count := self.columns.count(path)) > 1:
-                raise BadValue(f"{self.path}: has {count} columns '{path}', one was expected; rename the others")
-        at = {part: self.columns.index(part) for path in paths for part in self._parts(path)}
+        parts = [part for path in paths for part in self._parts(path)]
+        for part in parts:
+            if (count := self.columns.count(part)) > 1:
+                raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
+        at = {part: self.columns.index(part) for part in parts}
         for _, block, final in self._pieces():
             if self.separator == " ":
                 block = EDGES.sub(b"", BLANKS.sub(b" ", block))
@@ -212,7 +213,9 @@ class CsvLines(Table):
 
     def _next_line(self) -> str:
         place = self.file.tell()
-        line = next((text for data in iter(partial(self.file.readline, LONGEST), b"") if (text := decoded(data)).strip()), "")
+        line = next(
+            (text for data in iter(partial(self.file.readline, LONGEST), b"") if (text := decoded(data)).strip()), ""
+        )
         self.file.seek(place)
         return line
 
@@ -363,8 +366,8 @@ class CsvLines(Table):
             for k, text, value in zip(rows, texts, values[path], strict=True):
                 if np.isnan(value) and text.strip():
                     raise BadValue(
-                        f"{self.path}: line {where(k)}, column '{path}': '{text[:40]}' is not a date as '{form}'; correct "
-                        "it, or source.dates"
+                        f"{self.path}: line {where(k)}, column '{path}': '{text[:40]}' is not a date as '{form}'; "
+                        "correct it, or source.dates"
                     )
         return values
 

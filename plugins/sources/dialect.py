@@ -21,10 +21,14 @@ from fusion_core.chunk import Array
 SEPARATORS = ("\t", ";", ",", " ")
 SAMPLE = 400  # lines that are looked at, behind a preamble of at most as many
 NUMBER = {
-    sign: re.compile(rf"[+-]?(?:\d+(?:{re.escape(sign)}\d*)?|{re.escape(sign)}\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.I)
+    sign: re.compile(
+        rf"[+-]?(?:\d+(?:{re.escape(sign)}\d*)?|{re.escape(sign)}\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.I
+    )
     for sign in ".,"
 }
-DATE = re.compile(r"(?=.*\d[-/.:]\d)\d{1,4}(?:[-/.:, T]+(?:\d+|[A-Za-z]{3}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?", re.I)
+DATE = re.compile(
+    r"(?=.*\d[-/.:]\d)\d{1,4}(?:[-/.:, T]+(?:\d+|[A-Za-z]{3}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?", re.I
+)
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",
         "%d-%b-%Y", "%d-%m-%Y", "%Y%m%d")  # fmt: skip
@@ -67,7 +71,9 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     cut = [fields_of(line, separator) for line in lines]
     number = NUMBER[decimal].fullmatch
     good = [sum(bool(number(c.strip()) or DATE.fullmatch(c.strip())) for c in cells) for cells in cut]
-    widths = Counter(len(bare(cells)) for cells, k in zip(cut[-SAMPLE:], good[-SAMPLE:], strict=True) if 2 * k >= len(cells))
+    widths = Counter(
+        len(bare(cells)) for cells, k in zip(cut[-SAMPLE:], good[-SAMPLE:], strict=True) if 2 * k >= len(cells)
+    )
     if not widths:
         return None
     width = widths.most_common(1)[0][0]
@@ -85,7 +91,9 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
         if name and names.count(name) == 1
     }
     dates = _dates({n: t for n, t in texts.items() if any(t) and not any(c and number(c) for c in t)})
-    return Dialect(separator, decimal, 0 if header is None else header + 1, first + 1, dates, share if width > 1 else share / 4)
+    return Dialect(
+        separator, decimal, 0 if header is None else header + 1, first + 1, dates, share if width > 1 else share / 4
+    )
 
 
 def _longest_run(rows: Sequence[int], lines: Sequence[str]) -> int:

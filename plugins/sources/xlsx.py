@@ -56,7 +56,9 @@ class Xlsx(Csv):
         with _workbook(path) as book:
             names = book.sheet_names
             if self.sheet is not None and self.sheet not in names:
-                raise MissingChannel(f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet")
+                raise MissingChannel(
+                    f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet"
+                )
             rows = book.get_sheet_by_name(self.sheet or names[0]).iter_rows()
             lines = ("\t".join(map(_text, row)) + "\n" for row in rows)
             with kept(path, lines) as text:
@@ -95,7 +97,9 @@ def _repacked(path: Path) -> io.BytesIO:
             if entry.filename.startswith("xl/worksheets/"):
                 places = PLACE.findall(content)
                 columns = {letters.upper() for letters, _ in places}
-                width = max((sum((c - 64) * 26**k for k, c in enumerate(reversed(name))) for name in columns), default=0)
+                width = max(
+                    (sum((c - 64) * 26**k for k, c in enumerate(reversed(name))) for name in columns), default=0
+                )
                 height = max((int(number) for _, number in places), default=0)
                 check_size(path, f"a sheet of {height:,} rows and {width:,} columns", CELL * height * width, 2 * PIECE)
             parts.writestr(entry.filename, content)

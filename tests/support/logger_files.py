@@ -228,7 +228,9 @@ def _(u):
     return text(head, cells(np.arange(ROWS), np.rint(1e6 * u.t + 7e8), u.accel, u.gyro / DEG), before=before)
 
 
-@logger_file("vectornav.csv", "VectorNav interface control document, IMU group: names of fields; ns since startup", found=ALL)
+@logger_file(
+    "vectornav.csv", "VectorNav interface control document, IMU group: names of fields; ns since startup", found=ALL
+)
 def _(u):
     head = ["timeStartup", *xyz("uncompAccel!"), *xyz("uncompGyro!"), "temp", "pres"]
     rows = cells(np.rint(1e9 * u.t + 5e9), u.accel, u.gyro, u.temperature, np.full(ROWS, 101.3), form="%.12g")
@@ -303,7 +305,7 @@ def _(u):
     return rows.encode("latin-1")
 
 
-@logger_file("sensor_connect.csv", "LORD MicroStrain SensorConnect, CSV export: field descriptors in brackets, g and rad/s",
+@logger_file("sensor_connect.csv", "LORD MicroStrain SensorConnect, CSV export: fields in brackets, g and rad/s",
              found={name: ALL[name] for name in ("time", "gyro", "accel")})  # fmt: skip
 def _(u):
     head = ["GPS TFlags", "GPS Week", "GPS TOW", *xyz("! Accel [x8004]"), *xyz("! Gyro [x8005]")]
@@ -383,7 +385,9 @@ def _(u):
     return text(head, cells(u.t, u.gyro / DEG, u.accel / G, 32 + 1.8 * u.temperature), before=before, eol="\r\n")
 
 
-@logger_file("dewesoft.txt", "DewesoftX manual, 'Export to Text/CSV': a block of properties, names, a line of units", found=ALL)
+@logger_file(
+    "dewesoft.txt", "DewesoftX manual, 'Export to Text/CSV': a block of properties, names, a line of units", found=ALL
+)
 def _(u):
     head = ["Time", *xyz("Gyro_!"), *xyz("Acc_!"), "T_case"]
     units = ["\t".join(["(s)", *3 * ["(deg/s)"], *3 * ["(m/s2)"], "(°C)"]), ""]
@@ -392,7 +396,9 @@ def _(u):
     return text(head, rows, "\t", before=before, units=units, eol="\r\n")
 
 
-@logger_file("gantner.csv", "Gantner Instruments GI.monitor, CSV export: semicolons, a line of units, decimal commas", found=ALL)
+@logger_file(
+    "gantner.csv", "Gantner Instruments GI.monitor, CSV export: semicolons, a line of units, decimal commas", found=ALL
+)
 def _(u):
     head = ["Zeit", *xyz("Drehrate !"), *xyz("Beschleunigung !"), "Temperatur"]
     units = [";".join(["s", *3 * ["°/s"], *3 * ["g"], "°C"])]
@@ -426,7 +432,9 @@ def _(u):
     return text(head, rows, before=before, eol="\r\n").encode("utf-16")
 
 
-@logger_file("fluke2638.csv", "Fluke 2638A Hydra, scan file: date and time in a cell, status last", rate=0.1, found=HELD)
+@logger_file(
+    "fluke2638.csv", "Fluke 2638A Hydra, scan file: date and time in a cell, status last", rate=0.1, found=HELD
+)
 def _(u):
     before = ["Model,2638A", "Serial Number,1234567", "Scan Interval,00:00:10", ""]
     head = ["Scan", "Time", "101 (OHM)", "102 (C)", "Alarm Status", "Totalizer"]
@@ -455,7 +463,9 @@ def _(u):
     return text(["Date", "Time", "CH1 Temperature (°C)", "CH2 Temperature (°C)"], rows, "\t", eol="\r\n")
 
 
-@logger_file("date_and_time.csv", "Yokogawa GA10 and DAQStandard, text conversion: date and time in two columns", found=ALL)
+@logger_file(
+    "date_and_time.csv", "Yokogawa GA10 and DAQStandard, text conversion: date and time in two columns", found=ALL
+)
 def _(u):
     head = ["Date", "Time", *xyz("Rate ! [deg/s]"), *xyz("Acc ! [g]"), "Temp [°C]"]
     days, times = stamps(u, "%Y/%m/%d", 0), stamps(u, "%H:%M:%S{f}")
@@ -544,7 +554,9 @@ def _(u):
     return text(head, cells(u.t, u.gyro, u.accel, u.temperature, form="%.18e"), " ")
 
 
-@logger_file("excel_german.csv", "Excel, German locale, 'CSV (Trennzeichen-getrennt)': semicolons, commas, cp1252", found=ALL)
+@logger_file(
+    "excel_german.csv", "Excel, German locale, 'CSV (Trennzeichen-getrennt)': semicolons, commas, cp1252", found=ALL
+)
 def _(u):
     head = ["Datum", *xyz("Drehrate ! [°/s]"), *xyz("Beschl. ! [m/s²]"), "Temperatur [°C]"]
     rows = cells(u.gyro / DEG, u.accel, u.temperature)
@@ -553,7 +565,9 @@ def _(u):
     return text(head, lines, ";", eol="\r\n").encode("cp1252")
 
 
-@logger_file("excel_german.xlsx", "Excel, German locale: the same as a workbook, with dates as serial numbers", found=ALL)
+@logger_file(
+    "excel_german.xlsx", "Excel, German locale: the same as a workbook, with dates as serial numbers", found=ALL
+)
 def _(u):
     head = ["Datum", *xyz("Drehrate ! [°/s]"), *xyz("Beschl. ! [m/s²]"), "Temperatur [°C]"]
     times = [BEGIN + timedelta(milliseconds=round(1000 * float(t))) for t in u.t]
@@ -578,7 +592,8 @@ def _(u):
 
 
 @logger_file("arduino.txt", "Arduino Serial.print by commas: numbers without a head",
-             given={"columns": {"time": "1", "gyro": "2,3,4", "accel": "5,6,7", "temperature": "8"}}, found=ALL)  # fmt: skip
+             given={"columns": {"time": "1", "gyro": "2,3,4", "accel": "5,6,7", "temperature": "8"}},
+             found=ALL)  # fmt: skip
 def _(u):
     return text(None, cells(1e3 * u.t, u.gyro, u.accel, u.temperature), eol="\r\n")
 
@@ -631,8 +646,8 @@ def _(u):
 @logger_file("blackbox.csv", "Betaflight blackbox-tools, blackbox_decode: blanks behind commas, counts of 1/2048 g",
              found={"time": 1e-3, "gyro": 1e-6, "accel": 0.02})  # fmt: skip
 def _(u):
-    head = ["loopIteration", "time (us)", *(f"axisP[{k}]" for k in range(3)), *(f"gyroADC[{k}] (deg/s)" for k in range(3)),
-            *(f"accSmooth[{k}]" for k in range(3)), "vbatLatest (V)"]  # fmt: skip
+    head = ["loopIteration", "time (us)", *(f"axisP[{k}]" for k in range(3)),
+            *(f"gyroADC[{k}] (deg/s)" for k in range(3)), *(f"accSmooth[{k}]" for k in range(3)), "vbatLatest (V)"]  # fmt: skip
     rows = cells(np.arange(ROWS), 1e6 * u.t + 2e6, np.zeros((ROWS, 3)), u.gyro / DEG, np.rint(u.accel / G * 2048),
                  np.full(ROWS, 16.2), form="%.10g")  # fmt: skip
     return text(head, rows, ", ")

@@ -22,8 +22,8 @@ from fusion_core.contracts import FileSource, Source, Table, foreign, head
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import unpacking
 from fusion_plugins.sources.joining import mapped
+from fusion_plugins.sources.unpacked import unpacking
 
 SIGNATURE = b"\xa3\x95\x80"
 NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
