@@ -32,7 +32,7 @@ from driftlab.storage.ownership import seal_of, with_own
 from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel
-from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel
+from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel, UnitError
 
 COMMAND = "init"  # by which its files are known
 SIGNS = {"comma": ",", "point": "."}
@@ -111,8 +111,7 @@ def init(
         check_file(place, COMMAND, f"--out {place}", "name another file")
     with of_all(path, "finding out what it holds"):
         starter = _guess(path, os.path.relpath(path, Path() if place is None else place.parent), answers)
-        config = None if starter.asked else with_recording(config_of(starter.text), str(path))
-        problems = () if config is None else tuple(problems_of(config))
+        problems = _problems(starter, path)
     text = f"{starter.text}# {seal_of(COMMAND)}\n"
     if place is not None:
         write_text(place, text, COMMAND)
@@ -131,6 +130,15 @@ def _answers(
     if decimal is not None and decimal not in (*SIGNS, *SIGNS.values()):
         raise ConfigError(f"--decimal {decimal}: is no decimal sign; write comma or point")
     return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal))
+
+
+def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
+    try:
+        return tuple(problems_of(with_recording(config_of(starter.text, measuring=True), str(path))))
+    except (ConfigError, UnitError):
+        if starter.asked:  # which is why it cannot be read yet
+            return ()
+        raise
 
 
 def _guess(file: Path, path: str, given: Answers) -> Starter:

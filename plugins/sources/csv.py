@@ -203,7 +203,8 @@ class CsvLines(Table):
         self.line += len(skipped)
         self._skip(sum(map(len, skipped)))
         if not header:
-            return [str(k + 1) for k in range(len(bare(self._fields(self._next_line()))))]
+            cells = bare(self._fields(self._next_line()))
+            return self._widened([str(k + 1) for k in range(len(cells))])
         if header > len(skipped) or not skipped[header - 1]:
             raise EmptyRecording(f"{self.path}: has fewer than {header} lines; correct source.header")
         rest = [names_of(line, self.separator) for line in skipped[header:] if line.strip()]
@@ -277,7 +278,7 @@ class CsvLines(Table):
                 f"{self.path}: the first line has numbers only ({', '.join(self.columns[:4])}, ...), "
                 "the columns' names were expected; write them in a line above, or set header: 0"
             )
-        other = next((s for s in SEPARATORS if s != self.separator and s in self.columns[0]), None)
+        other = next((s for s in ",;\t" if s != self.separator and s in self.columns[0]), None)
         if len(self.columns) == 1 and other:
             raise MissingChannel(
                 f"{self.path}: the header has no '{SEPARATORS[self.separator]}' and is a single column; "

@@ -78,7 +78,8 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
         return None
     width = widths.most_common(1)[0][0]
     rows = [k for k, cells in enumerate(cut) if 0 <= len(bare(cells)) - width <= 1 and 3 * good[k] >= width]
-    usual = [k for k in rows if 2 * good[k] >= max(good[j] for j in rows)]
+    most = max((good[k] for k in rows), default=0)
+    usual = [k for k in rows if 2 * good[k] >= most]
     if not usual:
         return None
     first = _longest_run(usual, lines)
