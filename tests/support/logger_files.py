@@ -647,7 +647,8 @@ def _(u):
              found={"time": 1e-3, "gyro": 1e-6, "accel": 0.02})  # fmt: skip
 def _(u):
     head = ["loopIteration", "time (us)", *(f"axisP[{k}]" for k in range(3)),
-            *(f"gyroADC[{k}] (deg/s)" for k in range(3)), *(f"accSmooth[{k}]" for k in range(3)), "vbatLatest (V)"]  # fmt: skip
+            *(f"gyroADC[{k}] (deg/s)" for k in range(3)), *(f"accSmooth[{k}]" for k in range(3)),
+            "vbatLatest (V)"]  # fmt: skip
     rows = cells(np.arange(ROWS), 1e6 * u.t + 2e6, np.zeros((ROWS, 3)), u.gyro / DEG, np.rint(u.accel / G * 2048),
                  np.full(ROWS, 16.2), form="%.10g")  # fmt: skip
     return text(head, rows, ", ")
