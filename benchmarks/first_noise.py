@@ -61,7 +61,7 @@ def held(seed):
 
 
 def count(seeds):
-    """How many soaks have a guess, white noise within a factor of 2, a known walk, and of these one within it."""
+    """Count the soaks that have a guess, white noise within a factor of 2, a known walk, and of these one within it."""
     rows = [row for row in map(held, seeds) if row is not None]
     within = [max(r, 1 / r) <= 2 for _, r, _, _ in rows]
     known = [r for _, _, r, known in rows if known]

@@ -13,20 +13,10 @@ from typing import Any
 from driftlab.commands.console import load, say, say_lines
 from driftlab.commands.inputs import Place, config_of
 from driftlab.config import with_recording
-from driftlab.starter import config_text
+from driftlab.starter import config_text, reading
 from driftlab.starter.columns import FIELDS, Answers, channels_in, channels_of, noise_of_column
-from driftlab.starter.config_text import Question, Starter
+from driftlab.starter.config_text import OpenQuestion, Starter
 from driftlab.starter.problems import problems_of
-from driftlab.starter.reading import (
-    HEAD,
-    FileColumns,
-    beginning,
-    columns_of,
-    file_sources,
-    framing_of,
-    nothing_reads,
-    samples_of,
-)
 from driftlab.storage.map_file import check_file, write_text
 from driftlab.storage.ownership import seal_of, with_own
 from driftlab.storage.recorder import written_units
@@ -84,7 +74,7 @@ def init(
         A program writes nothing where it is left out. One that `init` wrote and nobody changed is replaced.
     columns : mapping of str to str, optional
         Columns of a channel, one an axis, e.g. gyro=wx,wy,wz; repeatable.
-        As `{"gyro": "wx,wy,wz"}`; the beginning of a name is enough where one column alone begins so.
+        As `{"gyro": "wx,wy,wz"}`; the reading.beginning of a name is enough where one column alone begins so.
     units : mapping of str to str, optional
         A unit that you know, e.g. gyro=deg/s; repeatable.
         As `{"gyro": "deg/s"}`.
@@ -142,28 +132,29 @@ def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
 
 
 def _guess(file: Path, path: str, given: Answers) -> Starter:
-    first, errors = b"" if file.is_dir() else beginning(file, HEAD), list[FusionError]()
-    settings = {"interval": given.interval, "decimal": given.decimal}
-    for cls in file_sources(file, first):
+    first, errors = b"" if file.is_dir() else reading.beginning(file, reading.HEAD), list[FusionError]()
+    known = {"interval": given.interval, "decimal": given.decimal}
+    known = {key: value for key, value in known.items() if value is not None}
+    for cls in reading.file_sources(file, first):
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
-            columns = columns_of(file, cls, {key: value for key, value in settings.items() if value is not None})
+            columns = reading.columns_of(file, cls, known)
         except DataError as error:
             check_all()
             errors.append(error)
             continue
         return _of_columns(file, path, columns, given)
-    frames = None if file.is_dir() else framing_of(file)
+    frames = None if file.is_dir() else reading.framing_of(file)
     if frames is None:
-        raise nothing_reads(file, errors)
-    samples = samples_of(file, frames)
+        raise reading.nothing_reads(file, errors)
+    samples = reading.samples_of(file, frames)
     return config_text.of_frames(
         path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
     )
 
 
-def _of_columns(file: Path, path: str, columns: FileColumns, given: Answers) -> Starter:
+def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answers) -> Starter:
     if not any(map(len, columns.values.values())):
         raise EmptyRecording(
             f"{file}: has the {columns.noun}s {_listed(columns.names)} and no rows of numbers; record anew"
@@ -178,7 +169,7 @@ def _of_columns(file: Path, path: str, columns: FileColumns, given: Answers) -> 
     return config_text.of_columns(path, file.name, columns, channels, _map_name(file))
 
 
-def _no_sensor(file: Path, columns: FileColumns) -> NoSensor:
+def _no_sensor(file: Path, columns: reading.FileColumns) -> NoSensor:
     error = NoSensor(
         f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name those of its axes, "
         "as in --column gyro=wx,wy,wz"
@@ -218,7 +209,7 @@ def _interview(arguments: dict[str, Any]) -> None:
                 questions = _guess(arguments["file"], "", _answers(**given)).questions
         except NoSensor as error:
             text = "the columns of the gyro's axes, as in 2,3,4"
-            questions = (Question("columns", "gyro", text, error.names, needed=False),)
+            questions = (OpenQuestion("columns", "gyro", text, error.names, needed=False),)
         new = [question for question in questions if (question.option, question.field) not in asked]
         if not new:
             return
@@ -231,7 +222,7 @@ def _interview(arguments: dict[str, Any]) -> None:
                 arguments[question.option] = answer
 
 
-def _ask(question: Question) -> str:
+def _ask(question: OpenQuestion) -> str:
     """Ask a person; return the answer, by its number or in words, the first where there is none."""
     say(f"\n{question.text}?\n")
     say_lines(f"{k}) {choice}" for k, choice in enumerate(question.choices, 1))

@@ -30,7 +30,7 @@ UNITS_OF = {
 FASTEST = 0.1  # s between epochs
 
 
-class Question(NamedTuple):
+class OpenQuestion(NamedTuple):
     """A question to the user: the option that answers it, of which channel, its words, and answers, the guess first."""
 
     option: str
@@ -46,7 +46,7 @@ class Starter:
 
     text: str
     asked: tuple[str, ...]
-    questions: tuple[Question, ...] = ()
+    questions: tuple[OpenQuestion, ...] = ()
 
 
 def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
@@ -112,14 +112,16 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 
 
-def _questions(columns: FileColumns, channels: Channels) -> Iterator[Question]:
+def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
     for field, channel in channels.found.items():
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
             choices = tuple(filter(None, [channel.unit, *usual]))
-            yield Question("units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None)
+            yield OpenQuestion(
+                "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
+            )
     if "time" not in channels.found and "interval" not in columns.settings:
-        yield Question("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
+        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 
 
 def _noises(channels: Channels) -> Iterator[str]:

@@ -23,7 +23,7 @@ MOVING = np.deg2rad(0.3)  # rad/s, deviation of means over 1 s: more is no unit 
 
 
 def problems_of(config: Config) -> Iterator[str]:
-    """Yield what speaks against a map of the first rows of a config's recording, a sentence each.
+    """Yield problems of a map of the first rows of a config's recording, a sentence each.
 
     Raises
     ------

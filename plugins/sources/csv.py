@@ -113,7 +113,7 @@ class Csv(FileSource):
                 raise foreign(path, first, self.kind)
             if encoding := next((name for mark, name in MARKS.items() if first.startswith(mark)), None):
                 decoder = codecs.getincrementaldecoder(encoding)("replace")
-                with kept(path, (decoder.decode(data) for data in iter(partial(file.read, COPIED), b""))) as text:
+                with stream_of(path, (decoder.decode(data) for data in iter(partial(file.read, COPIED), b""))) as text:
                     yield text
                 return
             if b"\0" in first.partition(b"\n")[0]:
@@ -122,7 +122,7 @@ class Csv(FileSource):
 
 
 @contextmanager
-def kept(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
+def stream_of(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
     """Open a temporary file with the texts that a file is turned into, as far as the budget allows."""
     with tempfile.TemporaryFile() as file:
         for text in texts:

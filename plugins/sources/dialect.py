@@ -26,8 +26,9 @@ NUMBER = {
     )
     for sign in ".,"
 }
+MONTHS = "jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec"
 DATE = re.compile(
-    r"(?=.*\d[-/.:]\d)\d{1,4}(?:[-/.:, T]+(?:\d+|[A-Za-z]{3}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?", re.I
+    rf"(?=.*\d[-/.:]\d)\d{{1,4}}(?:[-/.:, T]+(?:\d+|{MONTHS}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?", re.I
 )
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",

@@ -21,7 +21,7 @@ from fusion_core.budget import PIECE, check_size
 from fusion_core.contracts import Source, foreign, head
 from fusion_core.errors import ConfigError, MissingChannel
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.csv import Csv, kept
+from fusion_plugins.sources.csv import Csv, stream_of
 from fusion_plugins.sources.unpacked import Stream, plain_file, translated
 
 SIGNATURE = b"PK\x03\x04"
@@ -61,7 +61,7 @@ class Xlsx(Csv):
                 )
             rows = book.get_sheet_by_name(self.sheet or names[0]).iter_rows()
             lines = ("\t".join(map(_text, row)) + "\n" for row in rows)
-            with kept(path, lines) as text:
+            with stream_of(path, lines) as text:
                 yield text
 
 
