@@ -224,7 +224,7 @@ def _interview(arguments: dict[str, Any]) -> None:
 
 def _ask(question: OpenQuestion) -> str:
     """Ask a person; return the answer, by its number or in words, the first where there is none."""
-    say(f"\n{question.text}?\n")
+    say(f"\n{question.text}\n")
     say_lines(f"{k}) {choice}" for k, choice in enumerate(question.choices, 1))
     several = question.option == "columns"
     sys.stdout.write("number or text: " if several else "number or text [1]: ")
