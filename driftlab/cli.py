@@ -65,7 +65,7 @@ COMMANDS = (
         options=SIZES | LIMITED,
         several=True,
     ),
-    Command("allan", "reading", options=LIMITED),
+    Command("allan", "reading", options=LIMITED, measuring=True),
     Command(
         "compare",
         "comparing",
@@ -89,7 +89,12 @@ COMMANDS = (
     Command("simulate", "simulating", metavars={"out": "FILE", "framing": "CONFIG", "speed": "N"}),
     Command("live", options={}, kind=WithPort),
     Command("check", "reading"),
-    Command("init", "reading", metavars={"out": "CONFIG"}),
+    Command(
+        "init",
+        "reading",
+        metavars={"out": "CONFIG"},
+        options={"go": Option("--go", "Run fit-map with it at once, and show its page."), "json": JSON},
+    ),
     Command("export", "exporting", metavars={"out": "PATH"}),
     Command("import_map", "importing", title="import", metavars={"out": "MAP"}),
     Command("plugins", module="driftlab.commands.check", options={}),

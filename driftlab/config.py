@@ -5,7 +5,7 @@ The limits that a customer sets for a unit, and its serial number, as a config w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
@@ -166,26 +166,50 @@ def products() -> dict[str, Path]:
     return registry().products()
 
 
-def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:
+def load_config(
+    path: Path, recording: str | None = None, settings: Sequence[str] = (), *, measuring: bool = False
+) -> Config:
     """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
 
-    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.config`).
+    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.config`). Where noise is
+    what is measured (`measuring`), it need not be there.
 
     Raises
     ------
     ConfigError
         With one line for each thing that is wrong.
     """
-    config = understood(reduce(override, settings, read_document(path, products())))
+    config = understood(reduce(override, settings, read_document(path, products())), measuring=measuring)
     config._file = path
     return config if recording is None else with_recording(config, recording)
 
 
-def understood(document: Document) -> Config:
+def understood(document: Document, *, measuring: bool = False) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
+    if measuring:
+        document = reduce(override, _undeclared(document.data), document)
     config = validate(Config, document, registry().broken())
     config._name = document.path.name
     return config
+
+
+def _undeclared(data: Mapping[str, Any]) -> Iterator[str]:
+    """Yield settings of the noise and walk that a config lacks: so large that nothing is taken for motion."""
+    model = data.get("filter")
+    if not isinstance(model, dict):
+        return
+    held = model.get("kind", "zupt") != "zupt"
+    channel = data.get("source", {}).get("channels", {}).get(model.get("channel"), {})
+    sections = {"": str(channel.get("unit", "1"))} if held else {".gyro": "deg/s", ".accel": "g"}
+    for place, unit in sections.items():
+        section = model if held else model.get(place[1:])
+        if isinstance(section, dict):
+            bias = section.get("bias", {"kind": "random_walk"})
+            if "noise" not in section:
+                yield f"filter{place}.noise=1e6 {unit}/sqrt(Hz)"
+            if isinstance(bias, dict) and bias.get("kind") == "random_walk" and "walk" not in bias:
+                yield f"filter{place}.bias.kind=random_walk"
+                yield f"filter{place}.bias.walk=1 {unit}/sqrt(s)"
 
 
 def with_recording(config: Config, recording: str) -> Config:

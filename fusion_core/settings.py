@@ -114,7 +114,7 @@ def _descriptions(cls: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
-def nearest(word: str, known: Any) -> str | None:
-    """Return the known word most like `word`, or None."""
-    matches = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.5)
+def nearest(word: str, known: Any, cutoff: float = 0.5) -> str | None:
+    """Return the known word most like `word`, or None where none has the share `cutoff` of its letters in order."""
+    matches = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=cutoff)
     return matches[0] if matches else None

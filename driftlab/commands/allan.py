@@ -84,7 +84,7 @@ def allan(
 
     Parameters
     ----------
-    config, data, units, progress : as those of `run`; the config needs no filter
+    config, data, units, progress : as those of `run`; the config needs neither filter nor noise
     out : path, optional
         Folder for curves and report.
 
@@ -99,7 +99,7 @@ def allan(
     DataError, ConfigError, UnitError
         If the recording cannot be used, or `out` must not be replaced.
     """
-    understood = config_with(config, data, units)
+    understood = config_with(config, data, units, measuring=True)
 
     def analysed() -> AllanResult:
         faults = Faults()

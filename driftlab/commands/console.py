@@ -102,8 +102,12 @@ def print_json(content: Any, indent: int | None = 2) -> None:
     sys.stdout.write((content if isinstance(content, str) else json_text(content, indent)) + "\n")
 
 
-def load(path: Path, recordings: list[str] | None = None, channel: str | None = None) -> Config:
+def load(
+    path: Path, recordings: list[str] | None = None, channel: str | None = None, *, measuring: bool = False
+) -> Config:
     """Read a config, with recording, keys and tracked sensor of the command line in place of its own.
+
+    Where noise is what is measured (`measuring`), it need not be declared.
 
     Raises
     ------
@@ -116,7 +120,8 @@ def load(path: Path, recordings: list[str] | None = None, channel: str | None = 
     if recordings and len(recordings) > 1:
         raise ConfigError(f"--input: is given {len(recordings)} times, one recording was expected; run one at a time")
     now, begun = session(), time.monotonic()
-    config = load_config(path, recordings[0] if recordings else None, now.settings).tracking(channel)
+    config = load_config(path, recordings[0] if recordings else None, now.settings, measuring=measuring)
+    config = config.tracking(channel)
     now.configs.append(config)
     now.stages.append((f"reading {path.name}", time.monotonic() - begun))
     return config

@@ -131,7 +131,7 @@ def installed(base: type, kind: str, option: str) -> Any:
     """Return the installed class of a kind; raises ConfigError, which names the option, with a near one."""
     classes = registry().classes(base)
     if kind not in classes:
-        hint = nearest(kind, classes)
+        hint = nearest(kind, classes, 0.6)
         raise ConfigError(f"{option} {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
     return classes[kind]
 

@@ -3,39 +3,67 @@
 from __future__ import annotations
 
 import os
+import sys
+import webbrowser
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import say, say_lines
-from driftlab.commands.inputs import Place
-from driftlab.starter import config_text
-from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
-from driftlab.starter.config_text import Starter
-from driftlab.starter.reading import FileColumns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.commands.console import load, say, say_lines
+from driftlab.commands.inputs import Place, config_of
+from driftlab.config import with_recording
+from driftlab.starter import config_text, reading
+from driftlab.starter.columns import FIELDS, Answers, channels_in, channels_of, noise_of_column
+from driftlab.starter.config_text import OpenQuestion, Starter
+from driftlab.starter.problems import problems_of
+from driftlab.storage.map_file import check_file, write_text
+from driftlab.storage.ownership import seal_of, with_own
 from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
-from fusion_core.contracts import Channel, head
-from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
-from fusion_core.thermal.map_file import write_whole
+from fusion_core.contracts import Channel
+from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel, UnitError
+
+COMMAND = "init"  # by which its files are known
+SIGNS = {"comma": ",", "point": "."}
+ROUNDS = 4  # of questions, of which one may come of the answer to another
 
 
 @dataclass(frozen=True)
 class FirstConfig:
-    """The text of a config, what it leaves to be filled in, and where it was written, if it was."""
+    """The text of a config, what it leaves to be filled in, what speaks against the data, and where it was written."""
 
     text: str
     asked: tuple[str, ...]
     path: Path | None = None
+    problems: tuple[str, ...] = ()
+
+    @property
+    def status(self) -> int:
+        """Exit status: 1 where something is to be filled in, or speaks against the data."""
+        return int(bool(self.asked or self.problems))
 
 
-def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | None = None) -> FirstConfig:
-    """Write a first config of a file, with every guess marked.
+class NoSensor(MissingChannel):
+    """There is no column that is known as a sensor's."""
+
+    names: tuple[str, ...] = ()
+
+
+def init(
+    file: Place,
+    *,
+    out: Place | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    interval: str | None = None,
+    decimal: str | None = None,
+) -> FirstConfig:
+    """Write a first config of a file, with every guess marked, and look into its data.
 
     It has the source, channels, units and noise. FILE is a log of PX4 (.ulg) or ArduPilot (.bin), a ROS bag,
-    CSV (.csv.gz too), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that an installed framing knows.
-    Values without a guess are left to be filled in.
+    CSV or another text of a logger, Excel (.xlsx), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that
+    an installed framing knows; packed with gzip too. In a terminal it asks what it cannot know.
 
     Parameters
     ----------
@@ -43,73 +71,111 @@ def init(file: Place, *, out: Place | None = None, units: Mapping[str, str] | No
         A recording, or the bytes that a device sent.
     out : path, optional
         The config to write; by default FILE's name .yaml.
-        A program writes nothing where it is left out.
+        A program writes nothing where it is left out. One that `init` wrote and nobody changed is replaced.
+    columns : mapping of str to str, optional
+        Columns of a channel, one an axis, e.g. gyro=wx,wy,wz; repeatable.
+        As `{"gyro": "wx,wy,wz"}`; the reading.beginning of a name is enough where one column alone begins so.
     units : mapping of str to str, optional
         A unit that you know, e.g. gyro=deg/s; repeatable.
         As `{"gyro": "deg/s"}`.
+    interval : str, optional
+        Time between rows, e.g. '10 ms', where no column is a time.
+    decimal : str, optional
+        Decimal sign of a text: comma or point.
 
     Returns
     -------
     FirstConfig
-        `text`, YAML with every guess marked, and `asked`, what is left to be filled in.
+        `text`, YAML with every guess marked, `asked`, what is left to be filled in, and `problems` of the data.
 
     Raises
     ------
     ConfigError, UnitError
-        If the config is there already, or a unit is wrong.
+        If the config is there and was changed, or an option is wrong.
     DataError
-        If nothing reads the file, or it has no channel that is known.
+        If nothing reads the file, it has no rows, or no channel that is known.
     """
-    path, place, known = Path(file), None if out is None else Path(out), units or {}
-    if place is not None and os.path.lexists(place):
-        raise ConfigError(f"--out {place}: is there already; name another file, or remove it")
-    for field, unit in known.items():
-        if field not in FIELDS:
-            raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
-        Channel(path="?", unit=unit).check(field)
-    with of_all(path, "finding out what it holds"):
-        starter = _guess(path, os.path.relpath(path, Path() if place is None else place.parent), known)
+    path, place = Path(file), None if out is None else Path(out)
+    answers = _answers(columns, units, interval, decimal)
     if place is not None:
-        try:
-            write_whole(place, starter.text.encode())
-        except OSError as error:
-            raise Unwritable(f"--out {place}: cannot be written ({error.strerror}); name another place") from None
-    return FirstConfig(starter.text, starter.asked, place)
+        check_file(place, COMMAND, f"--out {place}", "name another file")
+    with of_all(path, "finding out what it holds"):
+        starter = _guess(path, os.path.relpath(path, Path() if place is None else place.parent), answers)
+        problems = _problems(starter, path)
+    text = f"{starter.text}# {seal_of(COMMAND)}\n"
+    if place is not None:
+        write_text(place, text, COMMAND)
+    return FirstConfig(with_own(text), starter.asked, place, problems)
 
 
-def _guess(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
-    for cls in file_sources(file, first):
+def _answers(
+    columns: Mapping[str, str] | None, units: Mapping[str, str] | None, interval: str | None, decimal: str | None
+) -> Answers:
+    for option, given in (("--column", columns or {}), ("--unit", units or {})):
+        for field, value in given.items():
+            if field not in FIELDS:
+                raise ConfigError(f"{option} {field}={value}: no channel is called so; known: {', '.join(FIELDS)}")
+    for field, unit in (units or {}).items():
+        Channel(path="?", unit=unit).check(field)
+    if decimal is not None and decimal not in (*SIGNS, *SIGNS.values()):
+        raise ConfigError(f"--decimal {decimal}: is no decimal sign; write comma or point")
+    return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal))
+
+
+def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
+    try:
+        return tuple(problems_of(with_recording(config_of(starter.text, measuring=True), str(path))))
+    except (ConfigError, UnitError):
+        if starter.asked:  # which is why it cannot be read yet
+            return ()
+        raise
+
+
+def _guess(file: Path, path: str, given: Answers) -> Starter:
+    first, errors = b"" if file.is_dir() else reading.beginning(file, reading.HEAD), list[FusionError]()
+    known = {"interval": given.interval, "decimal": given.decimal}
+    known = {key: value for key, value in known.items() if value is not None}
+    for cls in reading.file_sources(file, first):
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
-            columns = columns_of(file, cls)
+            columns = reading.columns_of(file, cls, known)
         except DataError as error:
             check_all()
             errors.append(error)
             continue
-        return _of_columns(file, path, columns, units)
-    frames = None if file.is_dir() else framing_of(file)
+        return _of_columns(file, path, columns, given)
+    frames = None if file.is_dir() else reading.framing_of(file)
     if frames is None:
-        raise nothing_reads(file, errors)
-    samples = samples_of(file, frames)
+        raise reading.nothing_reads(file, errors)
+    samples = reading.samples_of(file, frames)
     return config_text.of_frames(
         path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
     )
 
 
-def _of_columns(file: Path, path: str, columns: FileColumns, units: Mapping[str, str]) -> Starter:
-    written = written_units(file) if columns.kind == "csv" else {}
-    channels = channels_of(columns, units, written)
-    held = config_text.held_of(columns, channels)
-    if held is None and not any(sensor in channels.found for sensor in SENSORS):
-        raise MissingChannel(
-            f"{file}: no {columns.noun} is called like a gyro or an accelerometer; it has {_listed(columns.names)}; "
-            "write a config with the channels' paths, or rename them, as in gyro_x"
+def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answers) -> Starter:
+    if not any(map(len, columns.values.values())):
+        raise EmptyRecording(
+            f"{file}: has the {columns.noun}s {_listed(columns.names)} and no rows of numbers; record anew"
         )
-    if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
-        channels = replace(channels, noise={held: noise})
+    written = written_units(file) if columns.kind == "csv" else {}
+    channels = channels_of(columns, given, written)
+    held = config_text.held_of(columns, channels)
+    if held is None and "gyro" not in channels.found:
+        raise _no_sensor(file, columns)
+    if held is not None and (noise := noise_of_column(columns, held.path, channels.found)) is not None:
+        channels = replace(channels, noise={held.path: noise})
     return config_text.of_columns(path, file.name, columns, channels, _map_name(file))
+
+
+def _no_sensor(file: Path, columns: reading.FileColumns) -> NoSensor:
+    error = NoSensor(
+        f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name those of its axes, "
+        "as in --column gyro=wx,wy,wz"
+    )
+    error.names = tuple(columns.values)
+    return error
 
 
 def _listed(names: list[str]) -> str:
@@ -126,17 +192,76 @@ def _stem(file: Path) -> str:
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """Name the config as the file, in the working directory, where no other place is given."""
-    return {"out": Path(f"{_stem(arguments['file'])}.yaml"), **arguments}
+    """Name the config as the file, in the working directory, where no other place is given; ask, in a terminal."""
+    arguments = {"out": Path(f"{_stem(arguments['file'])}.yaml"), **arguments}
+    if sys.stdin.isatty() and sys.stdout.isatty() and not options["json"]:
+        _interview(arguments)
+    return arguments
+
+
+def _interview(arguments: dict[str, Any]) -> None:
+    """Ask what the file does not say, and put the answers among the arguments."""
+    asked: set[tuple[str, str]] = set()
+    for _ in range(ROUNDS):
+        given = {name: arguments.get(name) for name in ("columns", "units", "interval", "decimal")}
+        try:
+            with of_all(arguments["file"], "finding out what it holds"):
+                questions = _guess(arguments["file"], "", _answers(**given)).questions
+        except NoSensor as error:
+            text = "the columns of the gyro's axes, as in 2,3,4"
+            questions = (OpenQuestion("columns", "gyro", text, error.names, needed=False),)
+        new = [question for question in questions if (question.option, question.field) not in asked]
+        if not new:
+            return
+        for question in new:
+            asked.add((question.option, question.field))
+            answer = _ask(question)
+            if answer and question.field:
+                arguments[question.option] = {**(arguments.get(question.option) or {}), question.field: answer}
+            elif answer:
+                arguments[question.option] = answer
+
+
+def _ask(question: OpenQuestion) -> str:
+    """Ask a person; return the answer, by its number or in words, the first where there is none."""
+    say(f"\n{question.text}\n")
+    say_lines(f"{k}) {choice}" for k, choice in enumerate(question.choices, 1))
+    several = question.option == "columns"
+    sys.stdout.write("number or text: " if several else "number or text [1]: ")
+    sys.stdout.flush()
+    words = [word.strip() for word in sys.stdin.readline().split(",")]
+    known = {str(k): choice for k, choice in enumerate(question.choices, 1)}
+    return ",".join(known.get(word or ("" if several else "1"), word) for word in words)
 
 
 def content_of(result: FirstConfig, given: Mapping[str, Any]) -> Any:
-    """Return the config's place and text."""
-    return {"config": str(result.path), "text": result.text, "to_fill_in": list(result.asked)}
+    """Return the config's place and text, and what is left to do."""
+    left = {"to_fill_in": list(result.asked), "problems": list(result.problems)}
+    return {"config": str(result.path), "text": result.text, **left}
 
 
 def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
-    """Print the config, and what is to be filled in."""
+    """Print the config, what is to be filled in, what speaks against the data, and the next command."""
     say(result.text)
     say_lines(result.asked, "fill in: ")
-    say(f"written to {result.path}; look at what is guessed, then: driftlab check {result.path}\n")
+    say_lines(result.problems, "problem: ")
+    if result.status:
+        say(f"written to {result.path}; say what is missing with --column, --unit or --interval, or write it there\n")
+        return
+    say(f"written to {result.path}; look at what is guessed, then: driftlab fit-map {result.path}\n")
+    if given.get("go"):
+        _fit(result.path or Path())
+
+
+def _fit(path: Path) -> None:
+    """Fit the map of a config, print how good it is, and show its page."""
+    from driftlab.commands import fit_map  # with all that fits, which a first config does not need
+
+    options = {"select": False, "enforce_limits": False}
+    arguments = fit_map.arguments_of({"config": load(path), "compare": False}, options)
+    result = fit_map.fit_map(**arguments)
+    fit_map.show(result, arguments)
+    page = result.written[1].resolve()
+    say(f"the page: {page}\n")
+    if sys.stdout.isatty():
+        webbrowser.open(page.as_uri())

@@ -23,8 +23,10 @@ Progress = Callable[..., None]  # with the time in s and a count, or with a text
 TRUTH = "bias_truth"  # what is simulated and no unit measures
 
 
-def config_of(given: ConfigLike) -> Config:
+def config_of(given: ConfigLike, *, measuring: bool = False) -> Config:
     """Return a config; a text of several lines, or with a colon and a space in it, is YAML, any other is a path.
+
+    Where noise is what is measured (`measuring`), it need not be declared.
 
     Raises
     ------
@@ -34,9 +36,9 @@ def config_of(given: ConfigLike) -> Config:
     if isinstance(given, Config):
         return given
     if is_file(given):
-        return load_config(Path(given))  # type: ignore[arg-type]
+        return load_config(Path(given), measuring=measuring)  # type: ignore[arg-type]
     if isinstance(given, Mapping | str):
-        return understood(document_of(given, products()))
+        return understood(document_of(given, products()), measuring=measuring)
     raise ConfigError(
         f"config: is a {type(given).__name__}, a path, YAML text, a dict or a Config was expected; write e.g. "
         "'extends: mems_crs05'"
@@ -78,9 +80,9 @@ def recordings_of(data: DataLike, units: Units | None, title: str) -> list[str]:
     return [recording_of(data, units, title)]
 
 
-def config_with(config: ConfigLike, data: DataLike | None, units: Units | None) -> Config:
+def config_with(config: ConfigLike, data: DataLike | None, units: Units | None, *, measuring: bool = False) -> Config:
     """Return the config with the recording that is given, if one is, as its source; raises as `config_of`."""
-    loaded = config_of(config)
+    loaded = config_of(config, measuring=measuring)
     if data is None:
         if units:
             raise ConfigError("units: are given without data; give the data that they are of")

@@ -29,16 +29,23 @@ TYPES: dict[str, Any] = {  # by the first word of an annotation; of what is not 
     "Mapping[str, Any]": list[str], "Mapping[str, str]": list[str],
 }  # fmt: skip
 ARGUMENTS = {"config": "CONFIG", "configs": "CONFIG...", "kind": "KIND", "what": "MAP|CONFIG", "file": "FILE"}
-FLAGS = {"data": "--input", "settings": "--set", "units": "--unit", "map_kind": "--kind"}  # where the name differs
+FLAGS = {
+    "data": "--input", "settings": "--set", "units": "--unit", "columns": "--column", "map_kind": "--kind",
+}  # fmt: skip  # where the name differs
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
-    "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "data": RECORDING, "duration": "TIME",
-    "family": "FAMILY.json", "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "lag": "TIME", "out": "DIR",
-    "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR", "run": "DIR",
-    "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE", "sigma": "SIGMA", "start": "TEMPERATURE",
-    "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK", "web": "[PORT]", "without": "KIND",
+    "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
+    "data": RECORDING, "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json", "fit_map": "MAP",
+    "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR", "pages": "NAME|GLOB|all",
+    "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR", "run": "DIR", "scheduler": "ADDRESS",
+    "seed": "N", "settings": "KEY=VALUE", "sigma": "SIGMA", "start": "TEMPERATURE", "train": RECORDING,
+    "units": "CHANNEL=UNIT", "walk": "WALK", "web": "[PORT]", "without": "KIND",
 }  # fmt: skip
-PAIRS = {"settings": ("--set", "KEY=VALUE", "'step=0.5 K'"), "units": ("--unit", "CHANNEL=UNIT", "gyro=deg/s")}
+PAIRS = {
+    "settings": ("--set", "KEY=VALUE", "'step=0.5 K'"),
+    "units": ("--unit", "CHANNEL=UNIT", "gyro=deg/s"),
+    "columns": ("--column", "CHANNEL=NAME", "gyro=wx,wy,wz"),
+}
 HELP = {"config": "The config, a YAML file.", "json": "Print JSON for programs instead of text."}
 
 
@@ -97,6 +104,8 @@ class Command:
         Where they differ; `NEEDED` for what the command line cannot do without.
     several : bool
         Whether it takes several recordings.
+    measuring : bool
+        Whether the noise of its config is what it measures.
     kind : type, optional
         Of typer's command.
     indent : int
@@ -111,6 +120,7 @@ class Command:
     options: Mapping[str, Option] = field(default_factory=lambda: {"json": JSON})
     defaults: Mapping[str, Any] = field(default_factory=dict)
     several: bool = False
+    measuring: bool = False
     kind: type[TyperCommand] | None = None
     indent: int = 2
 
@@ -155,7 +165,9 @@ class Command:
         arguments = {name: value for name, value in given.items() if name in known and value is not None}
         if "config" in arguments:
             recordings = [] if self.several else arguments.pop("data", [])
-            arguments["config"] = load(arguments["config"], recordings, arguments.get("channel"))
+            arguments["config"] = load(
+                arguments["config"], recordings, arguments.get("channel"), measuring=self.measuring
+            )
             check_limits(arguments["config"], options.get("enforce_limits", False))
         for name, form in PAIRS.items():
             if isinstance(arguments.get(name), list):
@@ -179,8 +191,8 @@ class Command:
             print_json(plain(content), self.indent)
         else:
             module.show(result, given)
-        if options.get("enforce_limits") and result.exit_status:
-            raise typer.Exit(result.exit_status)
+        if status := getattr(result, "status", options.get("enforce_limits") and result.exit_status):
+            raise typer.Exit(status)
 
 
 class Declaration(NamedTuple):

@@ -275,7 +275,11 @@ def _samples(
     if not stretches:
         name = config.source.name if config.source else "the recording"
         section = config.filter.tracked.section if config.filter else "filter.gyro"
-        raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
+        seconds = interval * (used.moving + used.epochs)
+        raise EmptyRecording(
+            f"{name}: is nowhere at rest in {seconds:.3g} s; record a soak of hours, or check {section}.noise and the "
+            "channels' units"
+        )
     # the median over the windows knows of no gap
     ends, sizes = np.array([rest.t for rest in stretches]), np.array([len(rest.T) for rest in stretches])
     between = float(np.median(np.diff(ends) / sizes[1:])) if len(stretches) > 1 else interval

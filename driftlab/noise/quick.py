@@ -1,54 +1,117 @@
-"""Noise of a sensor by a part of its recording: white noise and walk of the quietest stretch.
+"""Noise of a sensor by a part of its recording: white noise of the quietest stretch, and walk beside the temperature.
 
-::
-
-    N = allan(tau) sqrt(tau) at the shortest averaging times     B = min allan(tau)     walk = sqrt(3)/2 B^2 / N
-
-The walk is that whose Allan curve, with the white noise above it, has its minimum at B: as data sheets allow,
-too (docs/explanation/noise.md). A short stretch has not seen the minimum: the walk is then at most that.
+The white noise is the Allan deviation at the shortest averaging times. The walk is the likeliest one in means of all
+that is quiet, beside any smooth curve of the temperature, and of how fast it moves: a bias that follows a ramp is no
+walk. It is known where the limits of 99 % of its likelihood are within a factor of it; else its upper limit is given.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from driftlab.noise.allan import curve
+from driftlab.noise.local_level import LevelLikelihood
 from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 MIN_SAMPLES = 200  # of a stretch
 WINDOWS = 20  # in which the rows are looked at
 STILL = 2.0  # times the scatter of the quietest window: more is motion
 GAP = 1.5  # usual steps
+MIN_IN_MEAN = 8  # samples, of which the scatter about a line tells motion
+MEANS = 1500  # of which the walk is told, at most
+COLUMNS = 16  # of curves over the temperature, at most
+BEND = 4.0  # K: in less, no curve bends
+LAG = 300.0  # s, of what follows the temperature
+RATIOS = np.geomspace(1e-8, 1e4, 73)  # of the walk's variance from mean to mean to that of their white noise
+DEPENDENT = 1e-9  # of the largest singular value: columns that are combinations of others
+LIMIT = 6.63  # of -2 log likelihood at 99 %
+FACTOR = 2.0  # between the walk and its limits, at most, where it is known
 
 
 @dataclass(frozen=True)
 class QuickNoise:
-    """White noise and walk (d,) in the values' unit per sqrt(Hz) and per sqrt(s); of `seconds` from `start` on."""
+    """White noise and walk (d,) in the values' unit per sqrt(Hz) and per sqrt(s); of `seconds` from `start` on.
+
+    `known` (d,) says of which axes the walk is known; that of the others is at most so.
+    """
 
     white: Array
     walk: Array
     start: float
     seconds: float
+    known: Flags
 
 
-def noise_of(t: Array, values: Array) -> QuickNoise | None:
-    """Return the noise of values (N, d) at times t (N,), s; None where there is too little, or nothing moves."""
+def noise_of(t: Array, values: Array, temperature: Array | None = None) -> QuickNoise | None:
+    """Return the noise of values (N, d) at times t (N,), s; None where there is too little, or nothing moves.
+
+    `temperature` (N,) is that of the sensor, in any unit; without one its drift cannot be told from a walk.
+    """
     rows = _quietest(t, values)
     if rows is None:
         return None
     quiet = values[rows]
     dt = float(np.median(np.diff(t[rows])))
-    white, walk = np.empty(values.shape[1]), np.empty(values.shape[1])
+    white = np.empty(values.shape[1])
     for k in range(values.shape[1]):
         allan = curve(np.ascontiguousarray(quiet[:, k]), dt)
         early = allan.tau <= max(1.0, 4 * dt)
         white[k] = float(np.median(allan.allan[early] * np.sqrt(allan.tau[early])))
-        walk[k] = np.sqrt(3) / 2 * float(np.min(allan.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
     if not np.all(white > 0):
         return None
-    return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt)
+    walk, known = _walk(t, values, temperature)
+    return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt, known)
+
+
+def _walk(t: Array, values: Array, temperature: Array | None) -> tuple[Array, Flags]:
+    """Return the walk (d,) of means beside curves of the temperature, and where it is known; else its upper limit."""
+    T = np.zeros(len(t)) if temperature is None else temperature
+    good = np.isfinite(t) & np.isfinite(T) & np.all(np.isfinite(values), axis=1)
+    n = max(1, int(np.sum(good)) // MEANS)
+    K = int(np.sum(good)) // n
+    cut = [x[good][: K * n].reshape(K, n, -1) for x in (t, T, values)]
+    times, means, y = (np.mean(x, axis=1) for x in cut)
+    scatter = _scatter(cut[2]) if n >= MIN_IN_MEAN else np.ones((K, 1))
+    moving = np.any(scatter > STILL * np.median(scatter, axis=0), axis=1)
+    step = float(np.median(np.diff(times[:, 0])))
+    dt = np.concatenate([[np.inf], np.maximum(np.diff(times[:, 0]) / step, 0.0)])
+    white = np.where(moving, np.inf, 1.0)
+    found = []
+    for X in _curves(times[:, 0], means[:, 0]):
+        costs, scales = LevelLikelihood([(np.hstack([X, y - y[:1]]), white, dt)], X.shape[1]).over(RATIOS)
+        walks = np.sqrt(RATIOS[:, None] * scales / step)
+        likely = np.where(costs - np.min(costs, axis=0) <= LIMIT, walks, np.nan)
+        best = walks[np.argmin(costs, axis=0), np.arange(y.shape[1])]
+        found.append((np.nanmin(likely, axis=0), best, np.nanmax(likely, axis=0)))
+    walk, all_found = found[0][1], np.array(found)
+    known = (np.max(all_found, axis=(0, 1)) <= FACTOR * walk) & (FACTOR * np.min(all_found, axis=(0, 1)) >= walk)
+    known &= temperature is not None
+    return np.where(known, walk, np.max(all_found, axis=(0, 1))), known
+
+
+def _curves(t: Array, T: Array) -> Iterator[Array]:
+    """Yield columns (K, q) of any smooth curve of the temperature and how it moves, then without that, orthonormal.
+
+    Through the noise of the thermometer a steep curve looks like a walk, to each of the two in another size.
+    """
+    from scipy.interpolate import BSpline
+
+    span = float(np.ptp(T))
+    if span == 0:
+        yield np.empty((len(t), 0))
+        return
+    slow = T.copy()
+    for k in range(1, len(T)):
+        slow[k] = slow[k - 1] + (T[k] - slow[k - 1]) * -np.expm1(-(t[k] - t[k - 1]) / LAG)
+    knots = np.linspace(T.min(), T.max(), int(np.clip(span / BEND, 1, COLUMNS)) + 1)
+    cubic = BSpline.design_matrix(T, np.concatenate([knots[[0] * 3], knots, knots[[-1] * 3]]), 3).toarray()
+    for columns in (np.column_stack([cubic, (T - slow) / span]), cubic):
+        left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
+        yield np.asarray(left[:, sizes > DEPENDENT * sizes[0]])
 
 
 def _quietest(t: Array, values: Array) -> slice | None:

@@ -64,7 +64,7 @@ class Manifest:
 
 
 def read_manifest(given: str) -> Manifest:
-    """Return the units of a manifest (`.csv`), or those whose files a pattern finds.
+    """Return the units of a manifest (`.csv`, `.tsv`), or those whose files a pattern finds.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read_manifest(given: str) -> Manifest:
         If there is none, or one is wrong; the message has a line for each mistake of a manifest.
     """
     pattern = re.search(r"[*?[]", given) is not None and not os.path.exists(given)
-    if pattern or not given.lower().endswith(".csv"):
+    if pattern or not given.lower().endswith((".csv", ".tsv")):
         return _of_pattern(given)
     folder = given.rpartition("/")[0] if is_url(given) else os.path.dirname(given)
     return Manifest(tuple(_entries(read_text(given), given, folder)), given)

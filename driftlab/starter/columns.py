@@ -8,7 +8,6 @@ is in SI.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
@@ -16,11 +15,12 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise, noise_of
-from driftlab.starter.names import UNITS, Name, leading, named, read_name
+from driftlab.starter.names import Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
-from fusion_core.units import convert, same_dimension
+from fusion_core.errors import ConfigError
+from fusion_core.units import convert, same_dimension, to_si
 
 V = TypeVar("V")
 SENSORS = ("gyro", "accel")
@@ -49,32 +49,71 @@ class Channels:
     step: float | None  # between rows [s]
 
 
-def channels_of(columns: FileColumns, given: Mapping[str, str], written: Mapping[str, str]) -> Channels:
-    """Return the channels; `given` are units by channel of the user, `written` those of the file's comments."""
+@dataclass(frozen=True)
+class Answers:
+    """The choices of the user: columns and units by channel, the interval between rows, the decimal sign."""
+
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+    interval: str | None = None
+    decimal: str | None = None
+
+
+def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]) -> Channels:
+    """Return the channels by what the user says, then by names and values; `written` are units of its comments."""
     names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
-    beside = leading(names) or ""
-    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
+    chosen = {field: _chosen(field, text, names) for field, text in given.columns.items()}
+    taken = {name.path for group in chosen.values() for name in group}
+    names = [name for name in names if name.path not in taken]
+    beside = leading([*chosen.get("gyro", ()), *names]) or ""
+    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None} | chosen
+    if given.interval is not None:
+        groups.pop("time", None)
     stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
-    if stream is not None:  # that the sensor is a part of: a topic stands for its time
+    if (
+        stream is not None and "time" not in chosen and given.interval is None
+    ):  # that the sensor is a part of: a topic stands for its time
         groups["time"] = [stream]
-    if "time" in groups and not _rises(columns.values[groups["time"][0].path]):
-        del groups["time"]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
     channels: dict[str, GuessedChannel] = {}
     noise: dict[str, QuickNoise] = {}
-    t: Array | None = None
+    t = _regular(given.interval, columns)
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
-        if field in SENSORS and t is not None and (quick := noise_of(t, values)):
+        T = channels["temperature"].values[:, 0] if "temperature" in channels else None
+        if field in SENSORS and t is not None and (quick := noise_of(t, values, T)):
             noise[field] = quick
-        stated = _stated(field, group, columns, given, written)
+        stated = _stated(field, group, columns, given.units, written)
         guess = stated or _by_values(field, values, channels, noise)
         axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
         paths = tuple(name.path for name in group)
         channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)
-        t = _seconds(channels.get("time"))
+        t = _seconds(channels.get("time")) if "time" in channels else t
     return Channels(_in_order(channels), _in_order(noise), others, _step(t))
+
+
+def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
+    """Return the columns that the user names for a channel, whole or by their beginnings, one an axis."""
+    by_path = {name.path: name for name in names}
+    group = []
+    for word in [text] if text in by_path else [part.strip() for part in text.split(",")]:
+        alike = [path for path in by_path if path.lower().startswith(word.lower())]
+        if word not in by_path and len(alike) != 1:
+            like = (
+                f"{len(alike)} columns begin so"
+                if alike
+                else f"no column of numbers is called so, there are {', '.join(by_path)}"
+            )
+            raise ConfigError(f"--column {field}={text}: '{word}': {like}; write the whole name of one")
+        group.append(by_path[word if word in by_path else alike[0]])
+    return [replace(name, axis=axis) for name, axis in zip(group, "xyz", strict=False)] if len(group) > 1 else group
+
+
+def _regular(interval: str | None, columns: FileColumns) -> Array | None:
+    """Return the times of rows that are an interval apart, s."""
+    rows = len(next(iter(columns.values.values()), ()))
+    return None if interval is None else to_si(interval, "s") * np.arange(rows, dtype=np.float64)
 
 
 def channels_in(samples: Chunk) -> Channels:
@@ -83,7 +122,8 @@ def channels_in(samples: Chunk) -> Channels:
     for field in (field for field in FIELDS if field in samples.channels):
         values = samples[field].reshape(len(samples), -1)
         channels[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
-    pairs = ((field, noise_of(samples.t, channels[field].values)) for field in SENSORS if field in channels)
+    T = samples.channels.get("temperature")
+    pairs = ((field, noise_of(samples.t, channels[field].values, T)) for field in SENSORS if field in channels)
     return Channels(channels, {field: noise for field, noise in pairs if noise is not None}, (), _step(samples.t))
 
 
@@ -96,17 +136,18 @@ def _step(t: Array | None) -> float | None:
     return None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
 
 
-def noise_of_column(columns: FileColumns, path: str, time: GuessedChannel | None) -> QuickNoise | None:
-    """Return the noise of one column, in its unit."""
-    t = _seconds(time)
-    return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
+def noise_of_column(columns: FileColumns, path: str, found: Mapping[str, GuessedChannel]) -> QuickNoise | None:
+    """Return the noise of one column beside the temperature, in its unit."""
+    t = _seconds(found.get("time"))
+    return None if t is None else noise_of(t, columns.values[path][:, None], found["temperature"].values[:, 0])
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
-    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
-    if unit is None or name.quantity is None or not same_dimension(unit, unit):
+    """Return a name; with the quantity of the file's unit where the name has another, as a thermometer's time."""
+    known = None if unit is None else known_unit(unit.split(" since ")[0])
+    if unit is None or known is None or (name.quantity is not None and _understood(unit, name.quantity)):
         return name
-    return name if _understood(unit, name.quantity) else replace(name, quantity=None)
+    return replace(name, quantity=None if name.quantity else quantity_of(known))
 
 
 def _by_values(
@@ -132,7 +173,8 @@ def _group(field: str, names: list[Name], columns: FileColumns, beside: str) -> 
     ):
         width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
         most = USUAL[field].axes or 1
-        if width <= most and np.any(np.isfinite(_values(group, columns))):
+        values = _values(group, columns)
+        if width <= most and np.any(np.isfinite(values)) and (field != "time" or _rises(values[:, 0])):
             return group
     return None
 
@@ -143,6 +185,8 @@ def _stated(
     """Return the unit of a channel that the user, the file, its comments, or the columns' names state."""
     if field in given:
         return Guess(given[field], "")
+    if group[0].path == TICKS and np.median(np.diff(columns.values[TICKS])) < RATES["us"][1] / 100:
+        return Guess("0.1 ms", "as MT Manager writes it")
     texts = {columns.units.get(name.path) for name in group}
     for text in texts:
         if len(texts) == 1 and text is not None and (unit := _understood(text, field)) is not None:
@@ -157,8 +201,8 @@ def _stated(
 def _understood(text: str, field: str) -> str | None:
     """Return a unit that a file writes in its own way (`C`, `seconds since 2021-09-20`) as one that is known."""
     si = USUAL[field].si
-    word = re.sub(r"[^a-z0-9]", "", text.split(" since ")[0].lower())
-    return next((unit for unit in (text, UNITS.get(word, "")) if unit and same_dimension(unit, si)), None)
+    known = (text, known_unit(text.split(" since ")[0]))
+    return next((unit for unit in known if unit and same_dimension(unit, si)), None)
 
 
 def _values(group: list[Name], columns: FileColumns) -> Array:
@@ -167,7 +211,7 @@ def _values(group: list[Name], columns: FileColumns) -> Array:
 
 def _rises(t: Array) -> bool:
     finite = t[np.isfinite(t)] if t.ndim == 1 else np.empty(0)
-    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and finite[-1] > finite[0])
+    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and np.median(np.diff(finite)) > 0)
 
 
 def _seconds(time: GuessedChannel | None) -> Array | None:
@@ -177,6 +221,7 @@ def _seconds(time: GuessedChannel | None) -> Array | None:
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
 YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
 RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
+TICKS = "SampleTimeFine"  # of Xsens: in us where its steps are those of a slow device
 G = {"g": 1.0, "m/s^2": 9.80665, "mg": 1000.0, "Gal": 980.665}
 NEAR = 0.15  # of g: bias and scale of accelerometers without calibration
 QUIET_DEG, QUIET_RAD = 1.5e-3, 1e-4  # noise densities that only gyros in deg/s have, and only those in rad/s

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise
 from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
+from driftlab.starter.names import Name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
 from fusion_core.escaping import line, yaml_text
@@ -21,35 +23,52 @@ DENSITIES = {
     "gyro": ("deg/h", "deg/s", 36.0),
     "accel": ("ug", "mg", 1000.0),
 }  # small unit, large one, and from where on
+UNITS_OF = {
+    "time": ("s", "ms", "us", "ns"), "gyro": ("deg/s", "rad/s", "deg/h", "mdeg/s"), "accel": ("g", "m/s^2", "mg"),
+    "temperature": ("degC", "degF", "K"),
+}  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
+
+
+class OpenQuestion(NamedTuple):
+    """A question to the user: the option that answers it, of which channel, its words, and answers, the guess first."""
+
+    option: str
+    field: str
+    text: str
+    choices: tuple[str, ...]
+    needed: bool = True
 
 
 @dataclass(frozen=True)
 class Starter:
-    """A config as text, and the places to be filled in, a sentence each."""
+    """A config as text, and the places to be filled in, a sentence each; `questions` a person can be asked."""
 
     text: str
     asked: tuple[str, ...]
+    questions: tuple[OpenQuestion, ...] = ()
 
 
 def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
-    asked = list(_questions(channels, held))
+    questions = tuple(_questions(columns, channels))
+    asked = [question.text for question in questions if question.needed]
+    asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
     lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
-    if "time" not in channels.found:
+    if "time" not in channels.found and "interval" not in columns.settings:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
     lines += [_channel(field, channel) for field, channel in channels.found.items()]
     if held is not None:
-        unit = held if _is_unit(held) else "1"
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
-        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {unit}}}   {note}")
-    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
+        place = f"{{path: {yaml_text(held.path)}, unit: {yaml_text(_held_unit(held))}}}"
+        lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
+    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return _starter(lines, asked)
+    return replace(_starter(lines, asked), questions=questions)
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
@@ -93,14 +112,16 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 
 
-def _questions(channels: Channels, held: str | None) -> Iterator[str]:
+def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
     for field, channel in channels.found.items():
-        if channel.unit is None:
-            yield f"the unit of {field} ({channel.why})"
-    if "time" not in channels.found:
-        yield "the interval between rows: no column is a time"
-    if held is None:
-        yield from _noises(channels)
+        if channel.guessed:
+            usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
+            choices = tuple(filter(None, [channel.unit, *usual]))
+            yield OpenQuestion(
+                "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
+            )
+    if "time" not in channels.found and "interval" not in columns.settings:
+        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 
 
 def _noises(channels: Channels) -> Iterator[str]:
@@ -141,7 +162,7 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
             continue
         white, walk = _in_units(sensor, noise, channel.unit)
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
-        yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+        yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # {_walk(noise)}"
         if sensor == "gyro" and "temperature" in channels.found:
             fitted = f"{{kind: spline, path: {yaml_text(map_name)}}}"
             yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
@@ -167,16 +188,28 @@ def _per_axis(values: Array, unit: str) -> str:
     return f"[{', '.join(f'{float(value):.3g} {unit}' for value in values)}]"
 
 
+def _walk(noise: QuickNoise) -> str:
+    if np.all(noise.known):
+        return "guess: the likeliest beside the temperature"
+    return "unknown: at most so, by these rows; better: `driftlab allan` on a night at rest"
+
+
 def _stretch(noise: QuickNoise) -> str:
     return f"quietest stretch, {noise.seconds:.4g} s from {noise.start:.4g} s on"
 
 
-def held_of(columns: FileColumns, channels: Channels) -> str | None:
+def held_of(columns: FileColumns, channels: Channels) -> Name | None:
     """Return the column that a `held` filter may take, where the file has neither gyro nor accelerometer."""
     if any(sensor in channels.found for sensor in SENSORS) or "temperature" not in channels.found:
         return None
-    candidates = [n.path for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1]
-    return candidates[0] if candidates else None
+    others = (n for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1)
+    return next((name for name in others if _measures(columns.values[name.path])), None)
+
+
+def _measures(values: Array) -> bool:
+    """Tell a reading from a constant, a counter, and a column that is mostly empty."""
+    steps = np.diff(values[np.isfinite(values)])
+    return len(steps) > len(values) / 2 and bool(np.ptp(steps) > 0)
 
 
 def _is_unit(text: str) -> bool:
@@ -184,12 +217,15 @@ def _is_unit(text: str) -> bool:
     return same_dimension(text, text)
 
 
-def _held_filter(held: str, channels: Channels) -> Iterator[str]:
-    unit = held if _is_unit(held) else "1"
-    noise = channels.noise.get(held)
+def _held_unit(held: Name) -> str:
+    return held.unit or (held.path if _is_unit(held.path) else "1")
+
+
+def _held_filter(held: Name, channels: Channels) -> Iterator[str]:
+    unit, noise = _held_unit(held), channels.noise.get(held.path)
     yield "filter:"
     yield "  kind: held"
-    yield f"  channel: {yaml_text(_key(held))}"
+    yield f"  channel: {yaml_text(_key(held.path))}"
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 300 s            # at the beginning"
     if noise is None:
@@ -198,7 +234,7 @@ def _held_filter(held: str, channels: Channels) -> Iterator[str]:
         return
     white, walk = _per_axis(noise.white, f"{unit}/sqrt(Hz)"), _per_axis(noise.walk, f"{unit}/sqrt(s)")
     yield f"  noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
-    yield f"  bias: {{kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+    yield f"  bias: {{kind: random_walk, walk: {walk}}}   # {_walk(noise)}"
 
 
 def _key(path: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 
 from fusion_core.contracts import USUAL
@@ -15,22 +15,27 @@ from fusion_core.units import same_dimension
 
 WORDS = {
     "gyro": {"gyr", "gyro", "gyros", "gyroscope", "gyroscopes", "omega", "rate", "rates", "rot", "ars", "angvel",
-             "angularvelocity", "angularrate", "rateofturn", "rotationrate"},
-    "accel": {"acc", "accel", "accels", "accelerometer", "accelerometers", "acceleration", "specificforce",
-              "linearacceleration"},
-    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient"},
-    "time": {"time", "timestamp", "stamp", "sec", "secs", "seconds", "epoch", "utc", "ts"},
+             "angularvelocity", "angularrate", "rateofturn", "rotationrate", "drehrate"},
+    "accel": {"acc", "accl", "accel", "accels", "accelerometer", "accelerometers", "acceleration", "specificforce",
+              "linearacceleration", "beschleunigung"},
+    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient",
+                    "temperatur"},
+    "time": {"time", "timestamp", "stamp", "sec", "secs", "seconds", "epoch", "utc", "ts", "elapsed", "tow", "micros",
+             "millis", "date", "datetime", "zeit", "datum", "xvalue"},
 }  # fmt: skip
 LETTERS = {"gyro": {"g", "w"}, "accel": {"a", "f"}}  # that mean so beside an axis
 NO_SENSOR = {"bias", "truth", "true", "std", "sigma", "cov", "covariance", "var", "variance", "delta", "mag", "offset",
-             "orientation", "position", "velocities", "scale", "error", "seq"}  # fmt: skip
+             "orientation", "position", "velocities", "scale", "error", "seq", "rms", "count"}  # fmt: skip
 UNITS = {
-    "dps": "deg/s", "degs": "deg/s", "degps": "deg/s", "mdps": "mdeg/s", "rads": "rad/s", "radps": "rad/s",
-    "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC", "kelvin": "K",
-    "us": "us", "usec": "us", "ns": "ns", "nsec": "ns", "ms": "ms", "msec": "ms", "s": "s", "sec": "s", "secs": "s",
-    "seconds": "s", "g": "g", "c": "degC", "k": "K", "f": "degF",
+    "dps": "deg/s", "degs": "deg/s", "degps": "deg/s", "degsec": "deg/s", "degs1": "deg/s", "mdps": "mdeg/s",
+    "degh": "deg/h", "deghr": "deg/h", "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "rads1": "rad/s",
+    "mrads": "mrad/s", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC",
+    "kelvin": "K", "degf": "degF", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "ms": "ms",
+    "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
+    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm",
 }  # fmt: skip
-AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z"}
+AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
+FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1
 
 
 @dataclass(frozen=True)
@@ -52,30 +57,41 @@ def read_name(path: str) -> Name:
     if len(path) > LONGEST:
         return Name(path, None, None, None, (path,))
     bare, unit = _in_brackets(path)
-    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", bare)]
-    if (letter := re.split(r"[./]", bare)[-1].strip()) in ("t", "T"):
+    words = [word.lower() for word in re.findall(r"[A-ZÄÖÜ]?[a-zäöüéèß]+|[A-ZÄÖÜ]+(?![a-zäöü])|\d+", bare)]
+    letter = re.split(r"[./_\s]", re.split(r"[./]", bare)[-1].strip())[0]
+    if letter == "T" or (letter == "t" and words[-1] == "t"):
         return Name(path, "time" if letter == "t" else "temperature", None, unit, (bare,))
     quantity, axis, rest = _meaning(words)
     if unit is None:
         for count in (3, 2, 1):  # `m_s2` and `rad_s` are several words
-            suffix = UNITS.get("".join(words[-count:])) if len(words) > count else None
-            shorter = _meaning(words[:-count])
+            suffix = UNITS.get("".join(words[-count:])) if len(words) >= count else None
+            shorter = _meaning(words[:-count] if len(words) > count else words)
             if suffix and shorter[0] and _fits(suffix, shorter[0]):
                 unit, (quantity, axis, rest) = suffix, shorter
                 break
-    elif quantity and not _fits(unit, quantity):
-        unit = None
+    elif not (quantity and _fits(unit, quantity)) and not NO_SENSOR & set(words):
+        quantity = quantity_of(unit)  # whatever its language calls it
     return Name(path, quantity, axis, unit, tuple(rest))
 
 
+def quantity_of(unit: str) -> str | None:
+    """Return the quantity that a unit is of, None where it is none that is known."""
+    return next((quantity for quantity in WORDS if _fits(unit, quantity)), None)
+
+
 def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str]]:
-    """Return quantity, axis, and the words without the axis."""
-    axis = None
-    if len(words) > 1 and words[-1] in AXES:
-        axis, words = AXES[words[-1]], words[:-1]
-    elif words and words[-1][-1] in "xyz" and _quantity([*words[:-1], words[-1][:-1]], axis=True):
-        axis, words = words[-1][-1], [*words[:-1], words[-1][:-1]]
-    return _quantity(words, axis=axis is not None), axis, words
+    """Return quantity, axis, and the words without the axis, which is the last, within the last, or the first."""
+    last = words[-1] if words else ""
+    for axis, rest in (
+        (last, words[:-1]),
+        (last[-1:] if last[-1:] in "xyz" else "", [*words[:-1], last[:-1]]),
+        (words[0] if words and words[0] in "xyz" else "", words[1:]),
+    ):
+        if axis in AXES and rest and (quantity := _quantity(rest, axis=True)):
+            return quantity, AXES[axis], rest
+    if len(words) > 1 and last in AXES:
+        return None, AXES[last], words[:-1]
+    return _quantity(words, axis=False), None, words
 
 
 def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[Name]]:
@@ -88,6 +104,8 @@ def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[N
         if name.quantity == quantity:
             groups.setdefault(name.group if name.axis else (name.path,), []).append(name)
     for group in groups.values():
+        if {name.axis for name in group} == set(FROM_ONE):
+            group[:] = [replace(name, axis=FROM_ONE[name.axis or ""]) for name in group]
         group.sort(key=lambda name: name.axis or "")
         axes = [name.axis for name in group]
         if len(set(axes)) < len(axes):
@@ -108,23 +126,32 @@ def leading(names: Iterable[Name]) -> str | None:
     return groups[0][0].path if groups else None
 
 
+def known_unit(text: str) -> str | None:
+    """Return a unit that is written as a file or a person writes it (`°/s`, `m.s-2`, `mG`) as one that is known."""
+    degrees = re.sub("[°º˚]", "deg", text.strip().replace("²", "2").replace("µ", "u").replace("μ", "u"))
+    unit = UNITS.get(re.sub(r"[^a-z0-9]", "", degrees.lower()), degrees)
+    return unit if unit and same_dimension(unit, unit) else None
+
+
 def _in_brackets(path: str) -> tuple[str, str | None]:
-    brackets = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", path)
-    if brackets is None or brackets[1].isdigit():
-        return path, None
-    text = brackets[1].strip()
-    text = UNITS.get(re.sub(r"[^a-z0-9]", "", text.lower()), text)
-    return (path[: brackets.start()], text) if same_dimension(text, text) else (path, None)
+    """Return a name without its brackets, and the unit in them, or behind a comma."""
+    bare = re.sub(r"\s*[(\[{](?!\d[)\]])[^()\[\]{}]*[)\]}]\s*$", "", path) or path
+    inside = path[len(bare) :].strip(" ()[]{}")
+    name, comma, behind = bare.rpartition(",")
+    unit = known_unit(inside) if inside else None
+    if unit is None and comma and (unit := known_unit(behind)) is not None:
+        bare = name
+    known = unit is not None or _meaning(re.findall("[a-z]+", bare.lower()))[0] is not None
+    return (bare if known else path), unit
 
 
 def _quantity(words: Sequence[str], *, axis: bool) -> str | None:
     if not words or NO_SENSOR & set(words):
         return None
     ends = {"".join(words[k:]) for k in range(len(words))}
-    for quantity, known in WORDS.items():
-        if known & (set(words) | ends) or (axis and words[-1] in LETTERS.get(quantity, ())):
-            return quantity
-    return "time" if list(words) == ["t"] else None
+    spoken = (quantity for quantity, known in WORDS.items() if known & (set(words) | ends))
+    lettered = (q for word in (words[-1], words[0]) for q, letters in LETTERS.items() if axis and word in letters)
+    return next(spoken, None) or next(lettered, None) or ("time" if list(words) == ["t"] else None)
 
 
 def _fits(unit: str, quantity: str) -> bool:

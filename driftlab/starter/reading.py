@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,9 @@ from fusion_core.host.registry import registry
 ROWS = 200_000  # that are looked at
 WIDEST = 1024  # values of an array that is a channel
 GZIP = b"\x1f\x8b"
+HEAD = 4096  # bytes by which a format is recognised
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
-SEPARATORS = (",", ";", "\t")
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,9 @@ def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
     """Yield the kinds of source that may read a file that begins so: by its first bytes, its name, then any."""
     installed = _file_sources()
     own = [kind for kind in kinds_of(first) if kind in installed]
-    named = [kind for kind, cls in installed.items() if path.name.lower().endswith(cls.suffixes or ("\0",))]
-    others = [] if recognised(first) and not first.startswith(GZIP) else ["csv"]
+    name = path.name.lower().removesuffix(".gz")
+    named = [kind for kind, cls in installed.items() if name.endswith(cls.suffixes or ("\0",))]
+    others = [] if recognised(first) else ["csv"]
     if path.is_dir():
         named = [kind for kind, cls in installed.items() if cls.signatures]
     for kind in dict.fromkeys([*own, *(named if not own else []), *others]):
@@ -68,31 +70,29 @@ def _file_sources() -> dict[str, type[FileSource]]:
     return {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
 
 
-def columns_of(path: Path, cls: type[FileSource]) -> FileColumns:
-    """Read the first rows of every column; raises DataError where the source cannot."""
-    found, errors = list[FileColumns](), list[FusionError]()
-    for given in [{"separator": text} for text in SEPARATORS] if "separator" in cls.model_fields else [{}]:
-        try:
-            found.append(_read(path, cls, given))
-        except DataError as error:
-            check_all()
-            errors.append(error)
-    if not found:
-        raise errors[0]
-    return max(found, key=lambda columns: len(columns.names))
+def beginning(path: Path, most: int) -> bytes:
+    """Return the first bytes of a file, unpacked where it is a gzip archive; raises UnreadableFile as `head`."""
+    first = head(path, most=most)
+    if not first.startswith(GZIP):
+        return first
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(first, most)
+    except zlib.error:
+        return first
 
 
-def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> FileColumns:
+def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any]) -> FileColumns:
+    """Read the first rows of every column; `known` are settings of the user. Raises DataError where it cannot."""
+    settings = dict(cls.settings_for(path, known))
     # a log's rows are those of the first channel; which column is a time, the names will tell
-    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
-    default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
+    source = cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
-    return FileColumns(source.kind, noun, default, names, values, units, more)
+    return FileColumns(source.kind, noun, settings, names, values, units, more)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
@@ -137,7 +137,7 @@ def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, A
 
 def framing_of(path: Path) -> FoundFraming | None:
     """Return the installed framing that finds most frames in a file's beginning; None where none does."""
-    data = head(path, most=TRIED)
+    data = beginning(path, TRIED)
     kind = next((kind for kind, cls in _file_sources().items() if "framing" in cls.model_fields), "")
     found = [FoundFraming(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
     best = max(found, key=lambda frames: frames.count, default=None)

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from driftlab.storage.folders import check_writable, refusals
-from driftlab.storage.ownership import check_own, put, seal, seal_of
+from driftlab.storage.ownership import OWN, check_own, put, seal, seal_of
 from driftlab.storage.system import sync
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, MapError
@@ -39,10 +39,12 @@ def check_file(path: Path, command: str, subject: str, remedy: str) -> None:
 
 
 def write_text(path: Path, text: str, command: str) -> None:
-    """Write a page, a figure or a text of JSON whole, where a link leads to; raises as `save`."""
-    known = (
-        f'{{\n  "sha256": "{seal_of(command)}",{text[1:]}' if text[0] == "{" else f"{text}<!-- {seal_of(command)} -->\n"
-    )
+    """Write a page, a figure, a text of JSON, or one with a place for its SHA-256, whole; raises as `save`."""
+    known = f"{text}<!-- {seal_of(command)} -->\n"
+    if text[0] == "{":
+        known = f'{{\n  "sha256": "{seal_of(command)}",{text[1:]}'
+    elif OWN in text:
+        known = text
     with _sealed(path, command, str(path)) as new:
         new.write_text(known, encoding="utf-8")
 

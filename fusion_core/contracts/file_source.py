@@ -20,7 +20,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, field_serializer, model_validator
@@ -106,6 +106,17 @@ class FileSource(Source):
         """The path, with ::START:STOP where a range is set."""
         start, stop = ("" if value is None else f"{value:.12g}" for value in (self.start, self.stop))
         return f"{self._title or self.path or self.kind}" + (f"::{start}:{stop}" if start or stop else "")
+
+    @classmethod
+    def settings_for(cls, path: Path, known: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings beside the channels under which a file can be read, by its beginning; `known` are some.
+
+        Raises
+        ------
+        UnreadableFile
+            If the file cannot be read.
+        """
+        return {key: value for key, value in known.items() if key in cls.model_fields}
 
     @abstractmethod
     def open(self, path: Path, faults: Faults) -> AbstractContextManager[Table]:
@@ -254,7 +265,7 @@ FORMATS = {  # the first bytes of a file: what it is, and what to do with it whe
     b"\x89MCAP0\r\n": ("an MCAP file", "install a source for it"),
     b"SQLite format 3\0": ("an SQLite database, as in a ROS 2 bag", f"install a source for it, or {AS_CSV}"),
     b"PK\x03\x04": ("a zip archive or a spreadsheet", f"unpack it, or {AS_CSV}"),
-    b"\x1f\x8b": ("a gzip archive", "use kind: csv for text, or unpack it first"),
+    b"\x1f\x8b": ("a gzip archive", "unpack it first"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Recordings as text: one row a line, columns by name from the header.
+"""Recordings as text, or as the sheet of a workbook: one row a line, columns by name from the header.
 
 ::
 
@@ -7,28 +7,33 @@
 
 Lines that begin with `#` and blank lines are skipped, SKIPPED bytes of them at most; an empty cell is NaN. A last line
 that its writer did not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is
-standard input.
+standard input. Text in UTF-16 is turned into UTF-8 first.
 """
 
 from __future__ import annotations
 
-import csv
+import codecs
+import io
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from fusion_core.budget import TEXTS, size_of
+from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
+from fusion_core.contracts.file_source import problem
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.dialect import JOINED, bare, dialect_of, fields_of, names_of, numbers_of, seconds_of
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
@@ -38,7 +43,11 @@ SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file; TEXTS o
 SLOW = 40  # times as many for each line that is left out by itself
 COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
 FIRST = re.compile(rb"^(?!#)[^\S\n]*\S", re.M)  # of a line that is neither
-SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
+SEPARATORS = {",": ",", ";": ";", "\t": "\\t", " ": " "}  # and how each is shown
+BLANKS, EDGES = re.compile(rb"[ \t]+"), re.compile(rb"^[ \t]+|[ \t]+(?=\r?$)", re.M)
+MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}  # of encodings, at the beginning
+COMMA = str.maketrans(",.", ".,")
+GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
 
 
 class Csv(FileSource):
@@ -47,43 +56,126 @@ class Csv(FileSource):
     suffixes: ClassVar[tuple[str, ...]] = (".csv", ".tsv", ".txt", ".csv.gz")
 
     kind: Literal["csv"] = "csv"
-    separator: Literal[",", ";", "\t"] = ","
-    """Separator of the cells of a line."""
+    separator: Literal[",", ";", "\t", " "] = ","
+    """Separator of the cells of a line; a blank stands for any number of blanks and tabs."""
+    decimal: Literal[".", ","] = "."
+    """Decimal sign of the numbers."""
+    header: Annotated[int, Field(ge=0)] | None = None
+    """Line of the columns' names, 0 where there is none: columns are then called 1, 2, ...; by default the first line
+    that is neither blank nor begins with `#`."""
+    first_row: Annotated[int, Field(ge=1)] | None = None
+    """Line of the first row, where lines of units or the like are between it and the names."""
+    dates: Mapping[str, str] = Field(default_factory=dict)
+    """Format of the dates of a column, as `%d.%m.%Y %H:%M:%S`; `Date + Time` is two columns, joined by a blank."""
+
+    @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        if self.separator == self.decimal:
+            raise problem("the separator and the decimal sign are both ','; correct one of them")
+        return self
+
+    @classmethod
+    def settings_for(cls, path: Path, known: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings under which a text can be read, by its first lines."""
+        with cls.model_construct(**known).lines_of(path) as file:
+            data = file.read(GUESSED)
+        if data.lstrip()[:1] in (b"{", b"<"):
+            what = "JSON" if data.lstrip()[:1] == b"{" else "XML"
+            raise UnreadableFile(f"{path}: is {what}, a table of lines and cells was expected; write it as CSV")
+        lines = decoded(data[: data.rfind(b"\n") + 1] or data).removesuffix("\n").split("\n")
+        found = dialect_of(lines, known)
+        if found is None:
+            return known
+        between = [line for line in lines[found.header : found.first_row - 1] if BLANK.fullmatch(line.encode()) is None]
+        usual = next((k for k, line in enumerate(lines, 1) if BLANK.fullmatch(line.encode()) is None), 0)
+        settings = {
+            "separator": found.separator,
+            "decimal": found.decimal,
+            "header": None if found.header == usual and not between else found.header,
+            "first_row": found.first_row if between else None,
+            "dates": found.dates,
+        }
+        defaults = {name: cls.model_fields[name].default for name in settings}
+        return {**{k: v for k, v in settings.items() if v == 0 or (v and v != defaults[k])}, **known}
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind."""
+        with self.lines_of(path) as file:
+            yield CsvLines(path, file, self, faults)
+
+    @contextmanager
+    def lines_of(self, path: Path) -> Iterator[Stream]:
+        """Open the text of a file, in UTF-8 where it is in UTF-16."""
         with opened(path) as file:
             first = beginning(file, path)
             if recognised(first):
                 raise foreign(path, first, self.kind)
+            if encoding := next((name for mark, name in MARKS.items() if first.startswith(mark)), None):
+                decoder = codecs.getincrementaldecoder(encoding)("replace")
+                with stream_of(path, (decoder.decode(data) for data in iter(partial(file.read, COPIED), b""))) as text:
+                    yield text
+                return
             if b"\0" in first.partition(b"\n")[0]:
                 raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
-            yield CsvLines(path, file, self.separator, faults)
+            yield file
+
+
+@contextmanager
+def stream_of(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
+    """Open a temporary file with the texts that a file is turned into, as far as the budget allows."""
+    with tempfile.TemporaryFile() as file:
+        for text in texts:
+            check_all()
+            keep(path, text.encode(), file)
+        file.seek(0)
+        yield io.BufferedReader(file.raw)
+
+
+def decoded(data: bytes) -> str:
+    """Return the text of bytes, in UTF-8 or else Latin-1."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 class CsvLines(Table):
-    """The lines of an open file."""
+    """The lines of an open file, under the settings of its source."""
 
-    def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:
-        self.path, self.file, self.separator, self.faults = path, file, separator, faults
+    def __init__(self, path: Path, file: Stream, settings: Csv, faults: Faults) -> None:
+        self.path, self.file, self.faults = path, file, faults
+        self.settings, self.separator = settings, settings.separator
         self.skipped, self.most = 0, TEXTS  # bytes of comments and blank lines, and how many there may be
         self.line = 1  # number of the first line of the block that is read
-        self.columns = [name.strip() for name in self._fields(self._header())]
+        self.units: list[str] = []
+        self.texts = {part for path in settings.dates for part in self._parts(path)}
+        self.columns = self._names()
         self._check_header()
 
     @property
     def names(self) -> Sequence[str]:
         """The columns' names."""
-        return [name for name in self.columns if name]
+        dates, columns = self.settings.dates, [name for name in self.columns if name and name not in self.texts]
+        return [*columns, *dates]
+
+    def unit(self, path: str) -> str | None:
+        """Return s of a date; of another column what the line below its name says."""
+        if path in self.settings.dates:
+            return "s"
+        place = self.columns.index(path) if path in self.columns else len(self.units)
+        return self.units[place].strip(" ()[]") or None if place < len(self.units) else None
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of about `BLOCK` bytes, in order."""
-        for path in paths:
-            if (count := self.columns.count(path)) > 1:
-                raise BadValue(f"{self.path}: has {count} columns '{path}', one was expected; rename the others")
-        at = {path: self.columns.index(path) for path in paths}
+        parts = [part for path in paths for part in self._parts(path)]
+        for part in parts:
+            if (count := self.columns.count(part)) > 1:
+                raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
+        at = {part: self.columns.index(part) for part in parts}
         for _, block, final in self._pieces():
+            if self.separator == " ":
+                block = EDGES.sub(b"", BLANKS.sub(b" ", block))
             unfinished = final and not block.endswith(b"\n")
             values = None if unfinished else self._fast(block, at)
             if values is None:
@@ -98,6 +190,44 @@ class CsvLines(Table):
                 self._skip(len(block))
             self.line += block.count(b"\n")
 
+    def _parts(self, path: str) -> list[str]:
+        """Return the columns that a path names: those of a date and of a time may be two."""
+        return path.split(JOINED) if path in self.settings.dates else [path]
+
+    def _names(self) -> list[str]:
+        """Return the names of the columns, and leave the file before the first row."""
+        header, first = self.settings.header, self.settings.first_row
+        if header is None and first is None:
+            return self._widened([name.strip() for name in self._fields(self._header())])
+        skipped = [decoded(self.file.readline(LONGEST)) for _ in range(max(header or 0, (first or 1) - 1))]
+        self.line += len(skipped)
+        self._skip(sum(map(len, skipped)))
+        if not header:
+            cells = bare(self._fields(self._next_line()))
+            return self._widened([str(k + 1) for k in range(len(cells))])
+        if header > len(skipped) or not skipped[header - 1]:
+            raise EmptyRecording(f"{self.path}: has fewer than {header} lines; correct source.header")
+        rest = [names_of(line, self.separator) for line in skipped[header:] if line.strip()]
+        names = names_of(skipped[header - 1], self.separator)
+        self.units = rest[0] if rest and len(rest[0]) == len(names) else []
+        return self._widened(names)
+
+    def _next_line(self) -> str:
+        place = self.file.tell()
+        line = next(
+            (text for data in iter(partial(self.file.readline, LONGEST), b"") if (text := decoded(data)).strip()), ""
+        )
+        self.file.seek(place)
+        return line
+
+    def _widened(self, names: list[str]) -> list[str]:
+        """Return the names with an empty one, or less one, where rows end with a separator and these do not, or do."""
+        cells = self._fields(self._next_line().rstrip("\r\n"))
+        if len(cells) == len(names) + 1 and not cells[-1].strip():
+            return [*names, ""]
+        spare = not names[-1] or self.settings.header is not None  # a column of comments, which no row has
+        return names[:-1] if len(cells) == len(names) - 1 > 0 and spare else names
+
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
         for offset, block, _ in self._pieces():
@@ -111,10 +241,7 @@ class CsvLines(Table):
             if end - begin > LONGEST:
                 raise self._too_long()
             self.file.seek(offset + end)
-            try:
-                text = block[begin:end].decode("utf-8" if offset + begin else "utf-8-sig")
-            except UnicodeDecodeError:
-                text = block[begin:end].decode("latin-1")
+            text = decoded(block[begin:end])
             if text.strip() and not text.startswith("#"):
                 return text
             self._skip(BLOCK)  # such a line is looked for in a block of its own
@@ -146,12 +273,12 @@ class CsvLines(Table):
             raise UnreadableFile(
                 f"{self.path}: has {len(self.columns):,} columns, at most {COLUMNS:,} are read; check the separator"
             )
-        if all(_number(name) is not None for name in self.columns):
+        if self.settings.header is None and all(_number(name) is not None for name in self.columns):
             raise MissingChannel(
                 f"{self.path}: the first line has numbers only ({', '.join(self.columns[:4])}, ...), "
-                "the columns' names were expected; write them in a line above"
+                "the columns' names were expected; write them in a line above, or set header: 0"
             )
-        other = next((s for s in SEPARATORS if s != self.separator and s in self.columns[0]), None)
+        other = next((s for s in ",;\t" if s != self.separator and s in self.columns[0]), None)
         if len(self.columns) == 1 and other:
             raise MissingChannel(
                 f"{self.path}: the header has no '{SEPARATORS[self.separator]}' and is a single column; "
@@ -180,13 +307,15 @@ class CsvLines(Table):
         names = [f"column_{k + 1}" for k in range(n + 1)]  # one more, where a line that is too long shows
         last, extra = names[-2:]
         used = {names[k] for k in at.values()}
+        texts = {names[at[part]] for part in self.texts if part in at}
         try:
             frame = pl.read_csv(
                 self.separator.encode() * n + b"\n" + block,  # polars counts the columns of the first line
                 has_header=False,
                 separator=self.separator,
                 comment_prefix="#",
-                schema={name: pl.Float64 if name in used else pl.String for name in names},
+                schema={name: pl.Float64 if name in used - texts else pl.String for name in names},
+                decimal_comma=self.settings.decimal == ",",
                 columns=sorted(used | {last, extra}, key=names.index),
             )[1:]
         except pl.exceptions.PolarsError:
@@ -195,7 +324,19 @@ class CsvLines(Table):
         separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(self.separator))
         if not (whole and separators == (n - 1) * len(frame)) and self._lines(block) != len(frame):
             return None
-        return {path: frame[names[k]].to_numpy() for path, k in at.items()}
+        columns = {part: frame[names[k]] for part, k in at.items()}
+        values = {part: column.to_numpy() for part, column in columns.items() if column.dtype == pl.Float64}
+        for path, form in self._dates(at):
+            parts = [columns[part] for part in self._parts(path)]
+            seconds = seconds_of(parts[0] if len(parts) == 1 else parts[0] + " " + parts[1], form)
+            if seconds.null_count() > sum(1 for cell in parts[0] if not (cell or "").strip()):
+                return None
+            values[path] = seconds.to_numpy()
+        return values
+
+    def _dates(self, at: Mapping[str, int]) -> Iterator[tuple[str, str]]:
+        """Yield the columns of dates among those that are read, with their formats."""
+        return ((path, form) for path, form in self.settings.dates.items() if all(p in at for p in self._parts(path)))
 
     def _lines(self, block: bytes) -> int | None:
         """Return the number of lines where each has as many fields as the header, or None."""
@@ -219,7 +360,17 @@ class CsvLines(Table):
             self.faults.add("torn last line, left out", 1, f"line {where(rows.pop())}")
         numbers = [self._row(lines[k], at, where, k) for k in rows]
         columns = np.array(numbers, dtype=np.float64).reshape(len(numbers), len(at)).T
-        return dict(zip(at, np.ascontiguousarray(columns), strict=True))
+        values = dict(zip(at, np.ascontiguousarray(columns), strict=True))
+        for path, form in self._dates(at):
+            texts = [" ".join(self._fields(lines[k])[at[part]] for part in self._parts(path)) for k in rows]
+            values[path] = numbers_of(texts, form)
+            for k, text, value in zip(rows, texts, values[path], strict=True):
+                if np.isnan(value) and text.strip():
+                    raise BadValue(
+                        f"{self.path}: line {where(k)}, column '{path}': '{text[:40]}' is not a date as '{form}'; "
+                        "correct it, or source.dates"
+                    )
+        return values
 
     def _number_of(self, block: bytes, k: int) -> int:
         """Return the number of the k-th line that is kept of the block."""
@@ -237,7 +388,7 @@ class CsvLines(Table):
                 f"{len(self.columns)} were expected as in the header; correct or remove the line"
             )
         for path, place in at.items():
-            number = _number(fields[place])
+            number = 0.0 if path in self.texts else self._number(fields[place])
             if number is None:
                 raise BadValue(
                     f"{self.path}: line {where(k)}, column '{path}': '{fields[place][:40]}' is "
@@ -251,14 +402,13 @@ class CsvLines(Table):
         fields, n = self._fields(line), len(self.columns)
         if len(fields) < n or closed:
             return len(fields) < n
-        return line.count('"') % 2 == 1 or (n - 1 in at.values() and _number(fields[-1]) is None)
+        return line.count('"') % 2 == 1 or (n - 1 in at.values() and self._number(fields[-1]) is None)
 
     def _fields(self, line: str) -> list[str]:
-        line = line.rstrip("\r\n")
-        if '"' in line:
-            with suppress(csv.Error):
-                return next(csv.reader([line], delimiter=self.separator))
-        return line.split(self.separator)
+        return fields_of(line, self.separator)
+
+    def _number(self, cell: str) -> float | None:
+        return _number(cell.translate(COMMA) if self.settings.decimal == "," else cell)
 
 
 def _number(cell: str) -> float | None:

@@ -26,7 +26,7 @@ from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import damaged
+from fusion_plugins.sources.unpacked import damaged, unpacking
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -39,6 +39,7 @@ class Hdf5(FileSource):
 
     kind: Literal["hdf5"] = "hdf5"
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind, damaged, or being written."""

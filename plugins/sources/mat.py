@@ -30,7 +30,7 @@ from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.mat_elements import Elements, Old, Variable
-from fusion_plugins.sources.unpacked import translated
+from fusion_plugins.sources.unpacked import translated, unpacking
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 DAMAGES = (
@@ -49,6 +49,7 @@ class Mat(FileSource):
 
     kind: Literal["mat"] = "mat"
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""

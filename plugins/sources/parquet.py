@@ -38,7 +38,7 @@ from fusion_core.contracts import Block, FileSource, Source, Table, foreign, hea
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import damaged, translated
+from fusion_plugins.sources.unpacked import damaged, translated, unpacking
 
 if TYPE_CHECKING:
     import polars as pl
@@ -56,6 +56,7 @@ class Parquet(FileSource):
 
     kind: Literal["parquet"] = "parquet"
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""

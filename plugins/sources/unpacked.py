@@ -12,16 +12,17 @@ import os
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import cache, wraps
 from pathlib import Path
 from threading import Lock
-from typing import IO, BinaryIO
+from typing import IO, Any, BinaryIO
 
-from fusion_core.budget import TEXTS, check_all, keep, no_room, size_of
-from fusion_core.contracts import head
+from fusion_core.budget import COPIED, TEXTS, check_all, keep, no_room, size_of, temporary_folder, unpacked_at_most
+from fusion_core.contracts import Table, head
 from fusion_core.errors import FusionError, UnreadableFile
+from fusion_core.faults import Faults
 
 STANDARD_INPUT = Path("-")
 GZIP = b"\x1f\x8b"
@@ -53,6 +54,44 @@ def opened(path: Path) -> Iterator[Stream]:
                 yield unpacked  # type: ignore[misc]
         except (EOFError, zlib.error) as error:
             raise damaged(path, str(error)) from None
+
+
+@contextmanager
+def plain_file(path: Path) -> Iterator[Path]:
+    """Yield the path of a file's plain bytes: its own, or of a gzip archive that of a temporary file.
+
+    Raises
+    ------
+    UnreadableFile, Unwritable
+        If the archive is damaged or too large, or the file cannot be kept.
+    """
+    if path == STANDARD_INPUT or path.is_dir() or not head(path).startswith(GZIP):
+        yield path
+        return
+    with temporary_folder(path) as folder:
+        place = folder / (path.stem if path.suffix == ".gz" else path.name)
+        with opened(path) as packed, place.open("wb") as file:
+            while data := packed.read(COPIED):
+                keep(path, data, file, unpacked_at_most(path))
+        try:
+            yield place
+        except FusionError as error:
+            raise type(error)(str(error).replace(str(place), str(path))) from None
+
+
+Open = Callable[[Any, Path, Faults], AbstractContextManager[Table]]
+
+
+def unpacking(own: Open) -> Open:
+    """Decorate the `open` of a source, so that it reads gzip archives of its files too."""
+
+    @contextmanager
+    @wraps(own)
+    def open_(self: Any, path: Path, faults: Faults) -> Iterator[Table]:
+        with plain_file(path) as place, own(self, place, faults) as table:
+            yield table
+
+    return open_
 
 
 def damaged(path: Path, reason: str) -> UnreadableFile:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bags import FIELDS, unit
 from bags import write as write_bag
+from logger_files import xlsx
 from recordings_on_disk import KINDS, channels, columns, write
 from ulog_writer import sensor, write_ulog
 
@@ -25,6 +26,7 @@ from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.rosbag import Rosbag
 from fusion_plugins.sources.synthetic import Synthetic
 from fusion_plugins.sources.ulog import Ulog
+from fusion_plugins.sources.xlsx import Xlsx
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 
@@ -36,7 +38,7 @@ FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Ex
 OWN = {  # held to their laws below; a kind may be that of two families
     (BiasModel, "thermal_derivative"),
     *((Source, kind) for kind in ("binary_log", "csv", "dataflash", "hdf5", "mat", "parquet", "rosbag", "serial",
-                                  "synthetic", "ulog")),
+                                  "synthetic", "ulog", "xlsx")),
     *((Framing, kind) for kind in ("text", "binary", "kvh_1775")),
 }  # fmt: skip
 PLAIN = {(family, kind): laws(cls) for family in FAMILIES for kind, cls in kinds(family) if (family, kind) not in OWN}
@@ -86,6 +88,10 @@ def test_file_sources(tmp_path):
     packed = tmp_path / "r.csv.gz"
     packed.write_bytes(gzip.compress((tmp_path / "csv").read_bytes()))
     examples.append(Csv(path=packed, channels=channels()))
+    book = tmp_path / "r.xlsx"
+    table = columns(400)
+    book.write_bytes(xlsx({"Data": [list(table), *np.column_stack(list(table.values())).tolist()]}))
+    examples.append(Xlsx(path=book, channels=channels()))
     for source in examples:
         check_plugin(type(source), [source])
 

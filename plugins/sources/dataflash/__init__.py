@@ -24,6 +24,7 @@ from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.joining import mapped
+from fusion_plugins.sources.unpacked import unpacking
 
 SIGNATURE = b"\xa3\x95\x80"
 NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
@@ -43,6 +44,7 @@ class DataFlash(FileSource):
     compensated: Literal["undo", "refuse", "keep"] = "undo"
     """Of what the autopilot corrected: undo it, refuse a log with a learned polynomial, or keep all as logged."""
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""

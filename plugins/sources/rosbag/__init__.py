@@ -39,7 +39,7 @@ from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
 from fusion_plugins.sources.rosbag.storage import Batch, ChunkedFile, Connection, Integers, plain, zstd
-from fusion_plugins.sources.unpacked import damaged
+from fusion_plugins.sources.unpacked import damaged, unpacking
 
 Storage = ChunkedFile | sqlite.Sqlite
 ROWS = 65_536  # messages that are decoded before they are passed on
@@ -57,6 +57,7 @@ class Rosbag(FileSource):
     stamp: Literal["header", "log"] = "header"
     """Clock: the stamps in the messages' headers, or the times of recording."""
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""

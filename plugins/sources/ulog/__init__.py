@@ -25,6 +25,7 @@ from fusion_core.contracts.file_source import problem
 from fusion_core.errors import ConfigError, MissingChannel, quote
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.unpacked import unpacking
 
 if TYPE_CHECKING:
     from fusion_core.contracts.file_source import RecordingWriter
@@ -82,6 +83,7 @@ class Ulog(FileSource):
                     )
         return self
 
+    @unpacking
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises MissingChannel where it lacks a sensor that is asked for."""

@@ -8,6 +8,8 @@ from flying_units import DEG_H, fitted
 from typer.testing import CliRunner
 
 from driftlab.cli import app
+from driftlab.commands.export import exporter_of
+from fusion_core.errors import ConfigError
 
 DEVICE = "device_id=2490378"
 
@@ -80,3 +82,10 @@ def test_the_loss_of_px4s_stairs_is_what_its_parameters_give_step_by_step(unit, 
         error.append(taken - fitted().bias(np.array([T]))[0])
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(error), axis=0)) * DEG_H, lost["warm_up"]["rms"], atol=1e-3)
     np.testing.assert_allclose(np.max(np.abs(error), axis=0) * DEG_H, lost["warm_up"]["largest"], atol=1e-2)
+
+
+def test_a_kind_that_is_like_no_other_is_answered_with_all():
+    with pytest.raises(ConfigError, match=r"export nope: known: .*kalibr.*openvins"):
+        exporter_of("nope", {})
+    with pytest.raises(ConfigError, match="export openvin: did you mean openvins"):
+        exporter_of("openvin", {})

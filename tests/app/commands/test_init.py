@@ -1,6 +1,9 @@
 """A config that `driftlab init` writes reads its file, and what it could not guess is asked for."""
 
+import io
 import re
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,6 +20,8 @@ from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
 from driftlab.cli import app
+from driftlab.commands import init as init_command
+from driftlab.commands.allan import allan
 from driftlab.commands.init import init
 from driftlab.commands.simulate import simulate
 from driftlab.config import load_config
@@ -77,7 +82,8 @@ def test_every_guess_is_marked_and_nothing_else(tmp_path):
     assert "# by the name" in lines["gyro"]
     assert "# by the name" in lines["accel"]
     assert re.search(r"unit: ms\}   # guess: steps of 50 ms are 20 Hz", lines["time"])
-    assert all("# guess: " in lines[key] for key in ("noise", "bias"))
+    assert "# guess: " in lines["noise"]
+    assert re.search("# (guess|unknown): ", lines["bias"])
 
 
 @pytest.mark.parametrize(
@@ -110,7 +116,7 @@ def test_hdf5_takes_the_units_of_the_file(tmp_path):
         file["note"] = np.array([b"of the bench"])
     done = init(tmp_path / "log.h5", out=tmp_path / "log.yaml")
     assert done.asked == ()
-    assert done.text.count("# guess") == 4  # noise and walk of both
+    assert len(re.findall("# (?:guess|unknown)", done.text)) == 4  # noise and walk of both
     got = samples(done.path)
     np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-12)
     np.testing.assert_allclose(got["temperature"], UNIT.temperature)
@@ -222,15 +228,22 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
 
 def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
     with pytest.raises(
-        MissingChannel, match=r"no column is called like a gyro or an accelerometer; it has one, b, c; "
+        MissingChannel, match=r"no column is called like a gyro; it has one, b, c; name those of its axes, as in --col"
     ):
         written(tmp_path, {"one": [1.0, 2.0], "b": [1.0, 2.0], "c": ["x", "y"]})
 
 
-def test_nothing_is_replaced_and_wrong_units_are_refused(tmp_path):
-    done = written(tmp_path, table(LOGS["short"]))
-    with pytest.raises(ConfigError, match=r"rec\.yaml: is there already; name another file, or remove it"):
+def test_a_config_is_made_anew_until_somebody_changes_it_and_wrong_units_are_refused(tmp_path):
+    written(tmp_path, table(LOGS["short"]))
+    done = written(tmp_path, table(LOGS["short"]), units={"gyro": "deg/s"})
+    assert "unit: deg/s}" in done.text
+    assert done.path.read_text() == done.text
+    done.path.write_text(done.text.replace("60 s", "30 s"))
+    with pytest.raises(
+        ConfigError, match=r"rec\.yaml: was changed since `driftlab init` wrote it; move it away, or name"
+    ):
         written(tmp_path, table(LOGS["short"]))
+    done.path.write_text(done.text)
     refused = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "b.yaml", "--unit", "gyro=m")
     assert "channel gyro: unit 'm' cannot be converted to rad/s" in str(refused.exception)
     refused = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "b.yaml", "--unit", "gyro")
@@ -249,3 +262,99 @@ def test_a_bag_of_several_topics_is_about_the_first_inertial_unit(tmp_path):
     assert config.source.channels["time"].paths == (FIELDS["time"]["path"],)
     assert [p.partition(".")[0] for p in config.source.channels["gyro"].paths] == [FIELDS["time"]["path"]] * 3
     assert config.source.channels["temperature"].paths == (FIELDS["temperature"]["path"],)
+
+
+def test_columns_interval_and_decimal_sign_can_be_said(tmp_path):
+    content = table(("Elapsed", "w?", "a?", "case"), "deg/s", "g")
+    got = samples(
+        written(tmp_path, content, columns={"time": "elap", "gyro": "wz,wx,wy"}, units={"gyro": "deg/s"}).path
+    )
+    np.testing.assert_allclose(got["gyro"], UNIT.gyro[:, [2, 0, 1]], rtol=1e-9)
+    config = load_config(
+        written(tmp_path, content, interval="50 ms", units={"time": "s"}, columns={"temperature": "case"}).path
+    )
+    assert config.source.interval == 0.05
+    assert "time" not in config.source.channels
+    for columns, message in (
+        ({"gyro": "w"}, "3 columns begin so"),
+        ({"gyro": "rate"}, "no column of numbers is called so"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            written(tmp_path, content, columns=columns)
+    (tmp_path / "rec.csv").write_text("t;gx;temp\n" + "".join(f"{k};{k}00;2{k % 7}\n" for k in range(400)))
+    text = init(tmp_path / "rec.csv", decimal="comma", units={"gyro": "0.001 deg/s"}).text
+    assert 'decimal: ","' in text
+    with pytest.raises(ConfigError, match="--decimal dot: is no decimal sign; write comma or point"):
+        init(tmp_path / "rec.csv", decimal="dot")
+
+
+MOVING = {f"g{a}": np.deg2rad(5) * np.sin(np.arange(len(UNIT.t)) / 40 + k) for k, a in enumerate("xyz")}
+
+
+@pytest.mark.parametrize(("change", "problem"), [
+    ({"temp": None}, "no column is known as a temperature, and a map is fitted over one"),
+    ({"temp": np.full(len(UNIT.t), 21.5)}, "temperature does not change: it shows 21.5 in every row"),
+    ({"gx": np.where(np.arange(len(UNIT.t)) % 3, UNIT.gyro[:, 0], np.nan)}, "gyro: 33% of the first 8,000 rows"),
+    (MOVING, "the gyro is never at rest: its means over 1 s vary by"),
+])  # fmt: skip
+def test_it_looks_into_the_data_before_it_vouches(tmp_path, change, problem):
+    content = {name: values for name, values in (table(LOGS["short"]) | change).items() if values is not None}
+    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
+    done = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "rec.yaml", "--unit", "gyro=rad/s")
+    assert done.exit_code == 1
+    assert f"problem: {problem}" in done.output
+    assert "then: driftlab fit-map" not in done.output
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (b"ULog\x01\x12\x35" + np.random.default_rng(6).bytes(4000), "ends before its first row"),
+    (b"t,gx,gy,gz,temp\n", "has the columns t, gx, gy, gz, temp and no rows of numbers"),
+    (b"t,gx,gy,gz,temp\n" + b"1,nan,nan,nan,nan\n" * 300, "no column is called like a gyro"),
+])  # fmt: skip
+def test_what_is_no_recording_writes_nothing(tmp_path, content, message):
+    (tmp_path / "rec.csv").write_bytes(content)
+    done = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "rec.yaml")
+    assert done.exit_code == 1
+    assert re.search(message, str(done.exception))
+    assert not (tmp_path / "rec.yaml").exists()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    content = table(("when", "?", "q?", "case"), "deg/s", "g")
+    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setattr(sys, "stdin", Terminal("2,3,4\n\n50 ms\n1\n"))
+    arguments = init_command.arguments_of({"file": tmp_path / "rec.csv"}, {"json": False})
+    asked = screen.getvalue()
+    assert "the columns of the gyro's axes" in asked
+    assert "2) x" in asked
+    assert arguments["columns"] == {"gyro": "x,y,z"}
+    assert arguments["interval"] == "50 ms"
+    assert arguments["units"]["gyro"] in ("deg/s", "rad/s")
+    assert arguments["out"] == Path("rec.yaml")
+
+
+def test_go_fits_the_map_at_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pl.DataFrame(table(LOGS["spoken"], "deg/s", "g", "ms")).write_csv(tmp_path / "rec.csv")
+    done = driftlab("init", "rec.csv", "--go")
+    assert done.exit_code == 0, done.output
+    assert f"the page: {tmp_path / 'rec.map.report.html'}" in done.output
+    assert (tmp_path / "rec.map.json").is_file()
+
+
+def test_allan_measures_the_noise_that_a_config_lacks(tmp_path):
+    content = {name: values for name, values in table(LOGS["short"]).items() if name != "temp"}
+    done = written(tmp_path, content, units={"gyro": "rad/s"})
+    bare = re.sub(r"    noise: .*\n|, walk: [^}]*", "", done.text)
+    assert "noise:" not in bare
+    (tmp_path / "bare.yaml").write_text(bare)
+    assert driftlab("allan", tmp_path / "bare.yaml").exit_code == 0
+    assert allan(tmp_path / "bare.yaml").config_lines == allan(done.path).config_lines

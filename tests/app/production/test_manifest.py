@@ -64,6 +64,10 @@ def test_what_spreadsheets_write_is_read(manifest, text):
     assert (unit.lot, unit.date, unit.more) == ("", "", {})
 
 
+def test_a_manifest_may_be_called_tsv(manifest):
+    assert manifest("unit\trole\tpath\na\tcalibration\ta.h5\n", "units.tsv").units[0].name == "a"
+
+
 def test_the_same_recording_may_calibrate_and_train(manifest):
     (unit,) = manifest("unit,role,path\n1,calibration,a.h5\n1,train,a.h5\n").units
     assert unit.recordings == {"calibration": ("a.h5",), "train": ("a.h5",)}

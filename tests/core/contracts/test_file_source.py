@@ -318,10 +318,18 @@ def test_what_is_advised_is_the_source_that_is_installed(monkeypatch, tmp_path):
             read(kind(path=path, channels=TIME))
 
 
-def test_hdf5_does_not_unpack(tmp_path):
-    path = text(tmp_path, gzip.compress(b"t,g\n0,1\n"))
-    with pytest.raises(UnreadableFile, match=r"is a gzip archive, .*; use kind: csv for text, or unpack it first"):
-        read(Hdf5(path=path, channels=channels()))
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not Csv])
+def test_every_kind_reads_a_gzip_archive_and_names_it(tmp_path, kind):
+    plain = write(kind, tmp_path / "plain", columns())
+    packed = text(tmp_path, gzip.compress(plain.read_bytes()), "packed.gz")
+    expected = read(kind(path=plain, channels=channels()))
+    np.testing.assert_array_equal(read(kind(path=packed, channels=channels()))["gyro"], expected["gyro"])
+    packed = text(tmp_path, gzip.compress(b"t,g\n0,1\n"), "packed.gz")
+    with pytest.raises(UnreadableFile, match=f"^{packed}: is a text file, a file of kind .*; use kind: csv"):
+        read(kind(path=packed, channels=channels()))
+    whole = gzip.compress(plain.read_bytes())
+    with pytest.raises(UnreadableFile, match=r"packed\.gz: is cut short or damaged"):
+        read(kind(path=text(tmp_path, whole[: len(whole) // 2], "packed.gz"), channels=channels()))
 
 
 def test_each_kind_names_the_other(tmp_path):

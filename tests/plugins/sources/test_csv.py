@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from recordings_on_disk import read, simple, text
 
 from fusion_core.chunk import concatenate
@@ -88,8 +89,9 @@ def test_text_of_another_encoding_in_other_columns(tmp_path):
         channels={"time": {"path": "t", "unit": "s"}, "temperature": {"path": "T (°C)", "unit": "degC"}},
     )
     assert read(named)["temperature"] == [5]
+    assert read(simple(text(tmp_path, "t,g\r\n0,1\r\n1,2".encode("utf-16"))))["gyro"].tolist() == [[1], [2]]
     with pytest.raises(UnreadableFile, match="is not UTF-8 text; save it as UTF-8"):
-        read(simple(text(tmp_path, GOOD.encode("utf-16"))))
+        read(simple(text(tmp_path, "t,g\n0,1\n".encode("utf-16-le"))))  # without a mark
 
 
 def test_empty_cells_are_dropped_and_reported_later(tmp_path):
@@ -368,3 +370,47 @@ def test_a_header_without_end(tmp_path):
         read(simple(text(tmp_path, "t,g," + "x," * 600_000 + "\n0,1\n")))
     with pytest.raises(UnreadableFile, match="has 20,003 columns, at most 10,000 are read; check the separator"):
         read(simple(text(tmp_path, "t,g," + "x," * 20_000 + "\n0,1\n")))
+
+
+LOGGED = (
+    'Soak of unit 7\n\nDatum;Zeit;g;T\n;;deg/s;°C\n05.03.2026;14:22:01,5;0,25;"20,5"\n05.03.2026;14:22:02;-1,5;21\n'
+)
+FORMS = {"separator": ";", "decimal": ",", "header": 3, "first_row": 5}
+
+
+def logged(path, **more):
+    settings = FORMS | {"dates": {"Datum + Zeit": "%d.%m.%Y %H:%M:%S"}} | more
+    names = {"time": {"path": "Datum + Zeit"}, "gyro": {"path": "g"}, "temperature": {"path": "T"}}
+    return Csv(path=path, channels=names, **settings)
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_a_text_is_read_as_a_logger_writes_it(tmp_path, quote):
+    """Quotes are read line by line, all else in blocks: a preamble, units, decimal commas and two columns of a date."""
+    path = text(tmp_path, LOGGED.replace('"', quote))
+    got = read(logged(path))
+    np.testing.assert_allclose(got.t - 1772720521, [0.5, 1.0], atol=1e-6)
+    np.testing.assert_allclose(got["gyro"][:, 0], np.deg2rad([0.25, -1.5]))
+    assert got["temperature"].tolist() == [20.5, 21.0]
+    found = Csv.settings_for(path, {})
+    assert found == FORMS | {"dates": {"Datum + Zeit": "%d.%m.%Y %H:%M:%S"}}
+
+
+@pytest.mark.parametrize(("content", "more", "message"), [
+    (LOGGED.replace("14:22:02", "noon"), {}, r"line 6, column 'Datum \+ Zeit': '05.03.2026 noon' is not a date as '%d"),
+    (LOGGED.replace("-1,5", "1.234,5"), {}, "line 6, column 'g': '1.234,5' is not a number"),
+    (LOGGED, {"header": 30}, "has fewer than 30 lines; correct source.header"),
+])  # fmt: skip
+def test_what_is_written_otherwise_is_refused_where_it_stands(tmp_path, content, more, message):
+    with pytest.raises((BadValue, EmptyRecording), match=message):
+        read(logged(text(tmp_path, content), **more))
+    with pytest.raises(ValidationError, match="the separator and the decimal sign are both ','; correct one of them"):
+        simple(tmp_path / "r.csv", decimal=",")
+
+
+def test_columns_of_blanks_and_columns_without_names(tmp_path):
+    channels = {"time": {"path": "1", "unit": "s"}, "gyro": {"path": ["2", "3"], "unit": "rad/s"}}
+    got = read(Csv(path=text(tmp_path, "  0   1\t2 \n  1  -1e-3  4"), channels=channels, separator=" ", header=0))
+    assert got["gyro"].tolist() == [[1, 2], [-1e-3, 4]]
+    got = read(Csv(path=text(tmp_path, "0,1,2,\n1,5,4,\n"), channels=channels, header=0))
+    assert got["gyro"].tolist() == [[1, 2], [5, 4]]
