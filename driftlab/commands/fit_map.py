@@ -216,6 +216,8 @@ def fit_map(
     _check_family(known, lot, bool(kind or neurons or compare or report or certificate))
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
+    if certificate and place is None:
+        raise ConfigError("--certificate: is a file beside the map; give --out, the map's file")
     for option, value in (("--kind", kind), ("--select", neurons)):
         if compare and value is not None:
             raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
@@ -316,15 +318,17 @@ def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
         raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     if family is not None and more:
         raise ConfigError(
-            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare, --report "
-            "and --certificate out"
+            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare, "
+            "--report and --certificate out"
         )
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """Say which sizes are tried, and where the map is written: where the config says, or beside the config."""
     config, kind, compare = arguments["config"], arguments.get("kind"), arguments["compare"]
-    more = any((kind, arguments.get("report"), compare, options["select"], options["enforce_limits"], arguments["certificate"]))
+    more = any(
+        (kind, arguments.get("report"), compare, options["select"], options["enforce_limits"], arguments["certificate"])
+    )
     out = arguments.get("out")
     _check_family(arguments.get("family"), arguments.get("lot"), more)
     if arguments.get("family") is None:

@@ -28,8 +28,9 @@ from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Unit
 from driftlab.commands.result import Result
 from driftlab.config import Config
 from driftlab.evaluation.limits import Measured, check_limits, verdict
+from driftlab.evaluation.measurements import normal
 from driftlab.evaluation.overview import OverviewAccumulator, averages_of, map_of, run_measurements
-from driftlab.evaluation.summary import remarks, summarise
+from driftlab.evaluation.summary import is_trusted, remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.recordings.identity import beforehand
@@ -136,11 +137,18 @@ class RunResult(Result):
                 (folder / f"certificate.{suffix}").write_text(text, encoding="utf-8")
 
     def _certificate(self, sheet: Sheet) -> Certificate:
-        overview, T = self.overview, self.overview.curves.get("temperature_raw")
+        overview, T, fitted = self.overview, self.overview.curves.get("temperature_raw"), map_of(self.config)
+        bias = Measured(overview.bias, self.model.tracked.axes, otherwise="the filter's deviations are not confirmed")
+        if is_trusted(overview.nis):
+            bias = normal(bias, overview.sigma, np.nan)
+        fitted_on = "" if fitted is None else fitted.record.provenance.get("recordings", "")
+        names = [Path(str(one["name"])).name for one in sheet.recordings]
+        seen = [f"the map was fitted on {name} too, so its prediction is of what it has seen" for name in names]
         return Certificate(
-            "run", self.config, sheet, self.judged, self.measured, map_of(self.config),
+            "run", self.config, sheet, self.judged, {"bias": bias, **self.measured}, fitted,
             seconds=(overview.end - overview.start) * (1 - overview.yardsticks.moved),
             domain=None if T is None else (float(np.min(T)), float(np.max(T))),
+            remarks=[text for name, text in zip(names, seen, strict=True) if name.partition("::")[0] in fitted_on],
         )  # fmt: skip
 
 
@@ -204,6 +212,8 @@ def run(
     """
     understood, journal = config_with(config, data, units).tracking(channel), RunLog()
     if out is None:
+        if certificate:
+            raise ConfigError("--certificate: is a file of the results; give --out, a folder")
         if smooth:
             raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
         running = Run(understood, journal)
@@ -286,5 +296,5 @@ def show(result: RunResult, given: Mapping[str, Any]) -> None:
     name = config.file.stem if config.file else config.name
     terminal().print(yardstick_table({name: result.overview.yardsticks}, config.recording, sensor))
     say_lines(result.lines(), "note: ")
-    names = ["estimates.h5", "summary.json", "report.html", *["certificate.html, certificate.json"] * given["certificate"]]
-    say(f"written to {given['out']}/: {', '.join(names)}\n")
+    signed = ", certificate.html, certificate.json" * given["certificate"]
+    say(f"written to {given['out']}/: estimates.h5, summary.json, report.html{signed}\n")

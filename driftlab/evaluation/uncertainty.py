@@ -5,8 +5,8 @@ the level that it had in the mean over the soak. It is read off the fitted map; 
 
     u(T)^2 = sum_i u_i(T)^2,    U(T) = k u(T),    k = 2,    about 95 % of a normal law
 
-- *curve* (A): white noise and walk of the soak in the curve, what smoothing takes of it, misfits and holes: the modes of
-  the map (`fusion_core.thermal.curve_error`), which know no level;
+- *curve* (A): white noise and walk of the soak in the curve, what smoothing takes of it, misfits and holes: the modes
+  of the map (`fusion_core.thermal.curve_error`), which know no level;
 - *mean* (A): noise of the level, s / sqrt(n) of n samples with the deviation s about the curve;
 - *memory* (A): half of the difference D between warming and cooling, as probable as a memory is: sqrt(p E[D^2]) / 2,
   where D is largest;

@@ -22,7 +22,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import CertificateTexts, Config
 from driftlab.evaluation.limits import RULE, LimitResult, Measured, outcome, verdict
-from driftlab.evaluation.uncertainty import K, BiasBudget, bias_budget, expanded
+from driftlab.evaluation.uncertainty import BiasBudget, K, bias_budget, expanded
 from driftlab.maps.fit import axes_of
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
@@ -54,6 +54,7 @@ NAMES = {
     "noise": "white noise",
     "bias_instability": "bias instability, after the map",
     "coast": "prediction over 10 min, rms of its error",
+    "bias": "bias at the end, by the filter",
 }
 TEXTS = {  # of the laboratory, as the sheet calls them
     "laboratory": "laboratory, address",
@@ -112,7 +113,7 @@ class Certificate:
     seconds : float
         How long the unit was measured at rest.
     domain : (float, float), optional
-        Lowest and highest temperature, degC; those of the map where they are left out.
+        Lowest and highest temperature of the recordings, degC; those of the map where they are left out.
     name : str
         The unit's name in a fleet.
     remarks : sequence of str
@@ -169,7 +170,7 @@ class Certificate:
         The date of issue is no part of it, so the same results have the same one.
         """
         issued = {"issued": datetime.now(UTC).date().isoformat()}
-        own = self.texts.model_dump(mode="json")
+        own, domain = self.texts.model_dump(mode="json"), None if self.fitted is None else self.fitted.domain
         if own["number"] and self.name:
             own["number"] = f"{own['number']}/{self.name}"
         content = plain({
@@ -179,7 +180,8 @@ class Certificate:
             "laboratory": {name: own[name] for name in (*TEXTS, "number", "performed", "operator", "authorised_by")},
             "item": {"serial": self.sheet.serial or self.name or None, "unit": self.name or None, **self._sensor()},
             "method": self._method(),
-            "temperature_degC": self._domain,
+            "temperature_degC": self.domain or domain,
+            "valid_degC": domain or self.domain,
             "coverage_factor": K,
             "bias": self._bias(),
             "figures": [self._figure(name, one) for name, one in self.measured.items()],
@@ -207,10 +209,6 @@ class Certificate:
             listed=MAX_RECORDINGS,
         )
 
-    @property
-    def _domain(self) -> tuple[float, float] | None:
-        return self.domain or (None if self.fitted is None else self.fitted.domain)
-
     def _sensor(self) -> dict[str, Any]:
         channel = self.fitted.record.channel if self.fitted is not None else ""
         if not channel and self.config.filter is not None:
@@ -230,6 +228,7 @@ class Certificate:
             "config": sheet.config or None,
             "config_sha256": sheet.config_sha256,
             "map": {**sheet.maps[0], "name": Path(sheet.maps[0]["file"]).name} if sheet.maps and self.fitted else None,
+            "kind": None if self.fitted is None else self.fitted.record.kind,
             "samples": None if self.fitted is None else self.fitted.record.samples,
             "reference": self._reference(),
             "plugins": sheet.plugins,

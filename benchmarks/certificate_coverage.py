@@ -4,7 +4,7 @@ Soaks are drawn with NumPy alone (`limits.soak`), with a thermometer that is off
 the curve that was drawn, and the level that curve and wandering had in the mean over the soak. Nothing is shared with
 the budget: 95 % of the truths must lie within U, whichever source is the largest.
 
-    python benchmarks/certificate.py [--soaks 60] [--seed 1]
+    python benchmarks/certificate_coverage.py [--soaks 60] [--seed 1]
 """
 
 from __future__ import annotations
