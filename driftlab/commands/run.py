@@ -212,10 +212,7 @@ def run(
     """
     understood, journal = config_with(config, data, units).tracking(channel), RunLog()
     if out is None:
-        if certificate:
-            raise ConfigError("--certificate: is a file of the results; give --out, a folder")
-        if smooth:
-            raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
+        _check_in_memory(smooth, certificate)
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
         gathered = accumulator(understood, running.model, journal).read(columns)
@@ -238,6 +235,14 @@ def run(
         if hashed is not None:
             hashed()
         return finish(estimates, running.model, Path(out), certificate=certificate)
+
+
+def _check_in_memory(smooth: bool, certificate: bool) -> None:
+    """Raise ConfigError where something is asked for that only files can hold."""
+    if certificate:
+        raise ConfigError("--certificate: is a file of the results; give --out, a folder")
+    if smooth:
+        raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
 
 
 def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Generator[RunSegment]:

@@ -310,7 +310,7 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
 def run_measurements(
     config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
 ) -> dict[str, Measured]:
-    """Return what a run measures of the quantities that a config may limit.
+    """Return the measurements by a run of the quantities that a config may limit.
 
     The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
     survey has filled; residual, swing and hysteresis are of the map.

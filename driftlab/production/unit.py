@@ -292,7 +292,8 @@ def certificate_of(record: UnitRecord, folder: Path, config: Config, sheet: Shee
         plugins=record.plugins,
         maps=[{**map_facts(fitted, unit), "file": record.map_file, "sha256": known}],
     )
-    measured = {name: _measured(record, name) for name in ("noise", "coast")} | of_map(fitted, unit)
+    beside = {"noise", "coast"} - {row.name for row in judged}  # a limit is held against a measurement of its own
+    measured = {name: _measured(record, name) for name in sorted(beside)} | of_map(fitted, unit)
     in_sample = "the prediction is of the soak that the map was fitted on"
     return Certificate(
         "fleet", config, own, judged, measured, fitted, seconds=3600 * record.hours, name=record.unit,

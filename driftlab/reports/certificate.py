@@ -83,6 +83,11 @@ def stated(value: float, uncertainty: float) -> tuple[str, str]:
     return first, second
 
 
+def two_digits(uncertainty: float) -> str:
+    """Return an uncertainty with two significant digits, or 0."""
+    return stated(0.0, uncertainty)[1] if uncertainty > 0 else "0"
+
+
 def trade_unit(si: str, largest: float, unit: BiasUnit) -> BiasUnit:
     """Return the unit that the trade has for biases up to the largest, in an SI unit: deg/h or deg/s, mg or m/s^2."""
     if si not in USUAL:
@@ -236,7 +241,7 @@ class Certificate:
         }
 
     def _reference(self) -> str:
-        """Return what was known of the input of the sensor, and taken off."""
+        """Return the known input of the sensor, which was taken off."""
         if self.unit.si == "m/s^2":
             return "gravity of the latitude" if self.config.latitude is not None else "gravity of 9.80665 m/s²"
         if self.unit.si != "rad/s":
@@ -247,7 +252,7 @@ class Certificate:
 
     @property
     def _vertical(self) -> bool:
-        """Whether the vertical part of the Earth rate is known: latitude, and accelerometers that show the vertical."""
+        """True if the vertical part of the Earth rate is known: latitude, and accelerometers that show the vertical."""
         sensors = () if self.config.filter is None else self.config.filter.sensors
         return self.config.latitude is not None and any(sensor.unit == "m/s^2" for sensor in sensors)
 
@@ -267,12 +272,12 @@ class Certificate:
         at = worst, np.arange(len(worst))
         entries = [
             {"source": one.name, "of": SOURCES[one.name], "type": one.kind, "u": one.u[at],
-             "shown": [f"{value * factor:.2g}" for value in one.u[at]]}
+             "shown": [two_digits(value * factor) for value in one.u[at]]}
             for one in budget.sources
         ]  # fmt: skip
-        total = {"u": budget.u[at], "U": U[at], "shown_u": [f"{value * factor:.2g}" for value in budget.u[at]]}
-        shown = [stated(0.0, value * factor)[1] for value in U[at]]
-        return {"rows": rows, "budget": {"at_degC": budget.T[worst], "sources": entries, **total, "shown_U": shown}}
+        shown = {f"shown_{name}": [two_digits(v * factor) for v in x[at]] for name, x in (("u", budget.u), ("U", U))}
+        total = {"u": budget.u[at], "U": U[at], **shown}
+        return {"rows": rows, "budget": {"at_degC": budget.T[worst], "sources": entries, **total}}
 
     def _shown(self, values: Array, U: Array | None, k: int, factor: float | None = None) -> list[str]:
         """Return values (d,), each with its uncertainty, as the sheet has them."""
@@ -289,7 +294,9 @@ class Certificate:
         if why:
             shown = [f"not measured: {why}"]
         elif measured.high is not None and not np.any(values):
-            shown = [f"≤ {high * unit.factor:.2g}" if np.isfinite(high) else "not known" for high in measured.high]
+            shown = [
+                f"≤ {two_digits(high * unit.factor)}" if np.isfinite(high) else "not known" for high in measured.high
+            ]
         else:
             shown = self._shown(values, None if U is None else U[None], 0, unit.factor)
         return {
@@ -299,7 +306,7 @@ class Certificate:
         }  # fmt: skip
 
     def _missing(self) -> Iterator[str]:
-        """Yield what the uncertainties do not cover, in sentences."""
+        """Yield the sources that the uncertainties do not cover, in words."""
         yield from () if self.budget is None else self.budget.missing
         if self.unit.si == "rad/s" and not (self._vertical and self.config.heading is not None):
             part = math.cos(self.config.latitude or 0.0) if self._vertical else 1.0
