@@ -321,4 +321,4 @@ class Certificate:
         yield "other conditions than those of the recording: motion, vibration, supply, ageing"
 
     def _size(self, value: float) -> str:
-        return f"{value * self.unit.factor:.2g} {self.unit.shown}"
+        return f"{two_digits(value * self.unit.factor)} {self.unit.shown}"

@@ -144,7 +144,7 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
                     run_in(tmp_path, *command)
 
 
-TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits"}
+TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits", "certificate"}
 
 
 @pytest.fixture(scope="module")
