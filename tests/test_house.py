@@ -251,7 +251,7 @@ BUDGET = {
     "driftlab/production": 2281,
     "driftlab/products": 6,
     "driftlab/recordings": 452,
-    "driftlab/reports": 2778,
+    "driftlab/reports": 2780,
     "driftlab/soak": 658,
     "driftlab/spc": 596,
     "driftlab/starter": 569,

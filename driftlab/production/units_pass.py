@@ -200,7 +200,7 @@ class UnitJobs:
         """Make the certificates of units that are done, where they are wanted; return why there is none of a unit."""
         if not self.options.certificate:
             return []
-        sheet = sheet_of(config.model_copy(update={"certificate": None, "source": None}), [])
+        sheet = sheet_of(config.model_copy(update={"source": None, "filter": None}), [])  # units say the rest
         sheet, failed = replace(sheet, config_sha256=hashlib.sha256(self.config.encode()).hexdigest()), []
         stage = Stage("certificates", total=len(records))
         for record in records:

@@ -96,6 +96,12 @@ def trade_unit(si: str, largest: float, unit: BiasUnit) -> BiasUnit:
     return BiasUnit(si, large if largest >= limit else USUAL[si])
 
 
+def shown(values: Array, widths: Array, unit: BiasUnit) -> list[str]:
+    """Return values (d,), each with its expanded uncertainty (d,), as the sheet has them; NaN: it is not known."""
+    pairs = (stated(float(v) * unit.factor, float(w) * unit.factor) for v, w in zip(values, widths, strict=True))
+    return [f"{value} ± {width}" if width != "not known" else f"{value}, U not known" for value, width in pairs]
+
+
 @dataclass(frozen=True, eq=False)
 class Certificate:
     """A certificate of one unit.
@@ -159,14 +165,15 @@ class Certificate:
         return bias_budget(self.fitted, thermometer=thermometer, soak=self.soak, placements=self.placements)
 
     @cached_property
-    def unit(self) -> BiasUnit:
-        """The trade's unit for biases of this size."""
+    def si(self) -> str:
+        """SI unit of the bias."""
+        return tracked_unit(self.config.filter).si if self.fitted is None else self.fitted.record.unit
+
+    def unit(self, *values: Array | float) -> BiasUnit:
+        """Return the trade's unit for biases of such a size, SI."""
         own = tracked_unit(self.config.filter)
-        if self.fitted is not None and self.fitted.record.unit != own.si:
-            own = default_unit(self.fitted.record.unit)
-        values = [one.values for one in self.measured.values()] if self.budget is None else [self.budget.bias]
-        largest = max((float(np.max(np.abs(v), initial=0.0, where=np.isfinite(v))) for v in values), default=0.0)
-        return trade_unit(own.si, largest, own)
+        sizes = [np.max(np.abs(v), initial=0.0, where=np.isfinite(v)) for v in values]
+        return trade_unit(self.si, float(max(sizes)), own if own.si == self.si else default_unit(self.si))
 
     @cached_property
     def content(self) -> dict[str, Any]:
@@ -190,7 +197,7 @@ class Certificate:
             "coverage_factor": K,
             "bias": self._bias(),
             "figures": [self._figure(name, one) for name, one in self.measured.items()],
-            "limits": [row.as_json(self.unit) for row in self.judged],
+            "limits": [row.as_json(self.unit(row.limit)) for row in self.judged],
             "verdict": verdict(self.judged) or None,
             "rule": RULE if self.judged else None,
             "not_covered": list(self._missing()),
@@ -209,7 +216,7 @@ class Certificate:
             "certificate",
             content=self.content,
             texts=TEXTS,
-            limits=[row.cells(self.unit) for row in self.judged],
+            limits=[row.cells(self.unit(row.limit)) for row in self.judged],
             outcome=outcome(verdict(self.judged)),
             listed=MAX_RECORDINGS,
         )
@@ -218,10 +225,11 @@ class Certificate:
         channel = self.fitted.record.channel if self.fitted is not None else ""
         if not channel and self.config.filter is not None:
             channel = self.config.filter.tracked.channel
-        return {"channel": channel, "axes": self.axes, "si": self.unit.si, "shown": self.unit.shown}
+        return {"channel": channel, "axes": self.axes, "si": self.si}
 
     def _method(self) -> dict[str, Any]:
-        sheet, recordings = self.sheet, self.sheet.recordings
+        sheet, recordings, fitted = self.sheet, self.sheet.recordings, self.fitted
+        own = (one for one in sheet.maps if fitted is not None and one["channel"] == fitted.record.channel)
         lines = "".join(f"{one.get('sha256', '')}  {one['name']}\n" for one in recordings)
         dated = sheet.date if sheet.dated != "page" else None
         return {
@@ -232,9 +240,9 @@ class Certificate:
             "recordings_sha256": hashlib.sha256(lines.encode()).hexdigest(),
             "config": sheet.config or None,
             "config_sha256": sheet.config_sha256,
-            "map": {**sheet.maps[0], "name": Path(sheet.maps[0]["file"]).name} if sheet.maps and self.fitted else None,
-            "kind": None if self.fitted is None else self.fitted.record.kind,
-            "samples": None if self.fitted is None else self.fitted.record.samples,
+            "map": next(({**one, "name": Path(one["file"]).name} for one in own), None),
+            "kind": None if fitted is None else fitted.record.kind,
+            "samples": None if fitted is None else fitted.record.samples,
             "reference": self._reference(),
             "plugins": sheet.plugins,
             "versions": sheet.versions,
@@ -242,9 +250,9 @@ class Certificate:
 
     def _reference(self) -> str:
         """Return the known input of the sensor, which was taken off."""
-        if self.unit.si == "m/s^2":
+        if self.si == "m/s^2":
             return "gravity of the latitude" if self.config.latitude is not None else "gravity of 9.80665 m/s²"
-        if self.unit.si != "rad/s":
+        if self.si != "rad/s":
             return "its known input"
         parts = {"vertical": self._vertical, "horizontal": self._vertical and self.config.heading is not None}
         known = " and ".join(name for name, there in parts.items() if there)
@@ -261,13 +269,15 @@ class Certificate:
         budget = self.budget
         if budget is None:
             return None
-        U, factor = budget.U, self.unit.factor
+        U, unit = budget.U, self.unit(budget.bias)
+        widths, factor = np.full_like(budget.bias, np.nan) if U is None else U, unit.factor
         rows = [
-            {"temperature_degC": T, "value": bias, "U": None if U is None else U[k], "shown": self._shown(bias, U, k)}
-            for k, (T, bias) in enumerate(zip(budget.T, budget.bias, strict=True))
+            {"temperature_degC": T, "value": bias, "U": None if U is None else width, "shown": shown(bias, width, unit)}
+            for T, bias, width in zip(budget.T, budget.bias, widths, strict=True)
         ]
+        table = {"shown_unit": unit.shown, "rows": rows}
         if U is None or budget.u is None:
-            return {"rows": rows, "budget": None}
+            return {**table, "budget": None}
         worst = np.argmax(U, axis=0)
         at = worst, np.arange(len(worst))
         entries = [
@@ -275,44 +285,38 @@ class Certificate:
              "shown": [two_digits(value * factor) for value in one.u[at]]}
             for one in budget.sources
         ]  # fmt: skip
-        shown = {f"shown_{name}": [two_digits(v * factor) for v in x[at]] for name, x in (("u", budget.u), ("U", U))}
-        total = {"u": budget.u[at], "U": U[at], **shown}
-        return {"rows": rows, "budget": {"at_degC": budget.T[worst], "sources": entries, **total}}
-
-    def _shown(self, values: Array, U: Array | None, k: int, factor: float | None = None) -> list[str]:
-        """Return values (d,), each with its uncertainty, as the sheet has them."""
-        scale = self.unit.factor if factor is None else factor
-        widths = np.full(len(values), np.nan) if U is None else U[k]
-        pairs = (stated(float(v) * scale, float(w) * scale) for v, w in zip(values, widths, strict=True))
-        return [f"{value} ± {width}" if width != "not known" else f"{value}, U not known" for value, width in pairs]
+        texts = {f"shown_{name}": [two_digits(v * factor) for v in x[at]] for name, x in (("u", budget.u), ("U", U))}
+        total = {"u": budget.u[at], "U": U[at], **texts}
+        return {**table, "budget": {"at_degC": budget.T[worst], "sources": entries, **total}}
 
     def _figure(self, name: str, measured: Measured) -> dict[str, Any]:
         """Return a measured quantity, or why there is none."""
-        unit = BiasUnit(f"{self.unit.si}/sqrt(Hz)", f"{self.unit.shown}/sqrt(Hz)") if name == "noise" else self.unit
-        U, values = expanded(measured), np.asarray(measured.values, dtype=np.float64)
+        values, nothing = np.asarray(measured.values, dtype=np.float64), np.full(len(measured.axes), np.nan)
         why = measured.missing or (measured.otherwise if not np.all(np.isfinite(values)) else "")
-        if why:
-            shown = [f"not measured: {why}"]
-        elif measured.high is not None and not np.any(values):
-            shown = [
-                f"≤ {two_digits(high * unit.factor)}" if np.isfinite(high) else "not known" for high in measured.high
-            ]
-        else:
-            shown = self._shown(values, None if U is None else U[None], 0, unit.factor)
+        widths = expanded(measured)
+        hidden = (values == 0) & (measured.high is not None)  # what does not show has an upper limit
+        highs = np.where(hidden, nothing if measured.high is None else measured.high, np.nan)
+        widths = nothing if widths is None or why else np.where(hidden, np.nan, widths)
+        unit = self.unit(values, highs)
+        texts = [f"not measured: {why}"] if why else shown(values, widths, unit)
+        if not why:
+            bounds = [f"≤ {two_digits(v * unit.factor)}" if np.isfinite(v) else "not known" for v in highs]
+            texts = [bound if below else text for below, bound, text in zip(hidden, bounds, texts, strict=True)]
+        per = "/sqrt(Hz)" if name == "noise" else ""
         return {
-            "name": name, "of": NAMES.get(name, name.replace("_", " ")), "unit": unit.si, "shown_unit": unit.shown,
-            "value": values, "U": None if why else U, "stands_on": measured.stands_on, "missing": why or None,
-            "shown": shown,
+            "name": name, "of": NAMES.get(name, name.replace("_", " ")), "unit": self.si + per,
+            "shown_unit": unit.shown + per, "value": values, "U": widths, "at_most": highs,
+            "stands_on": measured.stands_on, "missing": why or None, "shown": texts,
         }  # fmt: skip
 
     def _missing(self) -> Iterator[str]:
         """Yield the sources that the uncertainties do not cover, in words."""
         yield from () if self.budget is None else self.budget.missing
-        if self.unit.si == "rad/s" and not (self._vertical and self.config.heading is not None):
+        if self.si == "rad/s" and not (self._vertical and self.config.heading is not None):
             part = math.cos(self.config.latitude or 0.0) if self._vertical else 1.0
             which = "horizontal part of the " if self._vertical else ""
             yield f"the {which}Earth rate, which is in the bias: up to {self._size(EARTH * part)} an axis"
-        if self.unit.si == "m/s^2" and self.fitted is not None and self.placements is None:
+        if self.si == "m/s^2" and self.fitted is not None and self.placements is None:
             yield "the level: the map's file does not keep what the placements say of it"
         sensor = None if self.config.filter is None else self.config.filter.tracked
         walk = None if sensor is None else getattr(sensor.bias, "walk", None)
@@ -321,4 +325,5 @@ class Certificate:
         yield "other conditions than those of the recording: motion, vibration, supply, ageing"
 
     def _size(self, value: float) -> str:
-        return f"{two_digits(value * self.unit.factor)} {self.unit.shown}"
+        unit = self.unit(value)
+        return f"{two_digits(value * unit.factor)} {unit.shown}"

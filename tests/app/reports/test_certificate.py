@@ -176,6 +176,26 @@ def test_pass_is_said_of_decided_limits_alone(row, tmp_path):
     ]
 
 
+def test_a_wide_bias_and_a_narrow_limit_have_units_of_their_own(tmp_path):
+    known, size = certificate(tmp_path), np.array([2.0, 3.0, 4.0]) * DEG_H
+    wide = {"swing": Measured(3600 * size, "xyz"), "residual": Measured(size, "xyz", size, size)}
+    made = Certificate("run", known.config, known.sheet, known.judged, wide)
+    assert [one["shown_unit"] for one in made.content["figures"]] == ["deg/s", "deg/h"]
+    assert made.content["figures"][0]["shown"] == ["2, U not known", "3, U not known", "4, U not known"]
+    assert "<td>1 deg/h</td>" in made.page()
+
+
+def test_an_axis_that_does_not_show_has_an_upper_limit_alone(tmp_path):
+    known, size = certificate(tmp_path), np.array([0.0, 3.0, 0.0]) * DEG_H
+    high = np.array([1.04, 3.3, np.inf]) * DEG_H
+    found = {"noise": Measured(size, "xyz", 0.9 * size, high), "swing": Measured(size, "xyz", missing="no map")}
+    noise, swing = Certificate("run", known.config, known.sheet, [], found).content["figures"]
+    assert noise["shown"] == ["≤ 1.0", "3.00 ± 0.36", "not known"]
+    assert noise["U"][::2] == [None, None]
+    assert noise["at_most"] == [pytest.approx(1.04 * DEG_H), None, None]
+    assert (swing["shown"], swing["U"]) == (["not measured: no map"], [None] * 3)
+
+
 @pytest.mark.parametrize(("value", "uncertainty", "shown"), [
     (12.3456, 0.0996, ("12.35", "0.10")),
     (-0.0004, 0.021, ("0.000", "0.021")),
