@@ -301,5 +301,5 @@ def show(result: RunResult, given: Mapping[str, Any]) -> None:
     name = config.file.stem if config.file else config.name
     terminal().print(yardstick_table({name: result.overview.yardsticks}, config.recording, sensor))
     say_lines(result.lines(), "note: ")
-    signed = ", certificate.html, certificate.json" * given["certificate"]
+    signed = ", certificate.html, certificate.json" * given.get("certificate", False)
     say(f"written to {given['out']}/: estimates.h5, summary.json, report.html{signed}\n")

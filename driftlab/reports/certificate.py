@@ -96,7 +96,7 @@ def trade_unit(si: str, largest: float, unit: BiasUnit) -> BiasUnit:
     return BiasUnit(si, large if largest >= limit else USUAL[si])
 
 
-def shown(values: Array, widths: Array, unit: BiasUnit) -> list[str]:
+def statements(values: Array, widths: Array, unit: BiasUnit) -> list[str]:
     """Return values (d,), each with its expanded uncertainty (d,), as the sheet has them; NaN: it is not known."""
     pairs = (stated(float(v) * unit.factor, float(w) * unit.factor) for v, w in zip(values, widths, strict=True))
     return [f"{value} ± {width}" if width != "not known" else f"{value}, U not known" for value, width in pairs]
@@ -272,7 +272,12 @@ class Certificate:
         U, unit = budget.U, self.unit(budget.bias)
         widths, factor = np.full_like(budget.bias, np.nan) if U is None else U, unit.factor
         rows = [
-            {"temperature_degC": T, "value": bias, "U": None if U is None else width, "shown": shown(bias, width, unit)}
+            {
+                "temperature_degC": T,
+                "value": bias,
+                "U": None if U is None else width,
+                "shown": statements(bias, width, unit),
+            }
             for T, bias, width in zip(budget.T, budget.bias, widths, strict=True)
         ]
         table = {"shown_unit": unit.shown, "rows": rows}
@@ -298,7 +303,7 @@ class Certificate:
         highs = np.where(hidden, nothing if measured.high is None else measured.high, np.nan)
         widths = nothing if widths is None or why else np.where(hidden, np.nan, widths)
         unit = self.unit(values, highs)
-        texts = [f"not measured: {why}"] if why else shown(values, widths, unit)
+        texts = [f"not measured: {why}"] if why else statements(values, widths, unit)
         if not why:
             bounds = [f"≤ {two_digits(v * unit.factor)}" if np.isfinite(v) else "not known" for v in highs]
             texts = [bound if below else text for below, bound, text in zip(hidden, bounds, texts, strict=True)]
