@@ -272,12 +272,7 @@ class Certificate:
         U, unit = budget.U, self.unit(budget.bias)
         widths, factor = np.full_like(budget.bias, np.nan) if U is None else U, unit.factor
         rows = [
-            {
-                "temperature_degC": T,
-                "value": bias,
-                "U": None if U is None else width,
-                "shown": statements(bias, width, unit),
-            }
+            {"temperature_degC": T, "value": bias, "U": width, "shown": statements(bias, width, unit)}
             for T, bias, width in zip(budget.T, budget.bias, widths, strict=True)
         ]
         table = {"shown_unit": unit.shown, "rows": rows}
