@@ -335,8 +335,10 @@ def test_a_certificate_stays_until_its_results_change_and_one_that_was_filled_in
     assert fleets.contents(Path("made")) == before
     page = Path("made/units/0001/certificate.html")
     page.write_text(page.read_text() + "filled in")
+    Path("units.csv").write_text(Path("units.csv").read_text().replace("chamber", "serial"))
     fleet(certificate=True, settings=("certificate.customer=C",))
     assert certificates()["0001"]["laboratory"]["customer"] == "C"
+    assert certificates()["0001"]["item"]["serial"] == "K1"  # of the manifest
     assert page.with_name("certificate.html.before-1").read_text().endswith("filled in")
     assert not page.read_text().endswith("filled in")
 
