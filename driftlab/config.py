@@ -69,6 +69,8 @@ class Config(Settings):
     """The filter: its sensors, and how their biases move."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
     """Upper limits of acceptance; the pages say whether the unit passes."""
+    certificate: CertificateTexts | None = None
+    """Texts for a certificate that the laboratory knows; what is left out is a line to fill in by hand."""
 
     @property
     def name(self) -> str:
@@ -260,6 +262,7 @@ def _seconds(text: str, recording: str) -> float | None:
 
 
 LONGEST = 64  # characters of a serial number
+LONGEST_TEXT = 120  # characters of a text on a certificate, which has one sheet
 
 
 def _serial(value: Any) -> Any:
@@ -299,3 +302,49 @@ class Limits(Settings):
     def declared(self) -> dict[str, float]:
         """Those that are set, by name, in SI."""
         return {name: float(value) for name, value in self if value is not None}
+
+
+def _text(value: Any) -> Any:
+    """Return a text of a certificate; a whole number is one, as that of the certificate may be."""
+    text = str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    if isinstance(text, str) and not (0 < len(text) <= LONGEST_TEXT and is_plain(text) and text == text.strip()):
+        raise _problem(f"'{quote(text)}' does not fit the sheet; write 1 to {LONGEST_TEXT} characters in one line")
+    return text
+
+
+Text = Annotated[str, BeforeValidator(_text, json_schema_input_type=str | int)]
+
+
+class CertificateTexts(Settings):
+    """Texts that stand on a certificate as they are; of ISO/IEC 17025, 7.8, what a program cannot know."""
+
+    number: Text | None = None
+    """Number of the certificate; in a fleet the unit's name follows it."""
+    laboratory: Text | None = None
+    """Name and address of the laboratory."""
+    location: Text | None = None
+    """Place of the calibration, where it is another."""
+    customer: Text | None = None
+    """Name and contact of the customer."""
+    item: Text | None = None
+    """Manufacturer and type of the unit."""
+    condition: Text | None = None
+    """Condition of the unit as it was received."""
+    received: Text | None = None
+    """Date on which it was received."""
+    performed: Text | None = None
+    """Date of the calibration."""
+    procedure: Text | None = None
+    """Procedure of the laboratory, and deviations from it."""
+    equipment: Text | None = None
+    """Chamber, mount and reference thermometer."""
+    traceability: Text | None = None
+    """Traceability of time base and thermometer to the SI."""
+    environment: Text | None = None
+    """Humidity, pressure and supply."""
+    operator: Text | None = None
+    """Name of who calibrated."""
+    authorised_by: Text | None = None
+    """Name of who answers for the results."""
+    temperature_uncertainty: Annotated[float, Unit("K", positive=True, example="0.3 K")] | None = None
+    """Expanded uncertainty (k = 2) of the thermometer; without it T is its reading."""

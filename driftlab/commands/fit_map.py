@@ -26,10 +26,11 @@ from driftlab.maps.kind_selection import KindComparison, candidates, divide
 from driftlab.maps.kind_selection import compare as compare_kinds
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.reports import map_selection
+from driftlab.reports.certificate import SUFFIXES, Certificate
 from driftlab.reports.charts import Chart
 from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.map import chart, page_of
-from driftlab.reports.provenance import map_facts, sheet_of
+from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_file, check_place, save, write_text
@@ -79,7 +80,8 @@ class FitMapResult(Result):
         fitted, self.comparison = verdict.map, comparison
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
-        self.limits = check_limits(config.limits, of_map(fitted, self.unit))
+        self.measured = of_map(fitted, self.unit)
+        self.limits = check_limits(config.limits, self.measured)
         self.limits_verdict = verdict_line(self.limits)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
@@ -106,13 +108,17 @@ class FitMapResult(Result):
         """Return samples and curve over temperature, the residuals, how sure it is and on how many samples."""
         return chart(self.verdict, self.unit)
 
-    def save(self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None) -> None:
+    def save(
+        self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False
+    ) -> None:
         """Write the map to the file `out`, and its page; where its size was chosen, `select.json` and `select.svg` too.
 
-        Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
+        Those, and a certificate, are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or
+        MapError.
         """
         path, folder, selection = Path(out), None if report is None else Path(report), self.selection
-        _check(path, folder, [], selected=selection is not None)
+        names = _names(selected=selection is not None, certificate=certificate)
+        _check(path, folder, [], names)
         save(self.map, path, COMMAND)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
@@ -120,10 +126,19 @@ class FitMapResult(Result):
         if selection is not None:
             drawn = figure_of(map_selection.chart(selection, self.unit))
             texts += [text_of(map_selection.selection_document(selection, self.unit)), svg(drawn)]
-        beside = _beside(path, folder, selected=selection is not None)
+        if certificate:
+            signed = self._certificate(sheet)
+            texts += [signed.page(), signed.text()]
+        beside = _beside(path, folder, names)
         for place, text in zip(beside, texts, strict=True):
             write_text(place, text, COMMAND)
         self.written = (path, *beside)
+
+    def _certificate(self, sheet: Sheet) -> Certificate:
+        verdict, lasted = self.verdict, self.map.record.lasted
+        return Certificate(
+            COMMAND, self.config, sheet, self.limits, self.measured, self.map, verdict.soak, verdict.placements, lasted
+        )
 
 
 def fit_map(
@@ -139,6 +154,7 @@ def fit_map(
     report: Place | None = None,
     family: Place | None = None,
     lot: str | None = None,
+    certificate: bool = False,
     progress: Progress | None = None,
 ) -> FitMapResult | FamilyMapResult:
     """Fit a thermal map on a soak at rest, and say how good it is.
@@ -172,6 +188,9 @@ def fit_map(
         Its `family.json`.
     lot : str, optional
         Of the unit, where --family knows lots.
+    certificate : bool
+        Write a certificate too: one sheet with results, uncertainty and limits.
+        Beside the map or in `report`, as certificate.html and certificate.json; it needs `out`.
     progress : callable, optional
         Called with the recording's time in s and the number of samples so far, then with texts.
 
@@ -194,18 +213,20 @@ def fit_map(
     understood = config_of(config).tracking(channel)
     recordings = [] if data is None else recordings_of(data, units, "data")
     place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
-    _check_family(known, lot, bool(kind or neurons or compare or report))
+    _check_family(known, lot, bool(kind or neurons or compare or report or certificate))
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
+    if certificate and place is None:
+        raise ConfigError("--certificate: is a file beside the map; give --out, the map's file")
     for option, value in (("--kind", kind), ("--select", neurons)):
         if compare and value is not None:
             raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
     if place is not None:
         read = [*understood.files_to_fit(), *paths_of(recordings)]
-        _check(place, folder, read, selected=neurons is not None)
+        _check(place, folder, read, _names(selected=neurons is not None, certificate=certificate))
     result = _fitted(understood, recordings, kind, neurons, compare, progress)
     if place is not None:
-        result.save(place, report=folder)
+        result.save(place, report=folder, certificate=certificate)
     return result
 
 
@@ -274,15 +295,20 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
     return T, bias
 
 
-def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
+def _check(path: Path, report: Path | None, read: Collection[Path], names: Sequence[str]) -> None:
     check_place(path, read, COMMAND)
-    for name in _beside(path, report, selected=selected):
+    for name in _beside(path, report, names):
         check_file(name, COMMAND, str(name), "name another folder with --report")
 
 
-def _beside(path: Path, report: Path | None, *, selected: bool) -> list[Path]:
-    """Return the places of the page, and of the selection's files: in the folder, or beside the map under its name."""
-    names = ("report.html", "select.json", "select.svg")[: 3 if selected else 1]
+def _names(*, selected: bool, certificate: bool) -> list[str]:
+    """Return the names of the page, of the selection's files and of the certificate."""
+    more = ["select.json", "select.svg"] * selected
+    return ["report.html", *more, *(f"certificate.{suffix}" for suffix in SUFFIXES if certificate)]
+
+
+def _beside(path: Path, report: Path | None, names: Sequence[str]) -> list[Path]:
+    """Return the places of files: in the folder, or beside the map under its name."""
     return [path.with_name(f"{path.stem}.{name}") if report is None else report / name for name in names]
 
 
@@ -292,15 +318,17 @@ def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
         raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     if family is not None and more:
         raise ConfigError(
-            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
-            "--report out"
+            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare, "
+            "--report and --certificate out"
         )
 
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """Say which sizes are tried, and where the map is written: where the config says, or beside the config."""
     config, kind, compare = arguments["config"], arguments.get("kind"), arguments["compare"]
-    more = any((kind, arguments.get("report"), compare, options["select"], options["enforce_limits"]))
+    more = any(
+        (kind, arguments.get("report"), compare, options["select"], options["enforce_limits"], arguments["certificate"])
+    )
     out = arguments.get("out")
     _check_family(arguments.get("family"), arguments.get("lot"), more)
     if arguments.get("family") is None:

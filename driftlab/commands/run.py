@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from driftlab import __version__
@@ -25,15 +27,17 @@ from driftlab.commands.estimates import (
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
 from driftlab.commands.result import Result
 from driftlab.config import Config
-from driftlab.evaluation.limits import verdict
-from driftlab.evaluation.overview import OverviewAccumulator, averages_of, check_run_limits, map_of
-from driftlab.evaluation.summary import remarks, summarise
+from driftlab.evaluation.limits import Measured, check_limits, verdict
+from driftlab.evaluation.measurements import normal
+from driftlab.evaluation.overview import OverviewAccumulator, averages_of, map_of, run_measurements
+from driftlab.evaluation.summary import is_trusted, remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.recordings.identity import beforehand
 from driftlab.recordings.prefetch import aside
+from driftlab.reports.certificate import SUFFIXES, Certificate
 from driftlab.reports.charts import Chart
-from driftlab.reports.provenance import sheet_of
+from driftlab.reports.provenance import Sheet, sheet_of
 from driftlab.reports.run import bias_chart, page_of
 from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
@@ -64,7 +68,8 @@ class RunResult(Result):
         self.config, self.model, self.journal = config, model, journal
         self.recorded = recorded  # the file in which a live run has kept what came
         self.overview = overview = gathered.overview(journal.faults.first_row)
-        self.judged = check_run_limits(config, overview, journal.alignments[0], gathered.averages)
+        self._averages = gathered.averages
+        self.judged = [] if config.limits is None else check_limits(config.limits, self.measured)
         self.limits_verdict = self.verdict = verdict(self.judged)
         self.name = f"{config.file.stem}: {config.recording}" if config.file else config.recording
         self.units, self._columns = units_of(model), columns
@@ -81,6 +86,11 @@ class RunResult(Result):
             **summarise(overview, model, journal),
         }
 
+    @cached_property
+    def measured(self) -> dict[str, Measured]:
+        """Measurements of the quantities that a config may limit, by their names."""
+        return run_measurements(self.config, self.overview, self.journal.alignments[0], self._averages)
+
     def lines(self) -> list[str]:
         """Return the notes on the run, a sentence each."""
         return remarks(self.overview, self.model, self.journal)
@@ -94,18 +104,22 @@ class RunResult(Result):
         """Return the bias, its prediction and the temperature over time, and the errors below."""
         return bias_chart(self.overview, self.model, self.journal, errors=True)
 
-    def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
+    def save(self, out: str | os.PathLike[str], *, force: bool = False, certificate: bool = False) -> None:
+        """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does.
+
+        A `certificate` too, where it is asked for.
+        """
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
             with closing(EstimatesWriter(folder, self.config, self.journal)) as estimates:
                 estimates.open(self.model)
                 estimates.add(dict(self))
             note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
-            self._write(folder)
+            self._write(folder, certificate=certificate)
 
-    def _write(self, folder: Path) -> None:
+    def _write(self, folder: Path, *, certificate: bool = False) -> None:
         write_json(folder / "summary.json", self.summary)
         recording = None if self.recorded is None else [str(self.recorded)]
+        sheet = sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"])
         page = page_of(
             self.overview,
             self.summary,
@@ -113,10 +127,29 @@ class RunResult(Result):
             config=self.config.as_yaml(),
             model=self.model,
             journal=self.journal,
-            sheet=sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"]),
+            sheet=sheet,
             fitted=map_of(self.config),
         )
         (folder / "report.html").write_text(page, encoding="utf-8")
+        if certificate:
+            signed = self._certificate(sheet)
+            for suffix, text in zip(SUFFIXES, (signed.page(), signed.text()), strict=True):
+                (folder / f"certificate.{suffix}").write_text(text, encoding="utf-8")
+
+    def _certificate(self, sheet: Sheet) -> Certificate:
+        overview, T, fitted = self.overview, self.overview.curves.get("temperature_raw"), map_of(self.config)
+        bias = Measured(overview.bias, self.model.tracked.axes, otherwise="the filter's deviations are not confirmed")
+        if is_trusted(overview.nis):
+            bias = normal(bias, overview.sigma, np.nan)
+        fitted_on = "" if fitted is None else fitted.record.provenance.get("recordings", "")
+        names = [Path(str(one["name"])).name for one in sheet.recordings]
+        seen = [f"the map was fitted on {name} too, so its prediction is of what it has seen" for name in names]
+        return Certificate(
+            "run", self.config, sheet, self.judged, {"bias": bias, **self.measured}, fitted,
+            seconds=(overview.end - overview.start) * (1 - overview.yardsticks.moved),
+            domain=None if T is None else (float(np.min(T)), float(np.max(T))),
+            remarks=[text for name, text in zip(names, seen, strict=True) if name.partition("::")[0] in fitted_on],
+        )  # fmt: skip
 
 
 def run(
@@ -127,6 +160,7 @@ def run(
     out: Place | None = None,
     channel: str | None = None,
     smooth: bool = False,
+    certificate: bool = False,
     resume: bool = False,
     force: bool = False,
     progress: Progress | None = None,
@@ -153,6 +187,9 @@ def run(
     smooth : bool
         Add what is known given all of the recording (group `smoothed`).
         It is `smoothed` of the result, with `x`, `sigma` (N, n) and `bias` (N, d), and needs `out`.
+    certificate : bool
+        Write a certificate too: one sheet with results, uncertainty and limits.
+        As certificate.html and certificate.json into `out`, which it needs.
     resume : bool
         Go on where the same run was broken off.
         It needs `out`, in which that run left a checkpoint.
@@ -175,8 +212,7 @@ def run(
     """
     understood, journal = config_with(config, data, units).tracking(channel), RunLog()
     if out is None:
-        if smooth:
-            raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
+        _check_in_memory(smooth, certificate)
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
         gathered = accumulator(understood, running.model, journal).read(columns)
@@ -198,7 +234,15 @@ def run(
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
         if hashed is not None:
             hashed()
-        return finish(estimates, running.model, Path(out))
+        return finish(estimates, running.model, Path(out), certificate=certificate)
+
+
+def _check_in_memory(smooth: bool, certificate: bool) -> None:
+    """Raise ConfigError where something is asked for that only files can hold."""
+    if certificate:
+        raise ConfigError("--certificate: is a file of the results; give --out, a folder")
+    if smooth:
+        raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
 
 
 def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Generator[RunSegment]:
@@ -218,8 +262,15 @@ def accumulator(config: Config, model: MeasurementModel, journal: RunLog) -> Ove
     return OverviewAccumulator(model, first, averages_of(config, first))
 
 
-def finish(estimates: EstimatesWriter, model: MeasurementModel, out: Path, recorded: Path | None = None) -> RunResult:
-    """Write `summary.json` and `report.html` of the estimates into their folder, which will be called `out`.
+def finish(
+    estimates: EstimatesWriter,
+    model: MeasurementModel,
+    out: Path,
+    recorded: Path | None = None,
+    *,
+    certificate: bool = False,
+) -> RunResult:
+    """Write `summary.json`, `report.html` and a certificate of the estimates into their folder, to be called `out`.
 
     `recorded` is the file in which a live run has kept what came. The estimates are read back where they were not
     observed while they were made.
@@ -230,7 +281,7 @@ def finish(estimates: EstimatesWriter, model: MeasurementModel, out: Path, recor
         with reading(folder / "estimates.h5") as file:
             observed = accumulator(config, model, journal).read(file)
     result = RunResult(config, model, journal, observed, Stored(out / "estimates.h5"), recorded)
-    result._write(folder)
+    result._write(folder, certificate=certificate)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result
 
@@ -250,4 +301,5 @@ def show(result: RunResult, given: Mapping[str, Any]) -> None:
     name = config.file.stem if config.file else config.name
     terminal().print(yardstick_table({name: result.overview.yardsticks}, config.recording, sensor))
     say_lines(result.lines(), "note: ")
-    say(f"written to {given['out']}/: estimates.h5, summary.json, report.html\n")
+    signed = ", certificate.html, certificate.json" * given.get("certificate", False)
+    say(f"written to {given['out']}/: estimates.h5, summary.json, report.html{signed}\n")

@@ -114,6 +114,16 @@ class LimitResult:
             **({"beside": self.beside} if self.beside else {}),
         }
 
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> LimitResult:
+        """Return the row that `as_json` has written."""
+        numbers = {k: np.nan if row[k] is None else row[k] for k in ("value", "guard", "more_hours")}
+        measured, beside = row["verdict"] != "not measured", row.get("beside", "")
+        return cls(
+            row["name"], row["limit"], numbers["value"], numbers["guard"], row["axis"] or "", row["decision"], measured,
+            row["note"], row["would_decide"], 3600 * numbers["more_hours"], beside,
+        )  # fmt: skip
+
     def cells(self, unit: BiasUnit) -> list[str]:
         """Return name, limit, value with its guard, axis, verdict and note as texts, units beside the numbers."""
         shown = self.unit(unit)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.evaluation.limits import LimitResult, check_limits
+from driftlab.evaluation.limits import LimitResult, Measured, check_limits
 from driftlab.evaluation.measurements import Averages, of_coast, of_map
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
@@ -307,23 +307,31 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     return Averages(alignment.dt, sensor.axes, lambda block: clamped.bias(block["temperature"]))
 
 
-def check_run_limits(
+def run_measurements(
     config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
-) -> list[LimitResult]:
-    """Judge a run by the limits of its config.
+) -> dict[str, Measured]:
+    """Return the measurements by a run of the quantities that a config may limit.
 
     The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
     survey has filled; residual, swing and hysteresis are of the map.
     """
-    if config.limits is None or config.filter is None:
-        return []
-    align = config.filter.align
-    fitted = map_of(config)
-    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, align)}
-    if averages is not None and config.limits.noise is not None:
+    if config.filter is None:
+        return {}
+    fitted, limits = map_of(config), config.limits
+    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, config.filter.align)}
+    if averages is not None and limits is not None and limits.noise is not None:
         measured["noise"] = averages.noise()
-    if averages is not None and config.limits.bias_instability is not None:
+    if averages is not None and limits is not None and limits.bias_instability is not None:
         measured["bias_instability"] = averages.measured()
     if fitted is not None:
         measured |= of_map(fitted, tracked_unit(config.filter))
-    return check_limits(config.limits, measured)
+    return measured
+
+
+def check_run_limits(
+    config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
+) -> list[LimitResult]:
+    """Judge a run by the limits of its config; the arguments are those of `run_measurements`."""
+    if config.limits is None:
+        return []
+    return check_limits(config.limits, run_measurements(config, overview, alignment, averages))

@@ -12,6 +12,7 @@ from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Sc
 from driftlab.filtering.segment import RunLog
 from driftlab.units import axis_name, unit_of
 from fusion_core.chunk import Array
+from fusion_core.consistency import NisTest
 from fusion_core.contracts import MeasurementModel, Sensor
 from fusion_core.errors import moment
 
@@ -77,6 +78,11 @@ def remarks(overview: Overview, model: MeasurementModel, journal: RunLog) -> lis
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
     return [*lines, *(line for sensor in model.sensors for line in _noise(sensor, first.noise_ratio))]
+
+
+def is_trusted(nis: NisTest) -> bool:
+    """Return True if the deviations of a run are large enough for its innovations."""
+    return nis.consistent or nis.mean < 1 + NOTICED
 
 
 def inconsistency(mean: float) -> str:

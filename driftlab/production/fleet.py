@@ -43,6 +43,7 @@ def fleet(
     scheduler: str | None = None,
     explain: bool = False,
     pages: Sequence[str] = (),
+    certificate: bool = False,
     family: Place | None = None,
     force: bool = False,
     channel: str | None = None,
@@ -70,6 +71,9 @@ def fleet(
     pages : sequence of str
         Units whose pages to write; may be repeated.
         Names, patterns, or `all`.
+    certificate : bool
+        Write a certificate of each unit too: one sheet with results, uncertainty and limits.
+        As certificate.html and certificate.json in its folder; one of the same results stays as it is.
     family : path, optional
         A family that is known: none is fitted.
         Its `family.json`.
@@ -92,7 +96,8 @@ def fleet(
         If not one unit could be done.
     """
     understood, report = config_of(config).tracking(channel), progress or (lambda stage: None)
-    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
+    known = None if family is None else Path(family)
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, force)
     if wanted.scheduler is not None and wanted.workers is not None:
         raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
     manifest = read_manifest(str(units))
@@ -100,7 +105,8 @@ def fleet(
     with_recording(understood, next(iter(manifest.units[0].recordings.values()))[0])
     wanted.check_pages(manifest)
     with fleet_folder(Path(out), [] if wanted.family is None else [wanted.family]) as folder:
-        jobs = UnitJobs(manifest, folder, understood.as_yaml(), versions_of(understood), wanted, report)
+        plain = understood.model_copy(update={"certificate": None})  # its texts change no result
+        jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), wanted, report)
         command = _Command(understood, jobs)
         summary = command.all()
         if not command.status.done:
@@ -135,6 +141,7 @@ class _Command:
     jobs: UnitJobs
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage
     status: FleetStatus = field(default_factory=FleetStatus)
+    failed: list[str] = field(default_factory=list)  # of the certificates
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
@@ -143,6 +150,7 @@ class _Command:
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
         self._timed("units", jobs.do)
         status = self.status = self._timed("reading", jobs.status)
+        self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done))
         key, before = self._key(), folder.mark
         files = (TABLE, REPORT, *([FAMILY] if before.get("family", {}).get("fitted", True) else ()))
         as_it_was = before.get("key") == key and before.get("complete")
@@ -196,6 +204,7 @@ class _Command:
             kept_without_recordings=jobs.without_recordings,
             left=left,
             failed={record.unit: record.error for record in status.failed[:SHOWN]},
+            certificates_failed=self.failed,
             seconds=self.seconds,
             config=jobs.config,
             **more,

@@ -78,7 +78,9 @@ class FleetResult(Result):
         """The files in the fleet's folder, in words."""
         names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
         pages = len(self.summary["pages"])
-        return [*names, "units/", *([f"pages of {pages:,} in units/NAME/page/"] if pages else [])]
+        made = sum(1 for _ in (self.path / UNITS).glob("*/certificate.html"))
+        more = [f"pages of {pages:,} in units/NAME/page/"] * bool(pages) + [f"{made:,} certificates"] * bool(made)
+        return [*names, "units/", *more]
 
     @property
     def exit_status(self) -> int:

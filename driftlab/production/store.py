@@ -121,6 +121,23 @@ class FleetFolder:
                 os.rename(place, free(place))
             os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), place)
 
+    def put_certificate(self, unit: str, content: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
+        """Put a certificate among the files of a unit, in the place of an earlier one of other results.
+
+        One that was edited is put aside; one of the same results stays, and so does its date of issue.
+        """
+        record, place = self.record(unit), self.unit(unit)
+        assert record is not None
+        as_written = [is_as(place / name, record.written.get(name, "")) for name in files]
+        before = [ownership.document(place / name) for name in files if name.endswith(".json")]
+        if all(as_written) and all(one.get("identification") == content["identification"] for one in before):
+            return
+        for name, own in zip(files, as_written, strict=True):
+            if os.path.lexists(place / name) and not own:
+                os.rename(place / name, free(place / name))
+            self.write(f"{UNITS}/{unit}/{name}", files[name])
+        self.note(record.model_copy(update={"written": record.written | _digests(files)}))
+
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
         """Return a new folder beside those of the units, with files in it."""
         folder = self.path / UNITS / name

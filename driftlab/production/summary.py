@@ -134,6 +134,7 @@ class FleetSummary(BaseModel):
     kept_without_recordings: list[str] = []
     left: list[str] = []
     failed: dict[str, str] = {}
+    certificates_failed: Annotated[list[str], Field(exclude=True)] = []
     seconds: dict[str, float] = {}
     key: str | None = None
     family: FamilySummary | None = None
@@ -149,7 +150,7 @@ class FleetSummary(BaseModel):
     def sentences(self) -> list[str]:
         """Return the summary in sentences, most important first."""
         family = [] if self.family is None else self.family.sentences()
-        return [*self._of_units(), *self._of_the_manifest(), *family]
+        return [*self._of_units(), *self._of_the_manifest(), *self.certificates_failed, *family]
 
     def _of_units(self) -> list[str]:
         now, done, failed = (self.counts[name] for name in ("done_now", "done", "failed"))

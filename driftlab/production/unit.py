@@ -19,17 +19,25 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from driftlab import __version__
 from driftlab.commands.explain import explain
+from driftlab.commands.export import read_map
 from driftlab.config import Config, part_of, paths_of, products, understood
+from driftlab.evaluation.limits import LimitResult, Measured
+from driftlab.evaluation.measurements import normal, of_map
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_noise import Densities, soaked_of
 from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
+from driftlab.reports.certificate import Certificate
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.storage.in_memory import CopyName
-from fusion_core.errors import ConfigError, FusionError, UnreadableFile, describe_error
+from driftlab.storage.ownership import is_as
+from driftlab.units import tracked_unit
+from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, describe_error
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 from fusion_core.host.provenance import participants
@@ -37,6 +45,7 @@ from fusion_core.host.provenance import participants
 if TYPE_CHECKING:
     from driftlab.family.unit_information import UnitInformation
     from driftlab.production.unit_map import CoastResult, UnitMap
+    from driftlab.reports.provenance import Sheet
 
 CALIBRATION, TRAIN, HOLDOUT = "calibration", "train", "holdout"  # roles
 MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
@@ -261,3 +270,41 @@ def pages_of(
             journal=result.journal, sheet=sheet, fitted=unit.fitted,
         )  # fmt: skip
     return {f"page/{name}": page.encode() for name, page in pages.items()}
+
+
+def certificate_of(record: UnitRecord, folder: Path, config: Config, sheet: Sheet) -> Certificate:
+    """Return the certificate of a unit that is done, from its record and the map in its folder.
+
+    `config` and `sheet` are those of the fleet. Raises MapError where the map is not the one that was written.
+    """
+    path, known = folder / record.map_file, record.written.get(record.map_file, "")
+    if not is_as(path, known):
+        raise MapError(f"{path}: was changed since `driftlab fleet` wrote it; give --force to make it anew")
+    fitted, unit = read_map(path), tracked_unit(config.filter)
+    judged = [LimitResult.from_json(row) for row in record.limits]
+    own = replace(
+        sheet,
+        serial=record.more.get("serial", ""),
+        date=record.date,
+        dated="manifest" if record.date else "page",
+        recordings=[one for part in record.recordings.values() for one in part],
+        versions={"driftlab": record.driftlab},
+        plugins=record.plugins,
+        maps=[{**map_facts(fitted, unit), "file": record.map_file, "sha256": known}],
+    )
+    beside = {"noise", "coast"} - {row.name for row in judged}  # a limit is held against a measurement of its own
+    measured = {name: _measured(record, name) for name in sorted(beside)} | of_map(fitted, unit)
+    in_sample = "the prediction is of the soak that the map was fitted on"
+    return Certificate(
+        "fleet", config, own, judged, measured, fitted, seconds=3600 * record.hours, name=record.unit,
+        remarks=[in_sample] * record.coast_in_sample,
+    )  # fmt: skip
+
+
+def _measured(record: UnitRecord, name: str) -> Measured:
+    """Return a figure of a unit's record as a measurement."""
+    values, sigma = record.table([name], len(record.axes))[:, 0]
+    if np.all(np.isnan(values)):
+        return Measured(values, record.axes, missing="there is no such recording, or it is too short")
+    figure = Measured(values, record.axes, stands_on=record.coast_of if name == "coast" else "")
+    return normal(figure, sigma, float("nan")) if np.all(np.isfinite(sigma)) else figure

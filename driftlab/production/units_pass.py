@@ -12,7 +12,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import filter as matching
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -28,8 +28,9 @@ from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
 from driftlab.production.store import PAGE, FleetFolder
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
-from driftlab.production.unit import Task, key_of, work
+from driftlab.production.unit import Task, certificate_of, key_of, work
 from driftlab.production.workers import Pool, WorkerLost, Workers
+from driftlab.reports.provenance import sheet_of
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.host.provenance import participants
 
@@ -44,6 +45,7 @@ class FleetOptions:
     scheduler: str | None = None  # address of one of Dask, in place of processes
     explain: bool = False
     pages: Collection[str] = ()  # patterns of the units whose pages are wanted; `all`
+    certificate: bool = False  # of each unit that is done
     family: Path | None = None  # one that is known already
     force: bool = False
 
@@ -193,6 +195,27 @@ class UnitJobs:
                     stage.done += 1
                     self.progress(stage)
         return [entry.unit for entry in wanted if self._has_page(entry.unit)]
+
+    def make_certificates(self, config: Config, records: Sequence[UnitRecord]) -> list[str]:
+        """Make the certificates of units that are done, where they are wanted; return why there is none of a unit."""
+        if not self.options.certificate:
+            return []
+        sheet = sheet_of(config.model_copy(update={"source": None, "filter": None}), [])  # units say the rest
+        sheet, failed = replace(sheet, config_sha256=hashlib.sha256(self.config.encode()).hexdigest()), []
+        stage = Stage("certificates", total=len(records))
+        for record in records:
+            self.progress(stage)
+            try:
+                signed = certificate_of(record, self.folder.unit(record.unit), config, sheet)
+            except FusionError as error:
+                failed.append(f"unit {record.unit} has no certificate: {error}")
+                continue
+            texts = {"certificate.html": signed.page(), "certificate.json": signed.text()}
+            files = {name: text.encode() for name, text in texts.items()}
+            self.folder.put_certificate(record.unit, signed.content, files)
+            stage.done += 1
+        self.progress(stage)
+        return failed
 
 
 def _failed(task: Task, lost: WorkerLost) -> UnitRecord:

@@ -157,7 +157,7 @@ def follow(page, tmp_path, running):
                     run_in(tmp_path, *command)
 
 
-TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits"}
+TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits", "certificate"}
 
 
 @pytest.fixture(scope="module")

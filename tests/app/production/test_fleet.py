@@ -1,5 +1,6 @@
 """`driftlab.production.fleet`: no unit is calibrated twice, a failure stays alone, and files of others stay."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -292,3 +293,66 @@ def test_a_map_with_the_family_that_was_edited_is_put_aside(fleet):
     fleet()
     assert path.with_name("family_map.json.before-1").read_text() == edited
     assert path.read_text() != edited
+
+
+CERTIFICATE = ("certificate={number: 2026-7, laboratory: A <b>, customer: B}",)
+SIGNED = {"certificate.html", "certificate.json"}
+
+
+def certificates(out="made"):
+    """The certificates of a fleet, by unit."""
+    return {path.parent.name: json.loads(path.read_text()) for path in Path(out).rglob("certificate.json")}
+
+
+def test_each_unit_that_is_done_has_a_certificate_and_none_is_done_again_for_it(fleet):
+    result, asked = fleet(certificate=True, settings=CERTIFICATE)
+    made = certificates()
+    assert asked == []
+    assert sorted(made) == ["0000", "0001", "0002"]
+    assert "3 certificates" in result.written
+    for unit, content in made.items():
+        record = result.record(unit)
+        files = {name: hashlib.sha256((Path("made/units") / unit / name).read_bytes()).hexdigest() for name in SIGNED}
+        assert files.items() <= record.written.items()
+        assert (content["item"]["serial"], content["laboratory"]["number"]) == (unit, f"2026-7/{unit}")
+        assert content["method"]["map"]["sha256"] == record.written[record.map_file]
+        assert content["method"]["performed"] == record.date
+        assert content["method"]["config_sha256"] == hashlib.sha256(result.summary["config"].encode()).hexdigest()
+        assert [row["verdict"] for row in content["limits"]] == [row["verdict"] for row in record.limits]
+        names = [figure["name"] for figure in content["figures"]]
+        assert names.count("noise") == 0  # the limit is held against another measurement of it
+        coast = content["figures"][names.index("coast")]
+        assert coast["U"] == pytest.approx([2 * sigma for sigma in record.figures["coast"].sigma])
+        page = (Path("made/units") / unit / "certificate.html").read_text()
+        assert "A &lt;b&gt;" in page
+        assert "A <b>" not in page
+
+
+def test_a_certificate_stays_until_its_results_change_and_one_that_was_filled_in_is_put_aside(fleet):
+    fleet(certificate=True, settings=CERTIFICATE)
+    before = fleets.contents(Path("made"))
+    fleet(certificate=True, settings=CERTIFICATE)
+    assert fleets.contents(Path("made")) == before
+    page = Path("made/units/0001/certificate.html")
+    page.write_text(page.read_text() + "filled in")
+    Path("units.csv").write_text(Path("units.csv").read_text().replace("chamber", "serial"))
+    fleet(certificate=True, settings=("certificate.customer=C",))
+    assert certificates()["0001"]["laboratory"]["customer"] == "C"
+    assert certificates()["0001"]["item"]["serial"] == "K1"  # of the manifest
+    assert page.with_name("certificate.html.before-1").read_text().endswith("filled in")
+    assert not page.read_text().endswith("filled in")
+
+
+def test_a_unit_that_is_done_again_has_no_old_certificate(fleet):
+    fleet(certificate=True)
+    assert len(certificates()) == COUNT - 1
+    fleet(settings=["filter.align=50 s"])
+    assert certificates() == {}
+
+
+def test_a_map_that_was_changed_is_not_certified(fleet):
+    path = Path("made/units/0001/map.json")
+    path.write_text(path.read_text() + " ")
+    result, _ = fleet(certificate=True)
+    assert sorted(certificates()) == ["0000", "0002"]
+    assert any(line.startswith("unit 0001 has no certificate: ") for line in result.lines())
