@@ -171,7 +171,7 @@ def error_rows(runs: Sequence[Scores]) -> Rows:
     """Return the rows of the table of errors, what decides first: a label, and for each run the errors (d,) in SI."""
     rows = []
     for name in LONGEST_FIRST:
-        rows.append((f"coast, {name}", [run.coast[name] for run in runs]))
+        rows.append((f"prediction, {name}", [run.coast[name] for run in runs]))
         rows.append(("  its sigma", [run.coast_sigma[name] for run in runs]))
     return [
         *rows,

@@ -245,7 +245,7 @@ COLUMNS: dict[str, UnitColumn] = dict([
     *_with_sigma("coast_1min", "SI", "the same of 1 min"),
     *_with_sigma("coast_5min", "SI", "the same of 5 min"),
     *_with_sigma("coast_end", "SI", "the same to the end of the recording"),
-    ("coast_of", UnitColumn("text", "", "recording that was coasted")),
+    ("coast_of", UnitColumn("text", "", "recording that was predicted")),
     ("coast_in_sample", UnitColumn("flag", "", "whether the own map was fitted on it")),
     ("map_sigma", UnitColumn("number", "SI", "rms of the standard deviation of the own map over its domain")),
     ("family_sigma", UnitColumn("number", "SI", "rms of that of the family's map over the family's domain")),

@@ -1,4 +1,4 @@
-"""The report of a comparison: who coasts best, charts and tables to decide from, and the paper's tables.
+"""The report of a comparison: who predicts best, charts and tables to decide from, and the paper's tables.
 
 A config has one colour in all of them and one entry in the legend, so that one click hides it. d axes.
 """
@@ -121,7 +121,7 @@ def bias_chart(runs: Runs) -> Chart:
         clock.label,
         f"Bias of the {sensor.channel}",
         "Broad and grey: the reference, the centred 30 s average of what was measured. Solid: estimates, which follow "
-        "it while they are updated. Dashed: coasts, predicted from the end of the alignment with no measurement since.",
+        "it while they are updated. Dashed: predictions without updates, from the end of the alignment on.",
     )
 
 
@@ -137,11 +137,11 @@ def error_chart(runs: Runs) -> Chart:
             yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
 
     shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "coast error", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "prediction error", sensor.shown, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
-        "Error of the coasts",
+        "Error of the predictions",
         "Prediction less reference. The band is two of its standard deviations about zero: 95 % of the time an honest "
         "prediction is inside.",
     )

@@ -28,7 +28,7 @@ TITLES = {
     "noise": "White noise",
     "walk": "Walk of the bias",
     "swing": "Swing of the map",
-    "coast": "Coast, rms of 10 min without a measurement",
+    "coast": "Prediction over 10 min without updates, rms of its error",
     "level": "Level of the map, mean over the range",
 }
 CAPTION = (

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from driftlab.evaluation.comparison import REFUTED
 from driftlab.evaluation.overview import SMOOTHED, Overview
-from driftlab.evaluation.scores import moving_average
+from driftlab.evaluation.scores import Scores, moving_average
 from driftlab.evaluation.summary import error_rows, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
@@ -46,11 +47,14 @@ def page_of(
     domain = None if fitted is None else fitted.domain
     aligned = moment(journal.alignments[0].t, journal.faults.first_row)
     headings = scores.heading.items() if sensor.integral is not None else ()
+    result, use = result_sentences(scores, unit, heading=sensor.integral is not None)
     return page(
         "report",
         title=title,
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
+        result=result,
+        use=use,
         remarks=remarks(overview, model, journal),
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
@@ -72,13 +76,30 @@ def page_of(
     )
 
 
+def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[str, str]:
+    """Return the result of a run in a sentence, and its meaning for use; the second is empty where none is known."""
+    known = (name for name in ("10 min", "5 min", "1 min") if np.all(np.isfinite(scores.coast[name])))
+    name = next(known, None)
+    if name is None:
+        return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""
+    worst = int(np.argmax(scores.coast[name]))
+    error, sigma = float(scores.coast[name][worst]), float(scores.coast_sigma[name][worst])
+    axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
+    result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
+    trust = f"its sigma there, {unit.number(sigma)} {unit.shown}, " + (
+        "covers that" if error <= REFUTED * sigma else f"is too small by {error / sigma:.1f} times: widen walk or map"
+    )
+    turned = f"{name} without updates turn the heading by {np.rad2deg(scores.heading[name]):.2g} deg; " * heading
+    return f"{result}.", f"{turned}{trust}."
+
+
 def nis_sentence(nis: NisTest) -> str:
     """Return in a sentence or two what the NIS says of the deviations of a run."""
     if not np.isfinite(nis.mean):
         return "The NIS is not known, no update was used."
     mean, bounds = f"The mean NIS a component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
     if nis.consistent:
-        return f"{mean}, within {bounds}: innovations are as large as the model says."
+        return f"{mean}, within {bounds}: innovations are as large as the model says, so its sigma can be used as it is."
     return f"{mean}, outside {bounds}: {inconsistency(nis.mean)}."
 
 
@@ -110,10 +131,10 @@ def bias_chart(
         bias, sigma, coast, spread = (
             curves[name][:, k] * sensor.factor for name in ("bias", "bias_sigma", "coast", "coast_sigma")
         )
-        yield Line(t, None, "± 2σ of the coast", "coast", coast - 2 * spread, coast + 2 * spread)  # wide: below all
+        yield Line(t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread)  # wide: below all
         yield Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
-        yield Line(t, coast, "coast", "coast", style="dashed")
+        yield Line(t, coast, "prediction", "coast", style="dashed")
         if SMOOTHED in curves:
             yield Line(t, curves[SMOOTHED][:, k] * sensor.factor, "given all of it", "other", style="dotted")
 
@@ -144,10 +165,10 @@ def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) ->
     def lines(k: int) -> Iterator[Line]:
         sigma, spread = (2 * curves[name][:, k] * sensor.factor for name in ("bias_sigma", "coast_sigma"))
         error = np.where(np.isfinite(errors["coast"]), errors["bias"], np.nan)[:, k] * sensor.factor
-        yield charts.band_alone(t, spread, "± 2σ of the coast", "coast")
+        yield charts.band_alone(t, spread, "± 2σ of the prediction", "coast")
         yield charts.band_alone(t, np.where(np.isfinite(spread), sigma, np.nan), "± 2σ of the estimate", "estimate")
         yield Line(when, error, "estimate less reference", "error")
-        yield Line(when, errors["coast"][:, k] * sensor.factor, "coast less reference", "coast", style="dashed")
+        yield Line(when, errors["coast"][:, k] * sensor.factor, "prediction less reference", "coast", style="dashed")
 
     shades = event_shades(journal, clock)
     panels = charts.axis_panels(sensor.axes, lines, "error", sensor.shown, legibly=True, shades=shades)
