@@ -68,7 +68,8 @@ def write_fleet(
     rows = _rows(folder.path, status, analysis, curves, progress, each)
     write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
-    title = f"Fleet {folder.out.name or folder.path.name}"
+    name = (folder.out.name or folder.path.name).removeprefix("fleet").strip(" _-")
+    title = f"Fleet {name}".strip()
     overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
     write_fleet_report(folder.hidden(REPORT), overview)
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])

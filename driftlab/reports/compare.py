@@ -14,7 +14,7 @@ import numpy as np
 from driftlab.evaluation.comparison import TO_THE_END, Columns, Comparison, notes, paper, ranking, verdict
 from driftlab.evaluation.overview import thin
 from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
-from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
+from driftlab.evaluation.summary import Rows, error_rows
 from driftlab.reports import charts
 from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Panel, Shade, series
 from driftlab.reports.pages import write_page
@@ -34,9 +34,6 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
     si, factor, spec = unit.columns[-1]
     scores = {name: run.yardsticks for name, run in runs.items()}
     ranked, rows = ranking(scores), error_rows(list(scores.values()))
-    # the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first
-    over = coasts_over_axes(rows) if len(sensor.axes) > 1 else []
-    errors = [(over, ("rms",)), (rows, sensor.axes)]
     heading = {name: [np.rad2deg(y.heading[name]) for y in scores.values()] for name in LONGEST_FIRST}
     write_page(
         path,
@@ -48,7 +45,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
         best=ranked.best if ranked is not None and len(runs) > 1 else (),
         remarks=notes(runs),
         unit=sensor.shown,
-        errors=[cell for part, axes in errors for cell in _cells(part, axes, unit.factor, unit.digits)],
+        errors=_folded(rows, sensor.axes, unit),
         headings=[(name, _texts(row, ".2f")) for name, row in heading.items()] if sensor.integral else [],
         spans={TO_THE_END: duration(min(run.span for run in runs.values()))},
         bars=[(name, bars) for name in LONGEST_FIRST if (bars := _bars(runs, name, unit))],
@@ -92,6 +89,26 @@ def _cells(rows: Rows, axes: Sequence[str], factor: float, spec: str) -> Cells:
     ]
 
 
+def _folded(rows: Rows, axes: Sequence[str], unit: BiasUnit) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return a row an error: its label, and of each config the error of every axis and its sigma, as texts."""
+
+    def text(values: Array) -> str:
+        texts = [unit.number(value, "–") for value in values]
+        if len(set(texts)) == 1:
+            return texts[0] if len(axes) == 1 else f"{texts[0]} each"
+        return ", ".join(f"{axis} {value}" for axis, value in zip(axes, texts, strict=True))
+
+    folded: list[tuple[str, list[tuple[str, str]]]] = []
+    for label, columns in rows:
+        if label.startswith(" "):  # the sigma of the row before
+            above = folded.pop()
+            pairs = zip(above[1], columns, strict=True)
+            folded.append((above[0], [(error, text(sigma)) for (error, _), sigma in pairs]))
+        else:
+            folded.append((label, [(text(values), "") for values in columns]))
+    return folded
+
+
 def _texts(values: Sequence[float] | Array, spec: str) -> list[str]:
     return [formatted(value, spec) for value in values]
 
@@ -115,7 +132,7 @@ def bias_chart(runs: Runs) -> Chart:
             yield Line(t, coast, name, role, style="dashed")
 
     shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
@@ -137,7 +154,7 @@ def error_chart(runs: Runs) -> Chart:
             yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
 
     shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "prediction error", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "prediction error", sensor.shown, legibly=True, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,

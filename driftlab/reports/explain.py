@@ -101,7 +101,7 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         cells=_cells,
         prediction_chart=prediction_chart,
         loop_chart=loop_chart,
-        taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
+        taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out if closed.anything],
         bars=bars(verdict),
         needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
         rejected=[(trial, _percent(float(np.sqrt(trial.evidence.ratio)))) for trial in verdict.rejected],

@@ -137,6 +137,18 @@ def _difference(verdict: MapVerdict, unit: BiasUnit, axis: int) -> str:
     return f"{text(float(size))} ± {text(float(sigma), 2)} at {text(float(memory.where[axis]))} °C"
 
 
+def _use(verdict: MapVerdict, unit: BiasUnit) -> str:
+    """Return the meaning of the verdict for use."""
+    if verdict.seen:
+        return "do not calibrate by this map alone: up and down differ; run `driftlab explain` first."
+    if verdict.good is None:
+        return "check the map on another recording by `driftlab run`: its kind has no sigma."
+    low, high = verdict.fitted.domain
+    off = text(2 * float(np.max(verdict.good)) * unit.factor)
+    turned = f", {off} deg of heading an hour" if unit.shown == "deg/h" else ""
+    return f"from {low:.3g} to {high:.3g} °C count on {off} {unit.shown} (2 sigma) beside the level{turned}."
+
+
 def page_of(
     verdict: MapVerdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: KindComparison | None = None
 ) -> str:
@@ -151,6 +163,7 @@ def page_of(
         f"{low:.2f} to {high:.2f} °C",
         sheet=sheet,
         sentences=verdict.sentences(unit),
+        use=_use(verdict, unit),
         notes=notes,
         axes=verdict.axes,
         rows=rows(verdict, unit),
