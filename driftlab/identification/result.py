@@ -319,7 +319,9 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(f"to {what}, record: {experiment.description} (expected {log_likelihood(experiment.expected_gain_nats)})")
+        lines.append(
+            f"to {what}, record: {experiment.description} (expected {log_likelihood(experiment.expected_gain_nats)})"
+        )
     named = {name_of(finding.effect) for finding in verdict.findings}
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
@@ -354,7 +356,9 @@ def size(fit: Joint, finding: Finding, evidence: Evidence) -> str:
     if len(effect.coefficients or ()) != len(axes) or len(effect.sigma or ()) != len(axes) or len(units) != 1:
         each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
         return f"moves the bias by {', '.join(each)} {unit.shown}"
-    pairs = zip(axes, np.asarray(effect.coefficients) * unit.factor, np.asarray(effect.sigma) * unit.factor, strict=True)
+    pairs = zip(
+        axes, np.asarray(effect.coefficients) * unit.factor, np.asarray(effect.sigma) * unit.factor, strict=True
+    )
     coefficients = ", ".join(f"{axis} {with_uncertainty(value, sigma)}" for axis, value, sigma in pairs)
     moved = ", ".join(f"{axis} ±{value:.3g}" for axis, value in zip(axes, own[0], strict=True))
     return f"{coefficients} {units.pop()}, moves the bias by {moved} {unit.shown}"

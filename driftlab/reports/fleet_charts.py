@@ -99,9 +99,7 @@ def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tupl
 
     A unit that is measured badly has limits so wide that nothing else could be distinguished.
     """
-    all_of = np.concatenate(
-        [ends, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]]
-    )
+    all_of = np.concatenate([ends, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]])
     low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room

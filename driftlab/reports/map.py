@@ -6,7 +6,7 @@ import numpy as np
 
 from driftlab.maps.assessment import MapVerdict, text
 from driftlab.maps.kind_selection import KindComparison
-from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, band_alone, series
+from driftlab.reports.charts import Chart, Line, LineStyle, Panel, Rule, Shade, band_alone, series
 from driftlab.reports.map_selection import section
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
@@ -17,6 +17,7 @@ from fusion_core.chunk import Array
 LABEL = "temperature [°C]"
 NEITHER = "before the first turn"
 NAMES = WAYS | {NEITHER: 0}
+STYLES: tuple[LineStyle, ...] = ("line", "dashed", "dotted")  # so that none hides one that is alike
 ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
 
 
@@ -90,7 +91,7 @@ def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:
     shades, coverage, panels = _holes(verdict), verdict.coverage, []
     if verdict.sigma is not None and verdict.good is not None:
         lines = tuple(
-            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2))
+            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2), style=STYLES[k % 3])
             for k, name in enumerate(verdict.axes)
         )
         worst = float(np.max(verdict.good)) * unit.factor

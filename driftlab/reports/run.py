@@ -99,7 +99,9 @@ def nis_sentence(nis: NisTest) -> str:
         return "The NIS is not known, no update was used."
     mean, bounds = f"The mean NIS a component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
     if nis.consistent:
-        return f"{mean}, within {bounds}: innovations are as large as the model says, so its sigma can be used as it is."
+        return (
+            f"{mean}, within {bounds}: innovations are as large as the model says, so its sigma can be used as it is."
+        )
     return f"{mean}, outside {bounds}: {inconsistency(nis.mean)}."
 
 
@@ -131,7 +133,9 @@ def bias_chart(
         bias, sigma, coast, spread = (
             curves[name][:, k] * sensor.factor for name in ("bias", "bias_sigma", "coast", "coast_sigma")
         )
-        yield Line(t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread)  # wide: below all
+        yield Line(
+            t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread
+        )  # wide: below all
         yield Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
         yield Line(t, coast, "prediction", "coast", style="dashed")

@@ -27,7 +27,9 @@ def sentences(line: LineReport) -> list[str]:
         lines = ["Too few units to look for changes of the line."]
     elif not lines:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
-        off = f"Lot {', '.join(lots)} {'are' if len(lots) > 1 else 'is'} off as a whole; beside that no" if lots else "No"
+        off = (
+            f"Lot {', '.join(lots)} {'are' if len(lots) > 1 else 'is'} off as a whole; beside that no" if lots else "No"
+        )
         lines = [f"{off} change of the line in {len(line.units):,} units, {line.order}."]
     return [*lines, *_now(line), *_limits(line)]
 
@@ -78,7 +80,11 @@ def _change(line: LineReport, group: list[tuple[ControlChart, StepChange]]) -> s
 
 
 def _now(line: LineReport) -> list[str]:
-    out = [f"{c.axis} {figure_name(c.quantity)}" for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
+    out = [
+        f"{c.axis} {figure_name(c.quantity)}"
+        for c in line.controls
+        if c.drifting[-1] and c.at[-1] >= len(line.units) - 10
+    ]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
