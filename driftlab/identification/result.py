@@ -93,7 +93,7 @@ def investigate(
 def closed(
     identified: Identification, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Identification:
-    """Return the identification with its errors on the test recordings; `recordings` are the identities of each role's."""
+    """Return the identification with its errors on test recordings; `recordings` are each role's identities."""
     change = change_of(outcomes)
     verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
     first = sentence(change, outcomes)
@@ -319,9 +319,8 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(
-            f"to {what}, record: {experiment.description} (expected {log_likelihood(experiment.expected_gain_nats)})"
-        )
+        gain = log_likelihood(experiment.expected_gain_nats)
+        lines.append(f"to {what}, record: {experiment.description} (expected {gain})")
     named = {name_of(finding.effect) for finding in verdict.findings}
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
@@ -356,9 +355,7 @@ def size(fit: Joint, finding: Finding, evidence: Evidence) -> str:
     if len(effect.coefficients or ()) != len(axes) or len(effect.sigma or ()) != len(axes) or len(units) != 1:
         each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
         return f"moves the bias by {', '.join(each)} {unit.shown}"
-    pairs = zip(
-        axes, np.asarray(effect.coefficients) * unit.factor, np.asarray(effect.sigma) * unit.factor, strict=True
-    )
+    pairs = zip(axes, *np.array([effect.coefficients, effect.sigma], dtype=np.float64) * unit.factor, strict=True)
     coefficients = ", ".join(f"{axis} {with_uncertainty(value, sigma)}" for axis, value, sigma in pairs)
     moved = ", ".join(f"{axis} ±{value:.3g}" for axis, value in zip(axes, own[0], strict=True))
     return f"{coefficients} {units.pop()}, moves the bias by {moved} {unit.shown}"

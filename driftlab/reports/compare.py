@@ -96,7 +96,7 @@ def _folded(rows: Rows, axes: Sequence[str], unit: BiasUnit) -> list[tuple[str, 
         texts = [unit.number(value, "–") for value in values]
         if len(set(texts)) == 1:
             return texts[0] if len(axes) == 1 else f"{texts[0]} each"
-        return ", ".join(f"{axis} {value}" for axis, value in zip(axes, texts, strict=True))
+        return ", ".join(f"{axis}\u00a0{value}" for axis, value in zip(axes, texts, strict=True))
 
     folded: list[tuple[str, list[tuple[str, str]]]] = []
     for label, columns in rows:

@@ -43,7 +43,8 @@ TITLES = {
     "level": "Level of the map, mean over the range",
 }
 CAPTION = (
-    "A point a unit; one far off stands at the edge, its value in the label. Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
+    "A point a unit; one far off stands at the edge, its value in the label. "
+    "Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
     "well. Dotted: limits of the EWMA. Broad: what is usual between the changes; shaded: where a change is, by 95 %."
 )
 

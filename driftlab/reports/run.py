@@ -63,7 +63,7 @@ def page_of(
         domain=domain,
         axes=sensor.axes,
         unit=unit.shown,
-        rows=[(label, [unit.number(v, "–") for v in values]) for label, (values,) in error_rows([scores])],
+        rows=_errors(scores, unit),
         headings=[f"{name} {formatted(np.rad2deg(angle), '.2f')}" for name, angle in headings],
         nis=nis_sentence(overview.nis),
         nis_chart=nis_chart(overview, model.m),
@@ -74,6 +74,18 @@ def page_of(
         config=config,
         sections=sections(summary, overview.curves),
     )
+
+
+def _errors(scores: Scores, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+    """Return the errors of each axis, the sigma of a prediction in brackets: a label, and a text an axis."""
+    cells: list[tuple[str, list[str]]] = []
+    for label, (values,) in error_rows([scores]):
+        texts = [unit.number(value, "–") for value in values]
+        if label.startswith(" "):  # the sigma of the row before
+            above, errors = cells.pop()
+            label, texts = above, [f"{error} ({sigma})" for error, sigma in zip(errors, texts, strict=True)]
+        cells.append((label, texts))
+    return cells
 
 
 def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[str, str]:
