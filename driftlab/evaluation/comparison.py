@@ -221,7 +221,7 @@ def tables(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
     for name in LONGEST_FIRST:
         coast += [(f"prediction, {name}", [y.coast[name] for y in scores])]
         coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in scores])]
-    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(runs)]
+    return [("Prediction error, and its sigma (not in the paper)", coast), *paper(runs)]
 
 
 def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:

@@ -180,6 +180,18 @@ def error_rows(runs: Sequence[Scores]) -> Rows:
     ]
 
 
+def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, list[tuple[Array, Array | None]]]]:
+    """Return the rows of `error_rows` with the sigma of a prediction beside its error, None where there is none."""
+    filters = error_rows(runs)[-2:]
+    return [
+        *(
+            (f"prediction, {name}", [(run.coast[name], run.coast_sigma[name]) for run in runs])
+            for name in LONGEST_FIRST
+        ),
+        *((label, [(values, None) for values in columns]) for label, columns in filters),
+    ]
+
+
 def coasts_over_axes(rows: Rows) -> Rows:
     """Return the rows of the coasts of `error_rows`, with the rms (1,) over the axes in place of the errors (d,)."""
     return [(label, [np.array([over_axes(v)]) for v in columns]) for label, columns in rows[: 2 * len(LONGEST_FIRST)]]

@@ -345,14 +345,14 @@ def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
 
 
 def size(fit: Joint, finding: Finding, evidence: Evidence) -> str:
-    """Return how large an effect is: `x 3.06 ± 0.04 deg/h/K, moves the bias by x ±12.1 deg/h`.
+    """Return the size of an effect: `x 3.06 ± 0.04 deg/h/K, moves the bias by x ±12.1 deg/h`.
 
     The second is half of what it moves the bias by. Where an axis has several coefficients that alone, with its sigma.
     """
     effect, axes, unit = fit.effects[finding.place], evidence.axes, evidence.unit
     own = [values[finding.place] * unit.factor for values in (fit.sizes, fit.sizes_sigma)]
     units = set(effect.units_of(unit.shown))
-    if len(effect.coefficients or ()) != len(axes) or len(effect.sigma or ()) != len(axes) or len(units) != 1:
+    if {len(effect.coefficients or ()), len(effect.sigma or ())} != {len(axes)} or len(units) != 1:
         each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
         return f"moves the bias by {', '.join(each)} {unit.shown}"
     pairs = zip(axes, *np.array([effect.coefficients, effect.sigma], dtype=np.float64) * unit.factor, strict=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
 
 import numpy as np
 
@@ -212,8 +211,11 @@ def search(
 
 def _falling(points: list[Point]) -> tuple[Point, ...]:
     """Return the points with the best profile of up to so many hours: who has more may stop earlier."""
-    bests = list(accumulate((point.best for point in points), lambda a, b: a if a.score < b.score else b))
-    return tuple(replace(point, best=best) for point, best in zip(points, bests, strict=True))
+
+    def best(hours: float) -> RatedProfile:
+        return min((point.best for point in points if point.hours <= hours), key=lambda item: item.score)
+
+    return tuple(replace(point, best=best(point.hours)) for point in points)
 
 
 def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str:

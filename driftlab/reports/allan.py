@@ -232,11 +232,8 @@ def _positive(values: Array) -> Array:
     return np.where(values > 0, values, np.nan)
 
 
-LETTERS = ("Q", "N", "B", "K", "R")  # of the coefficients in IEEE Std 952 and 1293
-
-
 def names_of(units: DeviationUnits) -> dict[str, str]:
-    """Return the names of the coefficients of a sensor, each with its letter: of a gyro N is the angle random walk."""
+    """Return the names of the coefficients of a sensor, each with its letter in IEEE Std 952 and 1293."""
     noise, walk = {
         "rad/s": ("angle random walk (ARW, N)", "rate random walk (RRW, K)"),
         "m/s^2": ("velocity random walk (VRW, N)", "acceleration random walk (K)"),

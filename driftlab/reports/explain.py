@@ -60,20 +60,14 @@ def tables(closed: Identification) -> list[Table]:
     evidence = closed.search.columns.evidence
     sides = ["before", "after"] if closed.anything else ["declared"]  # where nothing was added both are the same
     return [
-        error_table(
-            f"test recording {Path(o.name).name}",
-            sides,
-            [(label, columns[: len(sides)]) for label, columns in _rows(o)],
-            evidence.axes,
-            evidence.unit,
-        )
+        error_table(f"test recording {Path(o.name).name}", sides, _rows(o, len(sides)), evidence.axes, evidence.unit)
         for o in closed.outcomes
     ]
 
 
-def _rows(outcome: Outcome) -> Rows:
+def _rows(outcome: Outcome, sides: int = 2) -> Rows:
     """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
-    return error_rows([overview.yardsticks for overview in outcome.overviews])
+    return error_rows([overview.yardsticks for overview in outcome.overviews[:sides]])
 
 
 def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:

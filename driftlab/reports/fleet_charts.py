@@ -15,17 +15,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.outliers import Outlier
 from driftlab.family.record import UnitRecord, figure_name
-from driftlab.reports.charts import (
-    SERIES,
-    Chart,
-    Line,
-    LineStyle,
-    Panel,
-    Shade,
-    axis_panels,
-    series,
-    without_spikes,
-)
+from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series, without_spikes
 from driftlab.spc.charts import ControlChart, LineReport
 from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
@@ -130,11 +120,11 @@ def _limits(
     place: Array, few: NDArray[np.intp], both: tuple[Array, Array], shown: Callable[[Array], Array], *, ewma: bool
 ) -> list[Line]:
     """Return two limits, of the values or of the EWMA; one that is the same all along has two points."""
-    name, role = ("limits of the EWMA", "limit") if ewma else ("three sigma", "limit")
+    name = "limits of the EWMA" if ewma else "three sigma"
     style: LineStyle = "dotted" if ewma else "dashed"
     steady = all(np.ptp(values) <= 0.02 * abs(both[1] - both[0]).max() for values in both)
     at = few[[0, -1]] if steady else few
-    return [Line(place[at], shown(values[at]), name, role, style=style) for values in both]
+    return [Line(place[at], shown(values[at]), name, "limit", style=style) for values in both]
 
 
 def distributions(line: LineReport) -> list[dict[str, Any]]:

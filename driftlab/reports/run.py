@@ -16,7 +16,7 @@ import numpy as np
 from driftlab.evaluation.comparison import REFUTED
 from driftlab.evaluation.overview import SMOOTHED, Overview
 from driftlab.evaluation.scores import Scores, moving_average
-from driftlab.evaluation.summary import error_rows, inconsistency, remarks
+from driftlab.evaluation.summary import error_pairs, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
 from driftlab.reports.charts import Chart, Clock, Line, Panel, Rule, Shade
@@ -47,14 +47,12 @@ def page_of(
     domain = None if fitted is None else fitted.domain
     aligned = moment(journal.alignments[0].t, journal.faults.first_row)
     headings = scores.heading.items() if sensor.integral is not None else ()
-    result, use = result_sentences(scores, unit, heading=sensor.integral is not None)
     return page(
         "report",
         title=title,
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
-        result=result,
-        use=use,
+        results=result_sentences(scores, unit, heading=sensor.integral is not None),
         remarks=remarks(overview, model, journal),
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
@@ -78,14 +76,14 @@ def page_of(
 
 def _errors(scores: Scores, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     """Return the errors of each axis, the sigma of a prediction in brackets: a label, and a text an axis."""
-    cells: list[tuple[str, list[str]]] = []
-    for label, (values,) in error_rows([scores]):
-        texts = [unit.number(value, "–") for value in values]
-        if label.startswith(" "):  # the sigma of the row before
-            above, errors = cells.pop()
-            label, texts = above, [f"{error} ({sigma})" for error, sigma in zip(errors, texts, strict=True)]
-        cells.append((label, texts))
-    return cells
+
+    def text(error: float, sigma: float | None = None) -> str:
+        return unit.number(error, "–") + ("" if sigma is None else f" ({unit.number(sigma, '–')})")
+
+    rows = []
+    for label, ((errors, sigmas),) in error_pairs([scores]):
+        rows.append((label, [text(*pair) for pair in zip(errors, *([] if sigmas is None else [sigmas]), strict=True)]))
+    return rows
 
 
 def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[str, str]:
