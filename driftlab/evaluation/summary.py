@@ -180,16 +180,11 @@ def error_rows(runs: Sequence[Scores]) -> Rows:
     ]
 
 
-def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, list[tuple[Array, Array | None]]]]:
+def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, Sequence[tuple[Array, Array | None]]]]:
     """Return the rows of `error_rows` with the sigma of a prediction beside its error, None where there is none."""
-    filters = error_rows(runs)[-2:]
-    return [
-        *(
-            (f"prediction, {name}", [(run.coast[name], run.coast_sigma[name]) for run in runs])
-            for name in LONGEST_FIRST
-        ),
-        *((label, [(values, None) for values in columns]) for label, columns in filters),
-    ]
+    predicted = [(name, [(run.coast[name], run.coast_sigma[name]) for run in runs]) for name in LONGEST_FIRST]
+    filters = [(label, [(values, None) for values in columns]) for label, columns in error_rows(runs)[-2:]]
+    return [*((f"prediction, {name}", columns) for name, columns in predicted), *filters]
 
 
 def coasts_over_axes(rows: Rows) -> Rows:
