@@ -219,9 +219,9 @@ def tables(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
     scores = [run.yardsticks for run in runs.values()]
     coast: list[tuple[str, list[Array]]] = []
     for name in LONGEST_FIRST:
-        coast += [(f"prediction, {name}", [y.coast[name] for y in scores])]
+        coast += [(f"coast, {name}", [y.coast[name] for y in scores])]
         coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in scores])]
-    return [("Prediction error, and its sigma (not in the paper)", coast), *paper(runs)]
+    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(runs)]
 
 
 def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:

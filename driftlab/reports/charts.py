@@ -293,11 +293,9 @@ def without_spikes(values: Array, few: float = FEW) -> tuple[float, float]:
     """Return from where to where values are drawn: all, or without a few far ones that would squash the others."""
     low, high = np.percentile(values, (10, 90))
     room = FAR * (high - low)
-    outside = np.sum((values < low - room) | (values > high + room))
-    least, most = float(np.min(values)), float(np.max(values))
-    if not room or outside > max(1.0, few * len(values)):
-        return least, most
-    return max(least, float(low - room)), min(most, float(high + room))
+    inside = values[(values >= low - room) & (values <= high + room)]
+    drawn = inside if room and len(values) - len(inside) <= max(1.0, few * len(values)) else values
+    return float(np.min(drawn)), float(np.max(drawn))
 
 
 def _finite(parts: Iterable[Array | None]) -> Array:

@@ -46,7 +46,7 @@ def test_the_mean_over_many_coasts_is_between_the_limits_of_one_run(walk):
         one = of_coast(score(run, None, AXES), 5400.0 - align, align)
         below += list(one.low <= np.sqrt(mean))
         above += list(one.high >= np.sqrt(mean))
-    assert one.stands_on.startswith("8 coasts of 10 min")
+    assert one.stands_on.startswith("8 predictions of 10 min")
     assert np.mean(below) >= 0.9  # 95 %, of 90 draws
     assert np.mean(above) >= 0.9
 

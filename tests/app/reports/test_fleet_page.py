@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browsers import assert_drawn_everywhere, overflow
+from browsers import assert_drawn_everywhere, assert_fits_on_paper, overflow
 from lines import AXES, DEG_H, line
 
 from driftlab.config import Limits
@@ -220,6 +220,36 @@ def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):
     shown = opened(path)
     assert "3 units: 0 done, 3 failed" in shown.locator("body").inner_text()
     assert cells(shown, "state") == ["failed"] * 3
+
+
+def test_on_paper_no_table_is_wider_than_the_sheet(path, opened):
+    assert_fits_on_paper(opened(path, width=688))
+
+
+def test_the_headline_has_the_odd_units_of_the_list_below(opened, tmp_path):
+    calm = fleet(40, odd=(3, 11), remarks=())
+    records = line(40, 1)
+    calm = replace(calm, records=records, line=line_of(records, LIMITS))
+    write_fleet_report(tmp_path / "calm.html", calm)
+    shown = opened(tmp_path / "calm.html")
+    headline = shown.locator(".verdict").last.inner_text()
+    assert headline.startswith("2 of 40 units are odd. ")
+    assert "No change of the line" in headline  # that alone would say that nothing is to be looked at
+    assert "odd units back" in shown.locator("p.use").inner_text()
+
+
+def test_a_unit_far_off_leaves_the_scale_to_the_others_and_its_value_in_the_label(overview):
+    records = line(60, 2)
+    figure = records[20].figures["noise"]
+    far = figure.model_copy(update={"value": tuple(15 * value for value in figure.value)})
+    records[20] = records[20].model_copy(update={"figures": {**records[20].figures, "noise": far}})
+    (chart,) = [chart for chart in control_charts(line_of(records, LIMITS)) if chart.title.startswith("White noise")]
+    values = np.array([one.figures["noise"].value for k, one in enumerate(records) if k != 20]) * RATE.factor
+    for k, panel in enumerate(chart.panels):
+        assert panel.span[1] < 2 * values[:, k].max()
+        assert panel.label.endswith(f"beyond the axis: {records[20].unit} at {far.value[k] * RATE.factor:.3g}")
+        (beyond,) = [one for one in panel.lines if one.name == "beyond three sigma"]
+        assert np.any((beyond.x == 21) & (beyond.y <= panel.span[1]))  # at the edge, in sight
 
 
 def test_half_of_the_units_are_in_the_narrow_band():

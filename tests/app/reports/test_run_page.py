@@ -117,7 +117,7 @@ def test_every_figure_is_drawn_and_can_be_zoomed_and_read(page, opened):
     box = shown.locator("figure.chart").nth(1).locator(".u-over").first.bounding_box()
     shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     said = shown.locator("figure.chart").nth(1).locator(".read").inner_text()
-    assert re.search(r"error x \[deg/h\]: .*estimate less reference -?\d.*, coast less reference -?\d", said)
+    assert re.search(r"error x \[deg/h\]: .*estimate less reference -?\d.*, prediction less reference -?\d", said)
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -151,7 +151,7 @@ def test_errors_are_those_of_every_row_in_a_scale_of_their_own(run):
     windows = [np.mean(found.rate[(abs(found.t - t) < 15 + 1e-9) & found.still.astype(bool), 2])
                for t in found.t[still][::50]]  # fmt: skip
     error = (found.coast[still][::50, 2] - windows) * RATE.factor
-    line = drawn["coast less reference"].y
+    line = drawn["prediction less reference"].y
     assert np.nanmin(line) <= error.min() + 0.05
     assert np.nanmax(line) >= error.max() - 0.05
     low, high = chart.panels[2].span
@@ -203,7 +203,11 @@ def test_on_paper_no_heading_is_left_alone_and_there_is_where_to_sign(page, open
     assert headings <= set(every)
     for lines in pages:
         assert lines[-1] not in headings
-    assert any("measured by checked by date" in line for line in pages[0])  # beside the verdict
+    first = pages[0]
+    (signed,) = [k for k, line in enumerate(first) if "measured by checked by date" in line]
+    (result,) = [k for k, line in enumerate(first) if line.startswith("Without updates the bias is predicted over 10 min")]
+    (error,) = [k for k, line in enumerate(first) if line.startswith("prediction, 10 min ")]
+    assert result < error < signed  # on the sheet that is signed
     assert "dark / light" not in every
 
 
