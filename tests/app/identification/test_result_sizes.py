@@ -27,7 +27,7 @@ def test_a_coefficient_has_its_sigma_and_its_unit():
 
 
 def test_of_several_terms_an_axis_the_whole_is_the_size():
-    effect = Curve(kind="curve", order=2, axes=("x", "y"), coefficients=(1e-6,) * 4, sigma=(1e-7,) * 4)
+    effect = Curve(kind="curve", powers=2, axes=("x", "y"), coefficients=(1e-6,) * 4, sigma=(1e-7,) * 4)
     assert sized(effect) == "moves the bias by x ±12.1 (sigma 0.2), y ±7.4 (sigma 0.3) deg/h"
 
 

@@ -92,7 +92,7 @@ def test_the_terminal_begins_with_the_verdict(run, capsys):
 def test_at_the_top_stand_serial_verdict_and_limits(page, opened):
     shown = opened(page)
     assert "CRS-0042" in shown.locator("p.lead").nth(1).inner_text()
-    verdict = shown.locator(".verdict")
+    verdict = shown.locator(".verdict").first
     assert verdict.get_attribute("class") == "verdict fail"
     assert verdict.bounding_box()["y"] < shown.locator("h2").first.bounding_box()["y"]
     assert shown.locator("table.limits td.pass").count() == 2
@@ -174,7 +174,7 @@ def test_a_plot_shows_what_the_page_shows(run):
     axes = found.plot().axes
     assert [panel.get_ylabel() for panel in axes][3] == "error x [deg/h]"
     estimate = next(line for line in axes[0].get_lines() if line.get_label() == "estimate, ± 2σ")
-    dashed = next(line for line in axes[0].get_lines() if line.get_label() == "coast")
+    dashed = next(line for line in axes[0].get_lines() if line.get_label() == "prediction")
     assert (estimate.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
     assert estimate.get_color() != dashed.get_color()
 
@@ -205,7 +205,9 @@ def test_on_paper_no_heading_is_left_alone_and_there_is_where_to_sign(page, open
         assert lines[-1] not in headings
     first = pages[0]
     (signed,) = [k for k, line in enumerate(first) if "measured by checked by date" in line]
-    (result,) = [k for k, line in enumerate(first) if line.startswith("Without updates the bias is predicted over 10 min")]
+    (result,) = [
+        k for k, line in enumerate(first) if line.startswith("Without updates the bias is predicted over 10 min")
+    ]
     (error,) = [k for k, line in enumerate(first) if line.startswith("prediction, 10 min ")]
     assert result < error < signed  # on the sheet that is signed
     assert "dark / light" not in every
