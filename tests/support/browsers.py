@@ -65,7 +65,8 @@ def assert_nothing_is_cut_in_silence(page) -> None:
     silent = page.evaluate(
         """() => [...document.querySelectorAll('body *')].filter((box) => box.clientWidth > 0
           && box.scrollWidth > box.clientWidth + 1 && box.checkVisibility()
-          && ['auto', 'scroll', 'hidden'].includes(getComputedStyle(box).overflowX) && !box.closest('figure.chart') && getComputedStyle(box).clipPath === 'none'
+          && ['auto', 'scroll', 'hidden'].includes(getComputedStyle(box).overflowX)
+          && !box.closest('figure.chart') && getComputedStyle(box).clipPath === 'none'
           && !(box.previousElementSibling?.matches('.hint') && box.previousElementSibling.offsetHeight > 0))
           .map((box) => `${box.tagName} ${box.className} ${box.textContent.slice(0, 40)}`)"""
     )

@@ -118,7 +118,7 @@ def test_sizes_are_said_in_the_unit_of_the_sensor(tmp_path):
     assert 0 < sigma < 0.05 * size
     assert content["effects"][0]["size_text"] in line
     assert f", moves the bias by resistance ±{size * 1e6:.3g} ppm;" in line
-    value, off = map(float, re.search(r"resistance (\S+) ± (\S+) ppm/V,", line).groups())
+    value, off = map(float, re.search(r"resistance (\S+) ± (\S+) ppm per SI unit of the channel,", line).groups())
     assert abs(value - 5) < 3 * off + 0.05
 
 

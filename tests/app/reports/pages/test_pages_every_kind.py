@@ -82,7 +82,7 @@ def test_kinds_are_bars_with_their_names(soak, tmp_path, monkeypatch, opened):
     names = [row["name"] for row in sorted(tried.summary["compare"]["tried"], key=lambda row: row["error"])]
     assert [text.removesuffix(" taken") for text in bars.locator(".name").all_inner_texts()] == names
     assert bars.locator(".name strong").count() == 1
-    widths = [bar["width"] for bar in map(lambda k: bars.nth(k).locator(".bar").bounding_box(), range(len(names)))]
+    widths = [bars.nth(k).locator(".bar").bounding_box()["width"] for k in range(len(names))]
     assert widths == sorted(widths)
 
 

@@ -9,7 +9,8 @@ from driftlab.reports import pages
 from driftlab.reports.charts import LOOKS, Chart, Line, Panel, axis_panels, without_spikes
 
 BODY = """{% extends "base.html" %}{% block title %}wide{% endblock %}{% block body %}
-<pre>{{ text }}</pre>{{ interactive(chart) }}<script type="application/json" id="units">["0001\\n2026-03-01", "0002\\n2026-03-02"]</script>
+<pre>{{ text }}</pre>{{ interactive(chart) }}
+<script type="application/json" id="units">["0001\\n2026-03-01", "0002\\n2026-03-02"]</script>
 {% endblock %}"""
 
 
