@@ -83,10 +83,12 @@ def _curves(analysis: Analysis, channel: str) -> dict[str, Any]:
 
 def table(analysis: Analysis, channel: str) -> TextTable:
     """Return the coefficients of a triad, axes as columns, in the units of data sheets."""
-    cells = [
-        [f"{name}\n[{unit}]", *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells)]
-        for name, unit, cells in rows(analysis, channel)
-    ]
+    cells = []
+    for name, unit, texts in rows(analysis, channel):
+        full, _, within = name.rstrip(")").partition(" (")
+        short, _, letter = within.rpartition(", ")  # 80 columns have no room for a long name
+        head = f"{short or full}\n{letter} [{unit}]"
+        cells.append([head, *(text.replace(" (", "\n(").replace(" to ", "–") for text in texts)])
     title = f"{channel}: value and {100 * LEVEL:.0f} % limits"
     return TextTable(["", *analysis.axes[channel]], cells, title, rigid=True)
 
@@ -236,7 +238,7 @@ def names_of(units: DeviationUnits) -> dict[str, str]:
     """Return the names of the coefficients of a sensor, each with its letter in IEEE Std 952 and 1293."""
     noise, walk = {
         "rad/s": ("angle random walk (ARW, N)", "rate random walk (RRW, K)"),
-        "m/s^2": ("velocity random walk (VRW, N)", "acceleration random walk (K)"),
+        "m/s^2": ("velocity random walk (VRW, N)", "random walk (K)"),
     }.get(units.deviation_si, ("white noise (N)", "random walk (K)"))
     return dict(zip(KEYS, ("quantisation (Q)", noise, "bias instability (B)", walk, "ramp (R)"), strict=True))
 

@@ -138,7 +138,7 @@ def test_a_hysteresis_that_is_seen_stands_beside_the_verdict_where_no_limit_is_s
     assert [row.as_json(RATE).get("beside") for row in rows] == [beside]
     assert outcome(verdict(rows)) == "pass"
     two = verdict(check_limits(Limits(swing=1.0, coast=1.0), of_map(remembering(**seen))))
-    assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: coast")
+    assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: prediction")
     assert two.endswith(f"; {beside}")
     for memory in ({"answer": "none", "none_larger_than": [1e-7, 1e-7]}, {"answer": "undecided"}):
         assert "hysteresis" not in verdict(check_limits(Limits(swing=1.0), of_map(remembering(**memory))))
