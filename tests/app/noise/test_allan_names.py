@@ -8,7 +8,6 @@ import pytest
 from driftlab.noise.allan_model import KEYS
 from driftlab.reports.allan import UNITS, names_of, result_lines, table
 
-
 SIZES = {"gyro": [5e-6, 1.5e-5, 4e-6, 2.8e-6, 3.6e-7], "accel": [2e-4, 8.3e-4, 1e-4, 2e-5, 6e-7]}  # SI, of MEMS units
 
 
