@@ -32,8 +32,8 @@ def coasts(folder: Path) -> dict[str, Coast]:
 def table(title: str, rows: Iterable[tuple[str, Mapping[str, Coast]]], axes: Sequence[str], scale: float) -> Table:
     """Return rows of errors before and after, in units of `scale` (SI); several axes also as their rms."""
     made = Table(title=title, title_justify="left")
-    for heading in ("coast, to the end", "", *axes, *(["rms"] if len(axes) > 1 else [])):
-        made.add_column(Text(heading), justify="left" if heading in ("coast, to the end", "") else "right")
+    for heading in ("prediction, to the end", "", *axes, *(["rms"] if len(axes) > 1 else [])):
+        made.add_column(Text(heading), justify="left" if heading in ("prediction, to the end", "") else "right")
     for label, found in rows:
         for which, what in enumerate(("rmse", "constant removed")):
             for name in ("before", "after"):

@@ -39,7 +39,7 @@ class CompareResult(Result):
         return self.found[name]
 
     def lines(self) -> list[str]:
-        """Return the ranking by coast, and the notes on the runs, a sentence each."""
+        """Return the ranking by prediction, and the notes on the runs, a sentence each."""
         return [self.summary["verdict"], *comparison.limit_lines(self.found), *comparison.notes(self.found)]
 
     def to_polars(self) -> pl.DataFrame:
@@ -75,7 +75,7 @@ def compare(
     channel: str | None = None,
     progress: Progress | None = None,
 ) -> CompareResult:
-    """Compare configs on one recording: which coasts best.
+    """Compare configs on one recording: which predicts best without updates.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def compare(
     Returns
     -------
     CompareResult
-        The comparison of each config, by name; `to_polars()` gives the paper's tables 5 to 12, and how each coasts.
+        The comparison of each config, by name; `to_polars()` gives the paper's tables 5 to 12, and how each predicts.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 
 def show(result: CompareResult, given: Mapping[str, Any]) -> None:
-    """Print who coasts best, the tables, and with `paper` the paper's too."""
+    """Print who predicts best, the tables, and with `paper` the paper's too."""
     comparisons = result.found
     first = next(iter(comparisons.values()))
     sensor, unit = first.sensor, first.initial.unit

@@ -56,9 +56,9 @@ SAME = 0.9  # share of the samples from which on two recordings are one
 
 
 class ExplainResult(Result):
-    """The verdict on a declared model, the new config, and the predictions of both models for the holdout.
+    """The verdict on a declared model, the new config, and the predictions of both models for the test recordings.
 
-    Arrays are those of `prediction.h5`, one holdout recording after the other: `t` (N,), `reference`, `before`,
+    Arrays are those of `prediction.h5`, one test recording after the other: `t` (N,), `reference`, `before`,
     `after`, `before_sigma`, `after_sigma` (N, d), and `recording` (N,), the number of the recording.
 
     Attributes
@@ -91,7 +91,7 @@ class ExplainResult(Result):
         return list(self.closed.lines)
 
     def plot(self, k: int = 0) -> Figure:
-        """Draw the prediction of the k-th holdout recording, before and after, and its errors."""
+        """Draw the prediction of the k-th test recording, before and after, and its errors."""
         return figure_of(prediction_chart(self.closed.outcomes[k], self.closed.search.columns.evidence.axes))
 
     def _write(self, folder: Path) -> None:
@@ -142,7 +142,7 @@ def explain(
     Returns
     -------
     ExplainResult
-        `verdict`, `config` (the new one), and `t` (N,), `reference`, `before`, `after` (N, d) of the holdout.
+        `verdict`, `config` (the new one), and `t` (N,), `reference`, `before`, `after` (N, d) of the test recordings.
 
     Raises
     ------
@@ -184,8 +184,8 @@ def _closed(
     explanation = investigate(evidence, settings, declared_effects(config), progress, without)
     new = _explained(config, explanation, fitted, settings, [*calibration, *train], folder, estimate)
     _write_config(folder / "explained.yaml", new, explanation.verdict.word, explanation.lines)
-    progress("opening the holdout")
-    # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
+    progress("opening the test recording")
+    # a test recording that leaves the map's domain is judged all the same, and not refused after all the work
     both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
     outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
     identities = {role: list(map(identity, names)) for role, names in recordings.items()}
@@ -260,7 +260,7 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
 
 
 def _limit_results(config: Config, runs: Sequence[tuple[Overview, Run]]) -> list[LimitResult]:
-    """Hold the worst holdout, and the map, against the limits of the config."""
+    """Hold the worst test recording, and the map, against the limits of the config."""
     if config.limits is None:
         return []
     measured = []
@@ -287,7 +287,7 @@ def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult])
 def outcome_of(
     declared: Config, explained: Config, recording: str, progress: Progress
 ) -> tuple[Outcome, tuple[Run, Run]]:
-    """Run one holdout recording, which is read once, through both configs; return what they predict, and the runs."""
+    """Run one test recording, which is read once, through both configs; return what they predict, and the runs."""
     config, faults = with_recording(declared, recording), Faults()
     stream = list(epochs(read(config, faults), config.filter.update_interval if config.filter else 1.0))
     progress(f"running {recording} through the declared config")
@@ -321,7 +321,7 @@ def _run(config: Config, stream: Sequence[Chunk], faults: Faults) -> tuple[dict[
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """Write `prediction.h5`: what was predicted of each holdout recording, in a group named by its file's stem."""
+    """Write `prediction.h5`: what was predicted of each test recording, in a group named by its file's stem."""
     import h5py
 
     whole = io.BytesIO()  # HDF5 itself does not survive a full disk

@@ -246,7 +246,7 @@ def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
 
 
 def verdict(runs: Mapping[str, Comparison]) -> str:
-    """Return the config that coasts best, and whether that is more than chance."""
+    """Return the config that predicts best, and whether that is more than chance."""
     unit = next(iter(runs.values())).initial.unit
     scores = {name: run.yardsticks for name, run in runs.items()}
     return coast_verdict(scores, unit, min(run.span for run in runs.values()))
@@ -352,13 +352,13 @@ def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
 
 
 def coast_verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
-    """Return the config that coasts best, by how much, and whether it is more than the sigma.
+    """Return the config that predicts best, by how much, and whether it is more than the sigma.
 
     All are of one recording; `span` is from the end of the alignment to its end, s.
     """
     ranked = ranking(runs)
     if ranked is None:
-        return "The config that coasts best is not known: too little of the recording is at rest after the alignment."
+        return "The config that predicts best is not known: too little of the recording is at rest after the alignment."
     text = _single(ranked, unit) if len(runs) == 1 else _several(ranked, unit)
     text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
     return text + _shorter(runs, ranked, span)
@@ -367,7 +367,7 @@ def coast_verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> st
 def _single(ranked: Ranking, unit: BiasUnit) -> str:
     ((name, error),) = ranked.errors.items()
     size = f"{unit.number(error)} {unit.shown}"
-    return f"{name} coasts {size} off, {ranked.horizon}; there is nothing to compare it with."
+    return f"{name} predicts with an error of {size}, {ranked.horizon}; there is nothing to compare it with."
 
 
 def _several(ranked: Ranking, unit: BiasUnit) -> str:
@@ -378,12 +378,12 @@ def _several(ranked: Ranking, unit: BiasUnit) -> str:
     others = ", ".join(f"{name} {value}" for name, value in values.items() if name not in best) + f" {unit.shown}"
     if len(best) == 1:
         return (
-            f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
+            f"On this one recording {best[0]} predicts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
             f"{others}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
         )
     worse = f"; worse: {others}" if len(best) < len(values) else ""
     return (
-        f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
+        f"On this one recording no difference is proven between {listed(best)}: {ranked.horizon} "
         f"{listed([values[n] for n in best])} {unit.shown}{over}, "
         f"within {_sigma(ranked, best, unit)}{_disagree(ranked)}{worse}."
     )
@@ -427,5 +427,5 @@ def _shorter(runs: Mapping[str, Scores], ranked: Ranking, span: float) -> str:
     if set(short.best) == set(ranked.best):
         return f" Over {OFTEN} the same."
     if len(short.best) == 1:
-        return f" Over {OFTEN} {short.best[0]} coasts best."
-    return f" Over {OFTEN} there is no difference between {listed(short.best)}."
+        return f" Over {OFTEN} {short.best[0]} predicts best."
+    return f" Over {OFTEN} none is proven between {listed(short.best)}."

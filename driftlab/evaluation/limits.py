@@ -37,7 +37,7 @@ VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's ro
 NAMES = {
     "bias_instability": "bias instability",
     "residual": "residual of the map",
-    "coast": "coast over 10 min (rms)",
+    "coast": "prediction over 10 min (rms)",
     "swing": "swing of the map",
     "noise": "white noise",
     "hysteresis": "hysteresis",

@@ -158,7 +158,7 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     variances = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
     low, high = np.sqrt(np.array(variances)).T
     high = np.maximum(high, yardsticks.coast[COAST])
-    stands_on = f"{J} coast{'s' * (J > 1)} of {COAST}, {at_rest}"
+    stands_on = f"{J} prediction{'s' * (J > 1)} of {COAST}, {at_rest}"
     return Measured(values, axes, low, high, stands_on, seconds=length)
 
 

@@ -40,7 +40,7 @@ from driftlab.family.outlier_tests import (
     tests_of,
     unscaled,
 )
-from driftlab.family.record import PER, UnitRecord
+from driftlab.family.record import PER, UnitRecord, figure_name
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
@@ -253,7 +253,7 @@ class _Words:
         sentence = {
             "hysteresis": f"{called} differs by {size} between warming and cooling",
             "soaks": f"two soaks differ more than one unit can: by {size} on {called}",
-        }.get(what, f"{what} of {called} is {size}")
+        }.get(what, f"{figure_name(what)} of {called} is {size}")
         of_most = f"of most units {low * factor:.3g} to {high * factor:.3g}"
         sentence += ", more than noise explains" if law is None else f", {of_most}"
         return Outlier(

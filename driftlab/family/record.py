@@ -58,6 +58,11 @@ the walk, largest less smallest bias of the map, rms of the error of 10 min with
 PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}  # of the unit of a figure, beside that of the bias
 
 
+def figure_name(figure: str) -> str:
+    """Return the name of a figure for people, where files have another."""
+    return {"coast": "prediction"}.get(figure, figure)
+
+
 class Figure(BaseModel):
     """One quantity of a unit, a value an axis.
 

@@ -342,8 +342,8 @@ def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     """Return an effect with its sizes and its evidence, in sentences."""
     name = described(effect.effect)
     lines = [
-        f"{name}: {_where(effect)}, {_sizes(effect, effect, unit, axes)}; {effect.evidence:.0f} nats "
-        f"({effect.price:.0f} needed), and a unit that was left out is predicted {effect.left_out:.2g} nats better."
+        f"{name}: {_where(effect)}, {_sizes(effect, effect, unit, axes)}; log-likelihood "
+        f"{effect.evidence:.0f} ({effect.price:.0f} needed), {effect.left_out:.2g} more for a unit that was left out."
     ]
     if effect.others is not None:
         lines.append(f"{name}: in the other lots {_sizes(effect, effect.others, unit, axes)}.")

@@ -191,9 +191,9 @@ class _Search:
             if one.pays:
                 why = "predicts no more than others do"
             elif one.chance > one.price + CHANCE:
-                why = f"{one.chance:.0f} nats, and left-out units are not predicted better ({one.total:+.0f} nats)"
+                why = f"log-likelihood {one.chance:.0f}, and left-out units are not predicted better ({one.total:+.0f})"
             else:
-                why = f"{one.chance:.1f} nats of {one.price + CHANCE:.1f} needed"
+                why = f"log-likelihood {one.chance:.1f} of {one.price + CHANCE:.1f} needed"
             reasons.append((described(one.effect), why))
         return tuple(RejectedEffect(effect=name, reason=why) for name, why in (*reasons, *self.refused.items()))
 

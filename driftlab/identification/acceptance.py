@@ -81,8 +81,8 @@ class CandidateEvidence:
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (
-                f"is seen at slow times alone ({self.chance:.0f} nats at fast ones, {self.price + CHANCE:.0f} needed), "
-                f"and predicts left-out parts {change:+.0f} % (-29 % needed)"
+                f"is seen at slow times alone (log-likelihood {self.chance:.0f} at fast ones, "
+                f"{self.price + CHANCE:.0f} needed), and predicts left-out parts {change:+.0f} % (-29 % needed)"
             )
         return "passes"
 

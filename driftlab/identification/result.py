@@ -1,6 +1,6 @@
 """Result of an identification: the effects that the declared model lacks, and their errors on test recordings.
 
-Predictions of a holdout recording, to which nothing was fitted, by the declared and the explained config.
+Predictions of a test recording, to which nothing was fitted, by the declared and the explained config.
 
 `loop.json`: the verdict for programs.
 
@@ -25,7 +25,7 @@ from driftlab.identification.search import search
 from driftlab.identification.state import LeftOut, Search, Trial, check_length, left_out, name_of, rms
 from driftlab.noise.local_level import falling
 from driftlab.soak.blocks import means, runs
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, with_uncertainty
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Identification:
-    """The effects that the declared model lacks, and once it has been opened, their errors on the holdout."""
+    """The effects that the declared model lacks, and once it has been opened, their errors on the test recordings."""
 
     search: Search  # the identified model, and the trials
     verdict: Diagnosis  # on it
     left_out: tuple[LeftOut, ...]  # prediction errors of left-out parts without the effects and with them
     fit: Joint  # the model fitted to all rows
     lines: tuple[str, ...]  # the verdict in sentences
-    outcomes: tuple[Outcome, ...] = ()  # each holdout recording through both configs
+    outcomes: tuple[Outcome, ...] = ()  # each test recording through both configs
     change: ErrorChange | None = None  # of the prediction error over all of them
     content: dict[str, Any] = field(default_factory=dict)  # that of `loop.json`
 
@@ -54,12 +54,12 @@ class Identification:
 
     @property
     def refuted(self) -> bool:
-        """True if the holdout is predicted worse beyond chance: then the declared config stays."""
+        """True if the test recording is predicted worse beyond chance: then the declared config stays."""
         return self.verdict.word == "refuted"
 
     @property
     def worse(self) -> bool:
-        """True if the holdout is predicted worse with the effects, by chance or beyond it."""
+        """True if the test recording is predicted worse with the effects, by chance or beyond it."""
         return self.change is not None and self.change.after > self.change.before
 
 
@@ -93,7 +93,7 @@ def investigate(
 def closed(
     identified: Identification, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Identification:
-    """Return the identification with its errors on the holdout; `recordings` are the identities of each role's."""
+    """Return the identification with its errors on test recordings; `recordings` are each role's identities."""
     change = change_of(outcomes)
     verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
     first = sentence(change, outcomes)
@@ -110,7 +110,7 @@ SURE = 1.645  # deviations: one-sided, 95 %
 
 @dataclass(frozen=True)
 class Outcome:
-    """One holdout recording through both configs: N times, d axes, SI.
+    """One test recording through both configs: N times, d axes, SI.
 
     `overviews` are of the two runs; log and remarks are of the second.
     """
@@ -131,7 +131,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ErrorChange:
-    """Change of the prediction error over all holdout recordings: its rms before and after, SI.
+    """Change of the prediction error over all test recordings: its rms before and after, SI.
 
     `sigma` is by how many deviations of chance the sum of its squares grows.
     """
@@ -275,6 +275,7 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
         "unit": ", ".join(dict.fromkeys(effect.units_of(bias))) or bias,
         "sigma": dict(zip(labels, sigma, strict=True)),
         **{name: dict(zip(evidence.axes, map(float, values), strict=True)) for name, values in sizes.items()},
+        "size_text": size(fit, finding, evidence),
         "domain": effect.domain or {},
         "regressors": None if effect.regressors is None else dict(zip(labels, effect.regressors, strict=True)),
         **_evidence(finding.trial),
@@ -285,7 +286,7 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
 
 
 def _errors(overviews: Sequence[Overview], unit: BiasUnit) -> dict[str, Any]:
-    """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values.
+    """Return the errors over all test recordings: rms of the rms, mean of the nis, least of the p values.
 
     Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
     """
@@ -312,13 +313,14 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     for trial in verdict.promising:
         lines.append(
             f"{described(trial.term.effect)}: not added, it {predicts(search, trial)}, with "
-            f"{nats(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
+            f"{log_likelihood(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
             "another recording would tell"
         )
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.expected_gain_nats)})")
+        gain = log_likelihood(experiment.expected_gain_nats)
+        lines.append(f"to {what}, record: {experiment.description} (expected {gain})")
     named = {name_of(finding.effect) for finding in verdict.findings}
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
@@ -330,11 +332,11 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
 def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
     evidence, name = finding.trial.evidence, name_of(finding.effect)
     lines = [
-        f"{described(finding.effect)}: {size(search, finding, fit)}; {predicts(search, finding.trial)}; "
-        f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
+        f"{described(finding.effect)}: {size(fit, finding, search.evidence)}; {predicts(search, finding.trial)}; "
+        f"{log_likelihood(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
     ]
     if not evidence.fast:
-        lines.append(f"{name}: stands on what is predicted of left-out recordings alone; record another to be sure")
+        lines.append(f"{name}: stands on the prediction of left-out recordings alone; record another to be sure")
     if finding.alike:
         lines.append(f"{name}: here the same as {', '.join(finding.alike)}")
     if finding.names:
@@ -342,12 +344,21 @@ def _of_finding(search: Search, finding: Finding, fit: Joint) -> list[str]:
     return lines
 
 
-def size(search: Search, finding: Finding, fit: Joint) -> str:
-    """Return half of what an effect moves the bias by on each axis, as `x ±12.1 (sigma 0.2) deg/h`."""
-    axes, unit = search.evidence.axes, search.evidence.unit
-    own = (values[finding.place] * unit.factor for values in (fit.sizes, fit.sizes_sigma))
-    each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
-    return f"{', '.join(each)} {unit.shown}"
+def size(fit: Joint, finding: Finding, evidence: Evidence) -> str:
+    """Return the size of an effect: `x 3.06 ± 0.04 deg/h/K, moves the bias by x ±12.1 deg/h`.
+
+    The second is half of what it moves the bias by. Where an axis has several coefficients that alone, with its sigma.
+    """
+    effect, axes, unit = fit.effects[finding.place], evidence.axes, evidence.unit
+    own = [values[finding.place] * unit.factor for values in (fit.sizes, fit.sizes_sigma)]
+    units = set(effect.units_of(unit.shown))
+    if {len(effect.coefficients or ()), len(effect.sigma or ())} != {len(axes)} or len(units) != 1:
+        each = (f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in zip(axes, *own, strict=True))
+        return f"moves the bias by {', '.join(each)} {unit.shown}"
+    pairs = zip(axes, *np.array([effect.coefficients, effect.sigma], dtype=np.float64) * unit.factor, strict=True)
+    coefficients = ", ".join(f"{axis} {with_uncertainty(value, sigma)}" for axis, value, sigma in pairs)
+    moved = ", ".join(f"{axis} ±{value:.3g}" for axis, value in zip(axes, own[0], strict=True))
+    return f"{coefficients} {units.pop()}, moves the bias by {moved} {unit.shown}"
 
 
 def predicts(search: Search, trial: Trial) -> str:
@@ -361,9 +372,9 @@ def predicts(search: Search, trial: Trial) -> str:
     return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} {unit.shown})"
 
 
-def nats(gain: float) -> str:
+def log_likelihood(gain: float) -> str:
     """Return evidence in words, up to the largest that a computer's numbers can tell."""
-    return f"{gain:.0f} nats" if gain < MAX_NATS else f"more than {MAX_NATS:.0f} nats"
+    return f"log-likelihood {gain:.0f}" if gain < MAX_NATS else f"log-likelihood over {MAX_NATS:.0f}"
 
 
 def described(effect: Effect) -> str:

@@ -8,7 +8,7 @@ where each temperature is passed again and again, going up and going down, it lo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -178,7 +178,7 @@ def ranked(rated: list[RatedProfile]) -> list[RatedProfile]:
 def search(
     subject: UnitModel, chamber: Chamber, hours: float, target: float | None = None, progress: Progress = None
 ) -> SearchResult:
-    """Return the profiles of `hours`, judged, and the Pareto curve of hours against sigma.
+    """Return the profiles of up to `hours`, judged, and the Pareto curve of hours against sigma.
 
     Raises
     ------
@@ -190,19 +190,32 @@ def search(
     tried = [judge(profile, subject, chamber) for profile in candidates(chamber, hours)]
     if max((item.share for item in tried), default=0.0) < MIN_COVERAGE:
         raise ConfigError(_too_short(chamber, hours, tried))
+    points: list[Point] = []
+    for share in SHARES:
+        say(f"profiles of {share * hours:g} h")
+        point = _point(subject, chamber, share * hours) if share != 1.0 else Point(hours, ranked(tried)[0], None)
+        points += [] if point is None else [point]
+    # where a cycle more does not fit, a slower one is worse by the walk: then the recording ends earlier
+    early = min((p.best for p in points if p.hours < hours), key=lambda item: item.score, default=None)
+    tried += [early] if early is not None and ALIKE * early.score < ranked(tried)[0].score else []
     order = ranked(tried)
     classic = next((item for item in tried if _is_classic(item)), None)
     keep = order[:2] + [item for item in (classic,) if item is not None and item not in order[:2]]
     finer = {item: judge(item.profile, subject, chamber, DRAWS) for item in keep}
     order = [finer.get(item, item) for item in order]
     classic = None if classic is None else finer[classic]
-    pareto: list[Point | None] = []
-    for share in SHARES:
-        say(f"profiles of {share * hours:g} h")
-        pareto += [_point(subject, chamber, share * hours)] if share != 1.0 else [Point(hours, order[0], classic)]
-    points = tuple(point for point in pareto if point is not None)
-    shortest = None if target is None else _shortest(subject, chamber, hours, target, points)
-    return SearchResult(subject, chamber, hours, tuple(order), classic, points, target, shortest)
+    pareto = _falling([Point(hours, order[0], classic) if p.hours == hours else p for p in points])
+    shortest = None if target is None else _shortest(subject, chamber, hours, target, pareto)
+    return SearchResult(subject, chamber, hours, tuple(order), classic, pareto, target, shortest)
+
+
+def _falling(points: list[Point]) -> tuple[Point, ...]:
+    """Return the points with the best profile of up to so many hours: who has more may stop earlier."""
+
+    def best(hours: float) -> RatedProfile:
+        return min((point.best for point in points if point.hours <= hours), key=lambda item: item.score)
+
+    return tuple(replace(point, best=best(point.hours)) for point in points)
 
 
 def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str:

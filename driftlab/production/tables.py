@@ -68,7 +68,7 @@ def write_fleet(
     rows = _rows(folder.path, status, analysis, curves, progress, each)
     write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
-    title = f"Fleet {folder.out.name or folder.path.name}"
+    title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
     overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
     write_fleet_report(folder.hidden(REPORT), overview)
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
@@ -245,7 +245,7 @@ COLUMNS: dict[str, UnitColumn] = dict([
     *_with_sigma("coast_1min", "SI", "the same of 1 min"),
     *_with_sigma("coast_5min", "SI", "the same of 5 min"),
     *_with_sigma("coast_end", "SI", "the same to the end of the recording"),
-    ("coast_of", UnitColumn("text", "", "recording that was coasted")),
+    ("coast_of", UnitColumn("text", "", "recording that was predicted")),
     ("coast_in_sample", UnitColumn("flag", "", "whether the own map was fitted on it")),
     ("map_sigma", UnitColumn("number", "SI", "rms of the standard deviation of the own map over its domain")),
     ("family_sigma", UnitColumn("number", "SI", "rms of that of the family's map over the family's domain")),

@@ -83,10 +83,12 @@ def _curves(analysis: Analysis, channel: str) -> dict[str, Any]:
 
 def table(analysis: Analysis, channel: str) -> TextTable:
     """Return the coefficients of a triad, axes as columns, in the units of data sheets."""
-    cells = [
-        [f"{name}\n[{unit}]", *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells)]
-        for name, unit, cells in rows(analysis, channel)
-    ]
+    cells = []
+    for name, unit, texts in rows(analysis, channel):
+        full, _, within = name.rstrip(")").partition(" (")
+        short, _, letter = within.rpartition(", ")  # 80 columns have no room for a long name
+        head = f"{short or full}\n{letter} [{unit}]"
+        cells.append([head, *(text.replace(" (", "\n(").replace(" to ", "–") for text in texts)])
     title = f"{channel}: value and {100 * LEVEL:.0f} % limits"
     return TextTable(["", *analysis.axes[channel]], cells, title, rigid=True)
 
@@ -98,7 +100,7 @@ def rows(analysis: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
     for key, unit in units.human:
         scale = float(convert(1.0, unit, units.si[key]))
         cells = [_cell(fit, KEYS.index(key), scale) for fit in analysis.coefficients[channel]]
-        result.append((NAMES[key], unit, cells))
+        result.append((names_of(units)[key], unit, cells))
     return result
 
 
@@ -160,6 +162,7 @@ def page_of(analysis: Analysis, sheet: Sheet) -> str:
         "allan",
         title=f"Allan deviation of {analysis.name}",
         lead=used(analysis),
+        result=result_lines(analysis),
         level=f"{100 * LEVEL:.0f}",
         notes=analysis.notes,
         charts=charts(analysis),
@@ -206,10 +209,10 @@ def _panels(analysis: Analysis, channel: str) -> Iterator[Panel]:
     scale = float(convert(1.0, units.deviation, units.deviation_si))
     for axis, c, fit in _each_axis(analysis, channel):
         label = f"deviation of {axis_name(channel, axis)} [{units.deviation}]"
-        yield Panel(tuple(_lines(c, fit, scale)), label, log=True, height=1.3)
+        yield Panel(tuple(_lines(c, fit, scale, names_of(units))), label, log=True, height=1.3)
 
 
-def _lines(c: AllanCurve, fit: Coefficients, scale: float) -> Iterator[Line]:
+def _lines(c: AllanCurve, fit: Coefficients, scale: float, names: dict[str, str]) -> Iterator[Line]:
     allan, hadamard = _positive(c.allan / scale), _positive(c.hadamard / scale)
     floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
     A = design(c, hadamard=False).A
@@ -220,7 +223,7 @@ def _lines(c: AllanCurve, fit: Coefficients, scale: float) -> Iterator[Line]:
     for k, key in enumerate(KEYS):
         if fit.value[k] > 0:
             term = np.sqrt(A[:, k]) * fit.value[k] / scale
-            yield Line(c.tau, np.where(term > floor, term, np.nan), NAMES[key], series(k + 1), style="dashed")
+            yield Line(c.tau, np.where(term > floor, term, np.nan), names[key], series(k + 1), style="dashed")
     yield Line(c.tau, hadamard, "Hadamard", "data", style="points")
     spread = np.minimum(fit.spread, 0.9)
     yield Line(c.tau, allan, "Allan, 1 sigma", "estimate", allan * (1 - spread), allan * (1 + fit.spread), "points")
@@ -231,7 +234,29 @@ def _positive(values: Array) -> Array:
     return np.where(values > 0, values, np.nan)
 
 
-NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "random walk", "ramp"), strict=True))
+def names_of(units: DeviationUnits) -> dict[str, str]:
+    """Return the names of the coefficients of a sensor, each with its letter in IEEE Std 952 and 1293."""
+    noise, walk = {
+        "rad/s": ("angle random walk (ARW, N)", "rate random walk (RRW, K)"),
+        "m/s^2": ("velocity random walk (VRW, N)", "random walk (K)"),
+    }.get(units.deviation_si, ("white noise (N)", "random walk (K)"))
+    return dict(zip(KEYS, ("quantisation (Q)", noise, "bias instability (B)", walk, "ramp (R)"), strict=True))
+
+
+def result_lines(analysis: Analysis) -> list[str]:
+    """Return the result in a sentence a sensor: N, B and K of its worst axis."""
+    lines = []
+    for channel in analysis.curves:
+        units = units_of(analysis, channel)
+        human = dict(units.human)  # of two units for one coefficient the last
+        parts = []
+        for key in ("white", "bias_instability", "rate_random_walk"):
+            k, scale = KEYS.index(key), float(convert(1.0, human[key], units.si[key]))
+            worst = max(analysis.coefficients[channel], key=lambda fit: float(fit.value[k] or fit.high[k]))
+            cell = _cell(worst, k, scale).partition(" (")[0]
+            parts.append(f"{names_of(units)[key]} {cell} {human[key]}" if cell != "-" else "")
+        lines.append(f"{channel}, worst axis: {', '.join(filter(None, parts))}.")
+    return lines
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ LOOKS = {
     "cooling": Look("#0072b2", "#56b4e9", 1.2),
     "temperature": Look("#333333", "#d6d6d6", 1.2),
     "nis": Look("#0072b2", "#56b4e9", 1.0),
-    "limit": Look("#b3261e", "#ff7a70", 1.2),
+    "limit": Look("#8d9299", "#7f858d", 0.8),
+    "alarm": Look("#b3261e", "#ff7a70", 1.2),
     "other": Look("#00795a", "#3ecf9f"),
     "series:0": Look("#0072b2", "#56b4e9"),
     "series:1": Look("#c24e00", "#ff9a4d"),
@@ -216,13 +217,22 @@ def axis_panels(
 ) -> tuple[Panel, ...]:
     """Return a panel an axis: the lines of axis k are `lines_of(k)`, and `how` is of each panel.
 
-    With `legibly` wide bands are drawn as far as `legible` says.
+    With `legibly` wide bands are drawn as far as `legible` says, and what is beyond is written in the label.
     """
     panels = []
     for k, axis in enumerate(axes):
         lines = tuple(lines_of(k))
-        panels.append(Panel(lines, f"{quantity} {axis} [{unit}]", span=legible(lines) if legibly else None, **how))
+        span = legible(lines) if legibly else None
+        label = f"{quantity} {axis} [{unit}]{_beyond(lines, span)}"
+        panels.append(Panel(lines, label, span=span, **how))
     return tuple(panels)
+
+
+def _beyond(lines: Iterable[Line], span: tuple[float, float] | None) -> str:
+    """Return in words how far lines go beyond what is drawn; empty where all is drawn."""
+    values = _finite(line.y for line in lines)
+    out = values[(values < span[0]) | (values > span[1])] if span else values[:0]
+    return f", spikes of {np.min(out):.3g} to {np.max(out):.3g} are cut" if len(out) else ""
 
 
 def temperature_panel(t: Array, T: Array, shades: tuple[Shade, ...], **how: Any) -> Panel:
@@ -262,18 +272,30 @@ class Clock:
 
 
 def legible(lines: Iterable[Line]) -> tuple[float, float] | None:
-    """Return from where to where y is drawn: lines whole, and of their bands as much as leaves the lines legible."""
+    """Return from where to where y is drawn: lines but for spikes, and of bands as much as leaves the lines legible."""
     lines = tuple(lines)
     values = _finite(line.y for line in lines)
     if not len(values):
         return None
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = without_spikes(values)
     ends = _finite(end for line in lines for end in (line.low, line.high))
     room = (high - low) * BAND or abs(high) * 0.1 or 1.0
     bottom = max(float(np.min(ends, initial=low)), low - room)
     top = min(float(np.max(ends, initial=high)), high + room)
     margin = (top - bottom) * 0.04 or room
     return bottom - margin, top + margin
+
+
+FAR, FEW = 3.0, 0.01  # of the width that 80 % of the values have, beyond it; share of all that may be cut
+
+
+def without_spikes(values: Array, few: float = FEW) -> tuple[float, float]:
+    """Return from where to where values are drawn: all, or without a few far ones that would squash the others."""
+    low, high = np.percentile(values, (10, 90))
+    room = FAR * (high - low)
+    inside = values[(values >= low - room) & (values <= high + room)]
+    drawn = inside if room and len(values) - len(inside) <= max(1.0, few * len(values)) else values
+    return float(np.min(drawn)), float(np.max(drawn))
 
 
 def _finite(parts: Iterable[Array | None]) -> Array:

@@ -1,4 +1,4 @@
-"""The report of a comparison: who coasts best, charts and tables to decide from, and the paper's tables.
+"""The report of a comparison: who predicts best, charts and tables to decide from, and the paper's tables.
 
 A config has one colour in all of them and one entry in the legend, so that one click hides it. d axes.
 """
@@ -13,8 +13,8 @@ import numpy as np
 
 from driftlab.evaluation.comparison import TO_THE_END, Columns, Comparison, notes, paper, ranking, verdict
 from driftlab.evaluation.overview import thin
-from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
-from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
+from driftlab.evaluation.scores import LONGEST_FIRST, Scores, over_axes
+from driftlab.evaluation.summary import Rows, error_pairs
 from driftlab.reports import charts
 from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Panel, Shade, series
 from driftlab.reports.pages import write_page
@@ -24,7 +24,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Sensor
 
 Runs = dict[str, Comparison]
-Cells = list[tuple[str, str, list[str], bool]]  # of a table: label, axis, a text a config, whether it belongs above
+Cells = list[tuple[str, str, list[str]]]  # of a table: label, axis, a text a config
 
 
 def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, Sheet]) -> None:
@@ -33,10 +33,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
     sensor, unit, (size, near) = first.sensor, first.initial.unit, first.initial.texts
     si, factor, spec = unit.columns[-1]
     scores = {name: run.yardsticks for name, run in runs.items()}
-    ranked, rows = ranking(scores), error_rows(list(scores.values()))
-    # the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first
-    over = coasts_over_axes(rows) if len(sensor.axes) > 1 else []
-    errors = [(over, ("rms",)), (rows, sensor.axes)]
+    ranked = ranking(scores)
     heading = {name: [np.rad2deg(y.heading[name]) for y in scores.values()] for name in LONGEST_FIRST}
     write_page(
         path,
@@ -48,7 +45,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
         best=ranked.best if ranked is not None and len(runs) > 1 else (),
         remarks=notes(runs),
         unit=sensor.shown,
-        errors=[cell for part, axes in errors for cell in _cells(part, axes, unit.factor, unit.digits)],
+        errors=_folded(scores, sensor.axes, unit),
         headings=[(name, _texts(row, ".2f")) for name, row in heading.items()] if sensor.integral else [],
         spans={TO_THE_END: duration(min(run.span for run in runs.values()))},
         bars=[(name, bars) for name in LONGEST_FIRST if (bars := _bars(runs, name, unit))],
@@ -86,10 +83,25 @@ def _bars(runs: Runs, horizon: str, unit: BiasUnit) -> list[dict[str, Any]]:
 
 def _cells(rows: Rows, axes: Sequence[str], factor: float, spec: str) -> Cells:
     return [
-        (label.strip() if k == 0 else "", axis, _texts([v[k] * factor for v in columns], spec), label.startswith(" "))
+        (label if k == 0 else "", axis, _texts([v[k] * factor for v in columns], spec))
         for label, columns in rows
         for k, axis in enumerate(axes)
     ]
+
+
+def _folded(scores: dict[str, Scores], axes: Sequence[str], unit: BiasUnit) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return a row an error: its label, and of each config the error of every axis and its sigma, as texts."""
+
+    def text(values: Array | None) -> str:
+        if values is None:
+            return ""
+        texts = [unit.number(value, "–") for value in values]
+        if len(set(texts)) == 1:
+            return texts[0] if len(axes) == 1 else f"{texts[0]} each"
+        return ", ".join(f"{axis}\u00a0{value}" for axis, value in zip(axes, texts, strict=True))
+
+    rows = error_pairs(list(scores.values()))
+    return [(label, [(text(error), text(sigma)) for error, sigma in columns]) for label, columns in rows]
 
 
 def _texts(values: Sequence[float] | Array, spec: str) -> list[str]:
@@ -115,13 +127,13 @@ def bias_chart(runs: Runs) -> Chart:
             yield Line(t, coast, name, role, style="dashed")
 
     shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
         f"Bias of the {sensor.channel}",
         "Broad and grey: the reference, the centred 30 s average of what was measured. Solid: estimates, which follow "
-        "it while they are updated. Dashed: coasts, predicted from the end of the alignment with no measurement since.",
+        "it while they are updated. Dashed: predictions without updates, from the end of the alignment on.",
     )
 
 
@@ -137,11 +149,11 @@ def error_chart(runs: Runs) -> Chart:
             yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
 
     shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "coast error", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "prediction error", sensor.shown, legibly=True, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
-        "Error of the coasts",
+        "Error of the predictions",
         "Prediction less reference. The band is two of its standard deviations about zero: 95 % of the time an honest "
         "prediction is inside.",
     )

@@ -46,18 +46,28 @@ MEANING = {
 }
 
 
+USE = {
+    "explained": "run with explained.yaml in place of the declared config.",
+    "nothing_missing": "keep the declared config.",
+    "unexplained": "explained.yaml is the best that is known; its sigma does not cover what is left.",
+    "refuted": "keep the declared config; candidate.yaml is for study.",
+    "ambiguous": "explained.yaml predicts as recorded; make the recording that is proposed before relying on a name.",
+}
+
+
 def tables(closed: Identification) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     evidence = closed.search.columns.evidence
+    sides = ["before", "after"] if closed.anything else ["declared"]  # where nothing was added both are the same
     return [
-        error_table(f"holdout {Path(o.name).name}", ["before", "after"], _rows(o), evidence.axes, evidence.unit)
+        error_table(f"test recording {Path(o.name).name}", sides, _rows(o, len(sides)), evidence.axes, evidence.unit)
         for o in closed.outcomes
     ]
 
 
-def _rows(outcome: Outcome) -> Rows:
+def _rows(outcome: Outcome, sides: int = 2) -> Rows:
     """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
-    return error_rows([overview.yardsticks for overview in outcome.overviews])
+    return error_rows([overview.yardsticks for overview in outcome.overviews[:sides]])
 
 
 def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:
@@ -72,10 +82,12 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         closed=closed,
         word=verdict.word.replace("_", " "),
         outcome="unknown" if worse else OUTCOME[verdict.word],
+        use=USE[verdict.word],
+        changed=closed.anything,
         meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
         unit=unit.shown,
         known="Earth rate" if unit == RATE else "its known input",
-        effects=[(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
+        effects=[(finding.effect, size(closed.fit, finding, evidence)) for finding in verdict.findings],
         parameters=parameters,
         name_of=name_of,
         holdouts=[(Path(outcome.name).name, outcome) for outcome in closed.outcomes],
@@ -83,7 +95,7 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         cells=_cells,
         prediction_chart=prediction_chart,
         loop_chart=loop_chart,
-        taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
+        taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out if closed.anything],
         bars=bars(verdict),
         needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
         rejected=[(trial, _percent(float(np.sqrt(trial.evidence.ratio)))) for trial in verdict.rejected],
@@ -99,7 +111,7 @@ def _decisive(outcome: Outcome) -> str:
     before, after = (float(np.linalg.norm(values)) * outcome.unit.factor for values in _rows(outcome)[0][1])
     change = 100 * (after / before - 1) if before > 0 else float("nan")
     if not np.isfinite(change):
-        return "the error to the end of the coast is not known"
+        return "the error of the prediction to the end is not known"
     how = "stays as it is" if abs(change) < 0.5 else f"{'falls' if change < 0 else 'grows'} by {abs(change):.0f} %"
     many = ", norm of the axes" if outcome.before.shape[1] > 1 else ""
     sizes = f"{before:.3g} to {after:.3g} {outcome.unit.shown}"
@@ -151,21 +163,22 @@ BEFORE, AFTER = "series:1", "series:0"
 STRETCHES = 600  # of an error, whose smallest and largest value are drawn
 
 
-def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
+def prediction_chart(outcome: Outcome, axes: Sequence[str], changed: bool = True) -> Chart:
     """Return the measured and the predicted bias of each axis, before and after, the errors below, and temperature."""
     rows, factor, unit = thin(len(outcome.t)), outcome.unit.factor, outcome.unit.shown
     clock = Clock(outcome.overviews[0].first_row, float(outcome.t[-1]))
-    t, shades = clock(outcome.t), event_shades(outcome.journal, clock, "refused, after")
+    t, shades = clock(outcome.t), event_shades(outcome.journal, clock, "refused, after" if changed else "refused")
+    sides = _sides(outcome, changed)
 
     def biases(k: int) -> Iterator[Line]:
         yield Line(t[rows], outcome.reference[rows, k] * factor, "measured", "reference")
-        for name, values, sigma, role in _sides(outcome):
+        for name, values, sigma, role in sides:
             yield charts.band(t[rows], values[rows, k] * factor, 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
 
     def errors(k: int) -> Iterator[Line]:
-        for name, _, sigma, role in _sides(outcome):
+        for name, _, sigma, role in sides:
             yield charts.band_alone(t[rows], 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
-        for name, values, _, role in _sides(outcome):
+        for name, values, _, role in sides:
             yield _extreme_line(t, (values - outcome.reference)[:, k] * factor, f"{name}, ± 2σ", role)
 
     above = charts.axis_panels(axes, biases, "bias", unit, legibly=True, shades=shades, height=1.2)
@@ -173,12 +186,15 @@ def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     panels = [panel for pair in zip(above, below, strict=True) for panel in pair]
     if outcome.temperature is not None:
         panels.append(charts.temperature_panel(t[rows], outcome.temperature[rows], shades, height=0.7))
-    return Chart(tuple(panels), clock.label, "Measured and predicted, before and after")
+    return Chart(tuple(panels), clock.label, f"Measured and predicted{', before and after' if changed else ''}")
 
 
-def _sides(outcome: Outcome) -> Iterator[tuple[str, Array, Array, str]]:
-    yield "before", outcome.before, outcome.before_sigma, BEFORE
-    yield "after", outcome.after, outcome.after_sigma, AFTER
+def _sides(outcome: Outcome, changed: bool = True) -> list[tuple[str, Array, Array, str]]:
+    """Return the predictions that are drawn: both, or the declared model's alone where nothing was added."""
+    if not changed:
+        return [("declared", outcome.before, outcome.before_sigma, AFTER)]
+    before = ("before", outcome.before, outcome.before_sigma, BEFORE)
+    return [before, ("after", outcome.after, outcome.after_sigma, AFTER)]
 
 
 def _extreme_line(t: Array, values: Array, name: str, role: str) -> Line:
@@ -192,17 +208,17 @@ def _extreme_line(t: Array, values: Array, name: str, role: str) -> Line:
     return Line(t[rows], values[rows], name, role)
 
 
-def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
+def loop_chart(outcome: Outcome, axes: Sequence[str], changed: bool = True) -> Chart:
     """Return the error over temperature, before and after in one scale, warming up and cooling down apart."""
     assert outcome.temperature is not None
     rows = thin(len(outcome.t))
     t, T = outcome.t[rows], outcome.temperature[rows]
     warming = np.gradient(T, t) >= 0 if len(t) > 1 else np.ones(len(t), dtype=bool)
-    panels = []
+    panels, sides = [], _sides(outcome, changed)
     for k, axis in enumerate(axes):
-        errors = [(values - outcome.reference)[rows, k] * outcome.unit.factor for _, values, *_ in _sides(outcome)]
+        errors = [(values - outcome.reference)[rows, k] * outcome.unit.factor for _, values, *_ in sides]
         span = charts.legible(Line(T, error, "") for error in errors)
-        for name, error in zip(("before", "after"), errors, strict=True):
+        for (name, *_), error in zip(sides, errors, strict=True):
             lines = []
             for text, role, way in (("warming up", "warming", warming), ("cooling down", "cooling", ~warming)):
                 order = np.flatnonzero(way)[np.argsort(T[way], kind="stable")]

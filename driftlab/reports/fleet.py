@@ -17,7 +17,7 @@ import numpy as np
 
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
-from driftlab.family.record import FIGURES, PER, UnitRecord
+from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
 from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, map_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
@@ -45,7 +45,9 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         lead="; ".join(lead),
         limits=verdict_of_units(limits).capitalize(),
         outcome=worst([row for of_unit in limits for row in of_unit]),
-        verdict=line.sentences[0],
+        verdict=_headline(line, odd, len(done)),
+        use=_use(line, odd),
+        called=figure_name,
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=_numbers(records),
         maps=map_charts(
@@ -62,9 +64,24 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
         failed_count=len(failed),
         left_out=len(records) - len(table["unit"]),
-        names=embedded(list(line.units)),
+        names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
         table=embedded(table),
     )
+
+
+def _headline(line: LineReport, odd: int, done: int) -> str:
+    """Return the first sentence on the units and on their line: odd units are no quiet line."""
+    if not odd:
+        return line.sentences[0]
+    return f"{odd:,} of {done:,} units {'is' if odd == 1 else 'are'} odd. {line.sentences[0]}"
+
+
+def _use(line: LineReport, odd: int) -> str:
+    """Return the meaning of the headline for use."""
+    parts = ["hold the odd units back until their reasons are known"] * bool(odd)
+    if any(chart.changes or chart.trend for chart in line.controls):
+        parts.append("judge units before and after a change apart, and find what was changed there")
+    return f"{'; '.join(parts) or 'one set of limits serves all of these units'}."
 
 
 ROWS = 5000
@@ -103,7 +120,7 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
         short = [[None if v is None else rounded(v * unit.factor, 4) for v in of_axes] for of_axes in values]
         columns = [[row[k] if k < len(row) else None for row in short] for k in range(len(axes))]
         if any(value is not None for column in columns for value in column):
-            figures.append({"name": name, "unit": unit.shown + PER.get(name, ""), "columns": columns})
+            figures.append({"name": figure_name(name), "unit": unit.shown + PER.get(name, ""), "columns": columns})
     domains = [record.domain or (None, None) for record in records]
     why = [record.error if record.state == "failed" else reasons.get(record.unit, "") for record in records]
     links = [overview.links.get(record.unit, "") for record in records]

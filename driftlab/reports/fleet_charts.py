@@ -14,25 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.outliers import Outlier
-from driftlab.family.record import UnitRecord
-from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series
+from driftlab.family.record import UnitRecord, figure_name
+from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series, without_spikes
 from driftlab.spc.charts import ControlChart, LineReport
 from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
 
 MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
 MAX_LOTS = 60  # lots that are drawn: the latest
+MANY = 0.05  # share of the units that may lie beyond an axis
 LIMITS = 300  # points of a limit that differs from unit to unit
 TITLES = {
     "residual": "Residual of the map, rms of 30 s averages",
     "noise": "White noise",
     "walk": "Walk of the bias",
     "swing": "Swing of the map",
-    "coast": "Coast, rms of 10 min without a measurement",
+    "coast": "Prediction over 10 min without updates, rms of its error",
     "level": "Level of the map, mean over the range",
 }
 CAPTION = (
-    "A point a unit. Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
+    "A point a unit; one far off stands at the edge, its value in the label. "
+    "Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
     "well. Dotted: limits of the EWMA. Broad: what is usual between the changes; shaded: where a change is, by 95 %."
 )
 
@@ -63,29 +65,32 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     place = (chart.at + 1).astype(np.float64)
     few = np.unique(np.linspace(0, len(place) - 1, LIMITS).astype(int))
     out = np.flatnonzero(chart.beyond)
+    value = chart.value[np.isfinite(chart.value)]
+    low, high = without_spikes(value, MANY)
+    cut = np.flatnonzero((chart.value < low) | (chart.value > high))
+    wide = not len(cut) and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
+    drawn_at = np.clip(chart.value, low, high)
     lines = [
         *_usual(chart, shown),
-        Line(place[drawn], shown(chart.value[drawn]), "unit", "data", style="points"),
-        Line(place[out], shown(chart.value[out]), "beyond three sigma", "limit", style="points"),
+        Line(place[drawn], shown(drawn_at[drawn]), "unit", "data", style="points"),
+        Line(place[out], shown(drawn_at[out]), "beyond three sigma", "alarm", style="points"),
         Line(place[drawn], shown(chart.ewma[drawn]), "EWMA", "estimate"),
         *_limits(place, few, (chart.low, chart.high), shown, ewma=False),
         *_limits(place, few, (chart.ewma_low, chart.ewma_high), shown, ewma=True),
     ]
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
-    value = chart.value[np.isfinite(chart.value)]
-    wide = bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
-    span = None if wide else _span(chart, unit.factor)
-    return Panel(tuple(lines), f"{chart.quantity} {chart.axis} [{unit.shown}]", shades, log=wide, span=span)
+    span = None if wide else _span(chart, (low, high), unit.factor)
+    names = ", ".join(f"{line.units[chart.at[k]]} at {chart.value[k] * unit.factor:.3g}" for k in cut[:NAMED])
+    label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"
+    return Panel(tuple(lines), label, shades, log=wide, span=span)
 
 
-def _span(chart: ControlChart, factor: float) -> tuple[float, float]:
-    """Return from where to where y is drawn: all values, and the limits of most units.
+def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tuple[float, float]:
+    """Return from where to where y is drawn: values between `ends`, and the limits of most units.
 
     A unit that is measured badly has limits so wide that nothing else could be distinguished.
     """
-    all_of = np.concatenate(
-        [chart.value, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]]
-    )
+    all_of = np.concatenate([ends, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]])
     low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room
@@ -115,11 +120,11 @@ def _limits(
     place: Array, few: NDArray[np.intp], both: tuple[Array, Array], shown: Callable[[Array], Array], *, ewma: bool
 ) -> list[Line]:
     """Return two limits, of the values or of the EWMA; one that is the same all along has two points."""
-    name, role = ("limits of the EWMA", "estimate") if ewma else ("three sigma", "limit")
+    name = "limits of the EWMA" if ewma else "three sigma"
     style: LineStyle = "dotted" if ewma else "dashed"
     steady = all(np.ptp(values) <= 0.02 * abs(both[1] - both[0]).max() for values in both)
     at = few[[0, -1]] if steady else few
-    return [Line(place[at], shown(values[at]), name, role, style=style) for values in both]
+    return [Line(place[at], shown(values[at]), name, "limit", style=style) for values in both]
 
 
 def distributions(line: LineReport) -> list[dict[str, Any]]:
@@ -305,7 +310,7 @@ def _fan(overview: FleetOverview, bands: Array, curves: Any, mean: Array | None,
                 yield Line(T, np.asarray(curve, dtype=np.float64) * factor, "a unit", "data")
         odd = [k for k, name in enumerate(drawn) if axes[axis] in bent.get(name, ())]
         for k in odd[:DRAWN]:
-            name, role = looks.get(drawn[k], ("more odd units", "limit"))
+            name, role = looks.get(drawn[k], ("more odd units", "alarm"))
             yield Line(T, np.asarray(curves[k, axis], dtype=np.float64) * factor, name, role)
 
     return axis_panels(axes, lines, quantity, overview.unit.shown, height=1.2)

@@ -6,7 +6,7 @@ import numpy as np
 
 from driftlab.maps.assessment import MapVerdict, text
 from driftlab.maps.kind_selection import KindComparison
-from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, band_alone, series
+from driftlab.reports.charts import Chart, Line, LineStyle, Panel, Rule, Shade, band_alone, series
 from driftlab.reports.map_selection import section
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
@@ -17,6 +17,7 @@ from fusion_core.chunk import Array
 LABEL = "temperature [°C]"
 NEITHER = "before the first turn"
 NAMES = WAYS | {NEITHER: 0}
+STYLES: tuple[LineStyle, ...] = ("line", "dashed", "dotted")  # so that none hides one that is alike
 ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
 
 
@@ -90,7 +91,7 @@ def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:
     shades, coverage, panels = _holes(verdict), verdict.coverage, []
     if verdict.sigma is not None and verdict.good is not None:
         lines = tuple(
-            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2))
+            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2), style=STYLES[k % 3])
             for k, name in enumerate(verdict.axes)
         )
         worst = float(np.max(verdict.good)) * unit.factor
@@ -137,6 +138,18 @@ def _difference(verdict: MapVerdict, unit: BiasUnit, axis: int) -> str:
     return f"{text(float(size))} ± {text(float(sigma), 2)} at {text(float(memory.where[axis]))} °C"
 
 
+def _use(verdict: MapVerdict, unit: BiasUnit) -> str:
+    """Return the meaning of the verdict for use."""
+    if verdict.seen:
+        return "do not calibrate by this map alone: up and down differ; run `driftlab explain` first."
+    if verdict.good is None:
+        return "check the map on another recording by `driftlab run`: its kind has no sigma."
+    low, high = verdict.fitted.domain
+    off = text(2 * float(np.max(verdict.good)) * unit.factor)
+    turned = f", {off} deg of heading an hour" if unit.shown == "deg/h" else ""
+    return f"from {low:.3g} to {high:.3g} °C count on {off} {unit.shown} (2 sigma) beside the level{turned}."
+
+
 def page_of(
     verdict: MapVerdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: KindComparison | None = None
 ) -> str:
@@ -151,6 +164,7 @@ def page_of(
         f"{low:.2f} to {high:.2f} °C",
         sheet=sheet,
         sentences=verdict.sentences(unit),
+        use=_use(verdict, unit),
         notes=notes,
         axes=verdict.axes,
         rows=rows(verdict, unit),

@@ -129,24 +129,27 @@ def _as_json(row: Tried) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def error_chart(comparison: KindComparison, unit: BiasUnit) -> Chart:
-    """Return the left-out error of each kind with its standard error, from the smallest on."""
-    good, chosen = _by_error(comparison), comparison.chosen
-    at = np.arange(1, len(good) + 1, dtype=np.float64)
-    error, sigma = np.array([(row.error, row.sigma) for row in good]).T * unit.factor
-    taken = np.array([row is chosen for row in good])
-    lines = (
-        Line(at, error, "left-out error", "estimate", low=np.maximum(error - sigma, error / 10), high=error + sigma,
-             style="points"),
-        Line(at[taken], error[taken], f"taken: {chosen.name}", "reached", style="points"),
-    )  # fmt: skip
-    names = "; ".join(f"{k} {row.name}" for k, row in enumerate(good, start=1))
-    panel = Panel(lines, f"left-out error [{unit.shown}]", log=bool(error.max() > WIDE * error.min()))
-    return Chart((panel,), "kind", "Left-out error of each kind", caption=f"With one standard error. {names}.")
+def error_bars(comparison: KindComparison, unit: BiasUnit) -> list[dict[str, Any]]:
+    """Return a bar a kind, the smallest left-out error first: name, text, and lengths in per cent of the widest.
+
+    `low` and `high` are the ends of its standard error; a bar is cut (`beyond`) at WIDE times the smallest error.
+    """
+    good = _by_error(comparison)
+    widest = min(max(row.error + row.sigma for row in good), WIDE * good[0].error) or 1.0
+    return [
+        {
+            "name": row.name, "added": row is comparison.chosen, "text": _pm(row.error, row.sigma, unit),
+            "beyond": row.error > widest,
+            **{name: min(100 * max(value, 0.0) / widest, 100.0) for name, value in (
+                ("width", row.error), ("low", row.error - row.sigma), ("high", row.error + row.sigma),
+            )},
+        }
+        for row in good
+    ]  # fmt: skip
 
 
 def curve_chart(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Chart:
-    """Return the curves of the chosen kind and of the best of each other kind, over means of the samples."""
+    """Return the means of the samples and the best curve of each other kind, all less the curve of the chosen one."""
     drawn: list[Tried] = [comparison.chosen]
     for row in _by_error(comparison):
         if all(row.settings is None or one.settings is None or row.settings.kind != one.settings.kind for one in drawn):
@@ -156,13 +159,20 @@ def curve_chart(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str])
     means, count = _cell_means(comparison.T, samples, 4 * ERROR_RANGES)
     means = means[count > 0]
 
+    chosen = drawn[0].fitted
+    assert chosen is not None
+
     def lines(axis: int) -> Iterator[Line]:
-        yield Line(means[:, 0], means[:, 1 + axis] * unit.factor, "samples, means", "data", style="points")
+        inside = np.clip(means[:, 0], *chosen.domain)
+        left = means[:, 1 + axis] - chosen.bias(inside)[:, axis]
+        yield Line(means[:, 0], left * unit.factor, "samples, means", "data", style="points")
         for k, row in enumerate(drawn[:CURVES]):
             assert row.fitted is not None
-            yield Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k))
+            less = row.fitted.bias(T)[:, axis] - chosen.bias(T)[:, axis]
+            yield Line(T, less * unit.factor, row.name, series(k))
 
-    return Chart(axis_panels(axes, lines, "bias", unit.shown), "temperature [°C]", "Curves of the kinds")
+    panels = axis_panels(axes, lines, "less the chosen", unit.shown, legibly=True)
+    return Chart(panels, "temperature [°C]", f"Kinds less {drawn[0].name}")
 
 
 def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
@@ -170,7 +180,8 @@ def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> 
     return {
         "sentences": [*verdict(comparison, unit, axes), *failures(comparison)],
         "table": comparison_table(comparison, unit, axes),
-        "charts": [error_chart(comparison, unit), curve_chart(comparison, unit, axes)],
+        "bars": error_bars(comparison, unit),
+        "charts": [curve_chart(comparison, unit, axes)],
     }
 
 

@@ -155,7 +155,7 @@ def page_of_search(plan: SearchResult, lag_of: str, outlook: DetectabilityReport
     table, sigma, pareto = _profiles(plan), _sigma_chart(plan), _pareto(plan)
     parts = [
         chosen_profile(plan.chosen.profile, plan.chamber.lag),
-        ("Profiles of the same hours", table),
+        ("Profiles of these hours", table),
         (plan_effects.HEADING, plan_effects.section(outlook)),
         (NOTES, lines),
         (sigma.title, sigma),
@@ -259,7 +259,7 @@ def _profiles(plan: SearchResult) -> TextTable:
         return [rated.profile.name + chosen, *sizes, f"{at:.1f}", covered + short]
 
     heads = ["profile", f"rms\n[{unit.shown}]", f"largest\n[{unit.shown}]", "at\n[°C]", "covers\n[°C]"]
-    title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({plan.hours:g} h each)"
+    title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis (up to {plan.hours:g} h)"
     return TextTable(heads, list(map(row, plan.judged)), title)
 
 
@@ -276,14 +276,10 @@ def _sigma_chart(plan: SearchResult) -> Chart:
 
 def _pareto(plan: SearchResult) -> Chart:
     unit = plan.subject.unit
-    hours, best, classic = np.array(
-        [(p.hours, p.best.score, p.classic.score if p.classic else np.nan) for p in plan.pareto]
-    ).T
-    lines = (
-        Line(hours, best * unit.factor, "best profile", "series:0"),
-        Line(hours, classic * unit.factor, "staircase one way", "series:1", style="dashed"),
-    )
-    return hours_chart(lines, plan.target, unit, "Gain of more hours", "each point is a search of its own")
+    hours, best = np.array([(p.hours, p.best.score) for p in plan.pareto]).T
+    line = Line(hours, best * unit.factor, "best profile of up to so many hours", "series:0")
+    caption = "Where the line is flat, more hours buy nothing: stop there."
+    return hours_chart([line], plan.target, unit, "Gain of more hours", caption)
 
 
 def _search_document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:

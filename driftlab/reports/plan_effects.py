@@ -9,7 +9,7 @@ from driftlab.planning.detectability import Detectability, DetectabilityReport, 
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit, number
 
-PLAINLY = 0.9  # share of the nats: with less left, another effect takes a part of it that is worth saying
+PLAINLY = 0.9  # share of the log-likelihood: with less left, another effect takes a part of it that is worth saying
 HEADING = "Effects that it would identify"  # on a page
 
 
@@ -23,14 +23,14 @@ def table(outlook: DetectabilityReport) -> TextTable:
         return [item.name, size, grid, f"{item.nats:.1f}", ", ".join(item.confused_with)]
 
     sizes = (f"{name}\n[{unit.shown}]" for name in ("found from", "over its grid"))
-    heads = ["effect", *sizes, f"of {number(outlook.size * factor)} {unit.shown}\n[nats]", "confused with"]
+    heads = ["effect", *sizes, f"of {number(outlook.size * factor)} {unit.shown}\n[log-likelihood]", "confused with"]
     title = "effects that the loop would find on it, from lowest to highest, on every axis alike"
     rows = [*map(row, outlook.effects), *([name, "not seen", "", "0", ""] for name in outlook.silent)]
     return TextTable(heads, rows, title, rigid=True, whole=False)
 
 
 def matrix(outlook: DetectabilityReport) -> tuple[list[str], list[tuple[str, list[tuple[str, str]]]]]:
-    """Return the effects, and for each what is left of its nats, in %, where another takes its part.
+    """Return the effects, and for each what is left of its log-likelihood, in %, where another takes its part.
 
     Each with a word beside it where the two are not distinguished at twice the smallest size that is found.
     """
@@ -95,10 +95,10 @@ def _confusions(item: Detectability) -> list[str]:
     parts = []
     if close:
         name, share = min(close.items(), key=lambda pair: pair[1])
-        parts.append(f"distinguished from {name} by {_nats(share * nats)} of {_nats(nats)} nats")
+        parts.append(f"distinguished from {name} by a log-likelihood of {_gain(share * nats)} of {_gain(nats)}")
     if item.confused_with:
-        names = [f"{name} ({_nats(item.left[name] * nats)})" for name in item.confused_with]
-        parts.append(f"not distinguished from {', '.join(names)} of {_nats(nats)} nats")
+        names = [f"{name} ({_gain(item.left[name] * nats)})" for name in item.confused_with]
+        parts.append(f"not distinguished from {', '.join(names)} of a log-likelihood of {_gain(nats)}")
     return parts
 
 
@@ -141,5 +141,5 @@ def document(outlook: DetectabilityReport) -> list[dict[str, Any]]:
     return [*effects, *silent]
 
 
-def _nats(value: float) -> str:
+def _gain(value: float) -> str:
     return f"{value:.1f}" if value < 10 else f"{value:.0f}"

@@ -96,6 +96,7 @@ def _hours(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
         if not soaks:
             continue
         hours, sigma, alone = np.array([(soak.profile.hours, soak.score, soak.own_score) for soak in soaks]).T
+        sigma, alone = np.minimum.accumulate([sigma, alone], axis=1)  # who has more hours may stop earlier
         drawn.append(Line(hours, sigma * unit.factor, f"{100 * share:.0f} % of the range", f"series:{k}"))
         if share == 1:
             without.append(Line(hours, alone * unit.factor, "all of it, without the family", "data", style="dashed"))

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from driftlab.evaluation.comparison import REFUTED
 from driftlab.evaluation.overview import SMOOTHED, Overview
-from driftlab.evaluation.scores import moving_average
-from driftlab.evaluation.summary import error_rows, inconsistency, remarks
+from driftlab.evaluation.scores import Scores, moving_average
+from driftlab.evaluation.summary import error_pairs, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
 from driftlab.reports.charts import Chart, Clock, Line, Panel, Rule, Shade
@@ -51,6 +52,7 @@ def page_of(
         title=title,
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
+        results=result_sentences(scores, unit, heading=sensor.integral is not None),
         remarks=remarks(overview, model, journal),
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
@@ -59,7 +61,7 @@ def page_of(
         domain=domain,
         axes=sensor.axes,
         unit=unit.shown,
-        rows=[(label, [unit.number(v, "–") for v in values]) for label, (values,) in error_rows([scores])],
+        rows=_errors(scores, unit),
         headings=[f"{name} {formatted(np.rad2deg(angle), '.2f')}" for name, angle in headings],
         nis=nis_sentence(overview.nis),
         nis_chart=nis_chart(overview, model.m),
@@ -72,13 +74,44 @@ def page_of(
     )
 
 
+def _errors(scores: Scores, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+    """Return the errors of each axis, the sigma of a prediction in brackets: a label, and a text an axis."""
+
+    def text(error: float, sigma: float | None = None) -> str:
+        return unit.number(error, "–") + ("" if sigma is None else f" ({unit.number(sigma, '–')})")
+
+    rows = []
+    for label, ((errors, sigmas),) in error_pairs([scores]):
+        rows.append((label, [text(*pair) for pair in zip(errors, *([] if sigmas is None else [sigmas]), strict=True)]))
+    return rows
+
+
+def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[str, str]:
+    """Return the result of a run in a sentence, and its meaning for use; the second is empty where none is known."""
+    known = (name for name in ("10 min", "5 min", "1 min") if np.all(np.isfinite(scores.coast[name])))
+    name = next(known, None)
+    if name is None:
+        return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""
+    worst = int(np.argmax(scores.coast[name]))
+    error, sigma = float(scores.coast[name][worst]), float(scores.coast_sigma[name][worst])
+    axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
+    result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
+    trust = f"its sigma there, {unit.number(sigma)} {unit.shown}, " + (
+        "covers that" if error <= REFUTED * sigma else f"is too small by {error / sigma:.1f} times: widen walk or map"
+    )
+    turned = f"{name} without updates turn the heading by {np.rad2deg(scores.heading[name]):.2g} deg; " * heading
+    return f"{result}.", f"{turned}{trust}."
+
+
 def nis_sentence(nis: NisTest) -> str:
     """Return in a sentence or two what the NIS says of the deviations of a run."""
     if not np.isfinite(nis.mean):
         return "The NIS is not known, no update was used."
     mean, bounds = f"The mean NIS a component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
     if nis.consistent:
-        return f"{mean}, within {bounds}: innovations are as large as the model says."
+        return (
+            f"{mean}, within {bounds}: innovations are as large as the model says, so its sigma can be used as it is."
+        )
     return f"{mean}, outside {bounds}: {inconsistency(nis.mean)}."
 
 
@@ -110,10 +143,12 @@ def bias_chart(
         bias, sigma, coast, spread = (
             curves[name][:, k] * sensor.factor for name in ("bias", "bias_sigma", "coast", "coast_sigma")
         )
-        yield Line(t, None, "± 2σ of the coast", "coast", coast - 2 * spread, coast + 2 * spread)  # wide: below all
+        yield Line(
+            t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread
+        )  # wide: below all
         yield Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
-        yield Line(t, coast, "coast", "coast", style="dashed")
+        yield Line(t, coast, "prediction", "coast", style="dashed")
         if SMOOTHED in curves:
             yield Line(t, curves[SMOOTHED][:, k] * sensor.factor, "given all of it", "other", style="dotted")
 
@@ -144,10 +179,10 @@ def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) ->
     def lines(k: int) -> Iterator[Line]:
         sigma, spread = (2 * curves[name][:, k] * sensor.factor for name in ("bias_sigma", "coast_sigma"))
         error = np.where(np.isfinite(errors["coast"]), errors["bias"], np.nan)[:, k] * sensor.factor
-        yield charts.band_alone(t, spread, "± 2σ of the coast", "coast")
+        yield charts.band_alone(t, spread, "± 2σ of the prediction", "coast")
         yield charts.band_alone(t, np.where(np.isfinite(spread), sigma, np.nan), "± 2σ of the estimate", "estimate")
         yield Line(when, error, "estimate less reference", "error")
-        yield Line(when, errors["coast"][:, k] * sensor.factor, "coast less reference", "coast", style="dashed")
+        yield Line(when, errors["coast"][:, k] * sensor.factor, "prediction less reference", "coast", style="dashed")
 
     shades = event_shades(journal, clock)
     panels = charts.axis_panels(sensor.axes, lines, "error", sensor.shown, legibly=True, shades=shades)

@@ -104,8 +104,10 @@ def _table(
         table.add_column(Text(heading), justify="right", no_wrap=True, vertical="bottom")
     for axes, rows in sections:
         for (label, _), (after, _) in zip_longest(rows, rows[1:], fillvalue=("", [])):
-            for k, line in enumerate(cells.pop(0)):
-                table.add_row(label if k == 0 else "", axes[k], *line)
+            lines = cells.pop(0)
+            alike = len(axes) > 1 and all(line == lines[0] for line in lines)  # printed once
+            for k, line in enumerate(lines[:1] if alike else lines):
+                table.add_row(label if k == 0 else "", "each" if alike else axes[k], *line)
             # what belongs to a row stays with it, and rows of one line each stay together
             if not after or (len(axes) > 1 and not after.startswith(" ")):
                 table.add_section()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.family.record import figure_name
 from driftlab.spc.charts import MIN_UNITS, SIGMAS
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ def sentences(line: LineReport) -> list[str]:
         lines = ["Too few units to look for changes of the line."]
     elif not lines:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
-        but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
-        lines = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
+        off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
+        lines = [f"{off} change of the line in {len(line.units):,} units, {line.order}."]
     return [*lines, *_now(line), *_limits(line)]
 
 
@@ -41,7 +42,7 @@ def _trend(line: LineReport, chart: ControlChart) -> str:
     assert chart.trend is not None
     first, last = line.units[int(chart.at[0])], line.units[int(chart.at[-1])]
     size = by_how_much(line, chart, chart.trend)
-    return f"{chart.axis} {chart.quantity} {size} from unit {first} to {last}: a trend, no step."
+    return f"{_called(chart)} {size} from unit {first} to {last}: a trend, no step."
 
 
 def by_how_much(line: LineReport, chart: ControlChart, change: StepChange | Trend) -> str:
@@ -69,15 +70,19 @@ def _together(controls: Iterable[ControlChart]) -> list[list[tuple[ControlChart,
 
 def _change(line: LineReport, group: list[tuple[ControlChart, StepChange]]) -> str:
     chart, change = group[0]
-    text = f"{chart.axis} {chart.quantity} {by_how_much(line, chart, change)} from unit {place(line, change.at)} on"
+    text = f"{_called(chart)} {by_how_much(line, chart, change)} from unit {place(line, change.at)} on"
     if change.high > change.low:
         text += f" (95 %: between {line.units[change.low]} and {line.units[change.high]})"
-    others = [f"{c.axis} {c.quantity} {by_how_much(line, c, other)}" for c, other in group[1:]]
+    others = [f"{_called(c)} {by_how_much(line, c, other)}" for c, other in group[1:]]
     return f"{text}{'; about there also ' if others else ''}{', '.join(others)}."
 
 
+def _called(chart: ControlChart) -> str:
+    return f"{chart.axis} {figure_name(chart.quantity)}"
+
+
 def _now(line: LineReport) -> list[str]:
-    out = [f"{c.axis} {c.quantity}" for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
+    out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
@@ -108,7 +113,7 @@ def _limits(line: LineReport) -> list[str]:
         unit = line.shown(name)
         since = f" since unit {line.units[worst.since]}" if worst.since else ""
         text = (
-            f"{name}, limit {worst.limit * unit.factor:.6g} {unit.shown}: {worst.axis} is worst{since}, "
+            f"{figure_name(name)}, limit {worst.limit * unit.factor:.6g} {unit.shown}: {worst.axis} is worst{since}, "
             f"Ppk {worst.ppk:.2f} (95 %: {worst.ppk_low:.2f} to {worst.ppk_high:.2f}), {worst.beyond:,} of {worst.n:,} "
             "units above"
         )

@@ -38,7 +38,7 @@ def with_walk(config: Config, walk: tuple[float, ...]) -> Config:
 def main() -> None:
     """Run both filters at every walk and print one table."""
     table = Table(title="CATS placement 3, deg/h, rms over the axes", title_justify="left")
-    for heading in ("filter", "walk", "[deg/h/sqrt(s)] x, y, z", "whole", "coast 10 min", "coast, to the end"):
+    for heading in ("filter", "walk", "[deg/h/sqrt(s)] x, y, z", "whole", "predicted 10 min", "to the end"):
         table.add_column(Text(heading), justify="left" if heading in ("filter", "walk") else "right", no_wrap=True)
     for name in ("no map", "standard", "tczupt"):
         file = "base" if name == "no map" else name

@@ -65,7 +65,7 @@ def bench(tmp_path_factory):
 def test_run_writes_whole_outputs(bench):
     done = process("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert done.returncode == 0, done.stderr
-    assert "coast, 1 min" in done.stdout
+    assert "prediction, 1 min" in done.stdout
     assert done.stderr == ""
     here = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert (here.returncode, here.stdout, here.stderr) == (done.returncode, done.stdout, done.stderr)

@@ -79,7 +79,7 @@ def test_run_is_in_ppm_in_the_terminal_on_the_page_and_in_the_json(bench):
     assert not [key for key in summary if WRONG.search(key)]
     coast = summary["coast_rmse"]["to the end"][0]
     assert 0.1 * PPM < coast < 2 * PPM
-    shown = re.search(r"coast, to the end │ resistance │ +(\S+) │", printed)
+    shown = re.search(r"prediction, to the end │ resistance │ +(\S+) │", printed)
     assert float(shown[1]) * PPM == pytest.approx(coast, rel=1e-3)
     assert "<th>resistance [ppm]</th></tr>" in page
     assert "bias resistance [ppm]" in page  # of the figure

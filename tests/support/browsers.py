@@ -60,11 +60,32 @@ def overflow(page) -> int:
     return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
 
 
+def assert_nothing_is_cut_in_silence(page) -> None:
+    """Assert that whatever scrolls sideways is announced, above it and in sight."""
+    silent = page.evaluate(
+        """() => [...document.querySelectorAll('body *')].filter((box) => box.clientWidth > 0
+          && box.scrollWidth > box.clientWidth + 1 && box.checkVisibility()
+          && ['auto', 'scroll', 'hidden'].includes(getComputedStyle(box).overflowX)
+          && !box.closest('figure.chart') && getComputedStyle(box).clipPath === 'none'
+          && !(box.previousElementSibling?.matches('.hint') && box.previousElementSibling.offsetHeight > 0))
+          .map((box) => `${box.tagName} ${box.className} ${box.textContent.slice(0, 40)}`)"""
+    )
+    assert not silent
+
+
+def assert_fits_on_paper(page) -> None:
+    """Assert that nothing is wider than a sheet of A4 between its margins, else all of it is printed smaller."""
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert overflow(page) == 0
+
+
 def assert_drawn_everywhere(opened, where: Path, figures: int) -> None:
     """Assert that a page fits its window and draws its figures: on a desk and on a phone, in light and dark."""
     for width, dark in ((1100, False), (390, False), (1100, True)):
         shown = opened(where, width=width, dark=dark)
         assert overflow(shown) == 0
+        assert_nothing_is_cut_in_silence(shown)
         assert shown.locator("figure.chart").count() == figures
         assert all(colours(shown, k) > 5 for k in range(figures))
         ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")

@@ -37,10 +37,13 @@ const driftlab = (() => {
     called(v) { return this.names ? this.names[v - 1] ?? "" : digits(v); }
 
     // pixels from one number or name under an axis to the next, at least
-    apart() { return this.names ? 16 + 7 * this.names.reduce((wide, name) => Math.max(wide, Math.min(name.length, LABEL)), 5) : 50; }
+    apart() { return this.names ? 16 + 7 * this.names.reduce((wide, name) => Math.max(wide, ...name.split("\n").map((part) => Math.min(part.length, LABEL))), 5) : 50; }
 
-    // under an axis there is no room for long names: of serial numbers the ends differ
-    label(v) { const name = this.called(v); return name.length > LABEL ? `…${name.slice(1 - LABEL)}` : name; }
+    // under an axis there is no room for long names: of serial numbers the ends differ; a date stands below
+    label(v) { return this.called(v).toString().split("\n").map((name) => (name.length > LABEL ? `…${name.slice(1 - LABEL)}` : name)).join("\n"); }
+
+    // pixels under the last panel
+    foot() { return this.names?.some((name) => name.includes("\n")) ? 48 : 34; }
 
     colour(role) { return this.looks[role][dark() ? "dark" : "light"]; }
 
@@ -123,12 +126,12 @@ const driftlab = (() => {
       const ink = css("--ink-2"), grid = { stroke: css("--rule"), width: 1 };
       const font = "12px system-ui, sans-serif";
       const options = {
-        width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, Math.max(22, this.names ? this.apart() / 2 : 0), last ? 0 : 6, 0],
+        width: this.width(), height: this.height(panel) + (last ? this.foot() : 0), padding: [6, Math.max(22, this.names ? this.apart() / 2 : 0), last ? 0 : 6, 0],
         legend: { show: false }, bands, series,
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
         scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
-          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, space: this.apart(), values: last ? (this.names ? (u, v) => v.map((k) => this.label(k)) : undefined) : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
+          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? this.foot() : 0, space: this.apart(), values: last ? (this.names ? (u, v) => v.map((k) => this.label(k)) : undefined) : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
           { stroke: ink, grid, ticks: grid, font, size: 62, filter: panel.log ? labelled("y") : undefined },
         ],
         hooks: {
@@ -215,7 +218,7 @@ const driftlab = (() => {
         const alike = series.filter((other) => other.read && other.label === series[s].label).length > 1;
         said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${band}`);
       }
-      this.read.textContent = `${this.content.label} ${this.called(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
+      this.read.textContent = `${this.content.label} ${this.called(u.data[0][k]).toString().replace("\n", ", ")} · ${panel.label}: ${said.join(", ")}`;
     }
 
     zoom(span) {
@@ -241,7 +244,7 @@ const driftlab = (() => {
       const width = this.width();
       this.plots.forEach((plot, k) => {
         const last = k === this.plots.length - 1;
-        if (plot.width !== width) plot.setSize({ width, height: this.height(this.content.panels[k]) + (last ? 34 : 0) });
+        if (plot.width !== width) plot.setSize({ width, height: this.height(this.content.panels[k]) + (last ? this.foot() : 0) });
       });
     }
 
@@ -274,6 +277,17 @@ const driftlab = (() => {
       for (const cell of table.querySelectorAll("tbody td:not([colspan])")) cell.dataset.head = heads[cell.cellIndex];
       table.classList.remove("cards");
       table.classList.toggle("cards", table.scrollWidth > table.clientWidth + 1);
+    }
+    hint();
+  };
+
+  // what is still wider than its place says so, above it
+  const hint = () => {
+    for (const box of document.querySelectorAll("pre, table, .rows")) {
+      const before = box.previousElementSibling, there = before?.classList.contains("hint");
+      const wide = box.clientWidth > 0 && box.scrollWidth > box.clientWidth + 1 && getComputedStyle(box).overflowX !== "visible";
+      if (there && !wide) before.remove();
+      if (wide && !there) box.before(Object.assign(document.createElement("p"), { className: "hint", textContent: "scroll sideways →" }));
     }
   };
 

@@ -154,7 +154,7 @@
       if (known(s.nis_low)) rules.push({ y: s.nis_low, text: "", role: "limit" }, { y: s.nis_high, text: "95 %", role: "limit" });
       others.push(panel("NIS per component, mean of 100 updates [1]", [line("NIS", "nis", column("nis"))], { rules }));
       others.push(panel("samples a second [1/s]", [line("samples a second", "data", column("samples_per_s"))], { height: 0.7 }));
-      others.push(panel("lost so far [samples]", [line("lost", "limit", column("lost"))], { height: 0.7 }));
+      others.push(panel("lost so far [samples]", [line("lost", "data", column("lost"))], { height: 0.7 }));
     }
     update("biases", { title: "", label, log: false, x: [x], panels: biases });
     update("others", { title: "", label, log: false, x: [x], panels: others });
@@ -174,12 +174,13 @@
     if (high > T[T.length - 1]) { T.push(high); sigma.push(unknown); }
     figure.chart.update({
       title: "", label: "temperature [°C]", log: false, x: [T],
-      panels: [{
-        label: `sigma of the map [${about.unit.shown}]`, log: false, height: 1.3,
-        lines: about.axes.map((axis, k) => ({ name: axis, role: `series:${k % 6}`, style: "line", x: 0, y: sigma.map((row) => (known(row[k]) ? row[k] * factor : null)) })),
+      // a panel an axis: in one of three alike the last would hide the others
+      panels: about.axes.map((axis, k) => ({
+        label: `sigma of the map, ${axis} [${about.unit.shown}]`, log: false, height: 0.8,
+        lines: [{ name: "sigma", role: "estimate", style: "line", x: 0, y: sigma.map((row) => (known(row[k]) ? row[k] * factor : null)) }],
         shades: (m.missing_degC || []).map(([start, stop]) => ({ start, stop, text: "not seen yet", role: "hole" })),
         rules: known(wanted) ? [{ y: wanted * factor, text: "wanted", role: "limit" }] : [],
-      }],
+      })),
     });
   }
 

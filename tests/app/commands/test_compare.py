@@ -56,14 +56,14 @@ def test_where_not_even_one_fits_no_number_is_cut(printed):
     text = printed(2, columns=20)
     assert text.count("┏") == 2
     assert "…" not in text
-    assert all(re.search(r"│ +\d+\.\d\d │$", line) for line in text.splitlines() if "coast, 1 min" in line)
+    assert all(re.search(r"│ +\d+\.\d\d │$", line) for line in text.splitlines() if "prediction, 1 min" in line)
 
 
 def test_the_sentence_stands_above_and_the_decisive_row_first(printed):
     lines = printed(2).splitlines()
     assert lines[0].startswith("On this one recording ")
     first = next(line for line in lines if line.startswith("│"))
-    assert re.match(r"│ coast, to the end +│ +rms +│", first)
+    assert re.match(r"│ prediction, to the end +│ +rms +│", first)
 
 
 def test_the_paper_s_tables_are_printed_when_they_are_asked_for(printed):

@@ -1,6 +1,7 @@
 """Limits of `explain`: an effect holds beyond its inputs; what predicts the test recording worse is refuted."""
 
 import json
+import re
 
 import h5py
 import numpy as np
@@ -115,7 +116,10 @@ def test_sizes_are_said_in_the_unit_of_the_sensor(tmp_path):
     truth = 5e-6 * np.ptp(seen) / 2
     assert abs(size - truth) < 3 * sigma + 0.01 * truth
     assert 0 < sigma < 0.05 * size
-    assert f"resistance ±{size * 1e6:.3g} (sigma {sigma * 1e6:.2g}) ppm" in line
+    assert content["effects"][0]["size_text"] in line
+    assert f", moves the bias by resistance ±{size * 1e6:.3g} ppm;" in line
+    value, off = map(float, re.search(r"resistance (\S+) ± (\S+) ppm per SI unit of the channel,", line).groups())
+    assert abs(value - 5) < 3 * off + 0.05
 
 
 @pytest.mark.parametrize("how", ["cut", "shifted", "rounded", "part"])

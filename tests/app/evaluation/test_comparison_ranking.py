@@ -37,7 +37,7 @@ def test_the_best_is_named_with_its_error_whatever_the_order():
     runs = {"standard": coasting(34.1), "tczupt": coasting([12.0, 12.0, 12.9]), "plain": coasting(90)}
     for order in permutations(runs):
         assert of({name: runs[name] for name in order}) == (
-            "On this one recording tczupt coasts best: to the end (40 min) 12.31 deg/h rms over the axes, "
+            "On this one recording tczupt predicts best: to the end (40 min) 12.31 deg/h rms over the axes, "
             "standard 34.10, plain 90.00 deg/h; they differ by more than the sigma (5.00 deg/h), and all axes agree. "
             "Itself it is off by 2.5 times its sigma, which is too small to tell chance by. Over 10 min the same."
         )
@@ -48,7 +48,7 @@ def test_within_the_sigma_is_no_difference_whatever_the_order():
     runs = {"a": coasting(7.0), "b": coasting(3.0)}
     for order in (["a", "b"], ["b", "a"]):
         text = of({name: runs[name] for name in order})
-        assert "no difference between b and a: to the end (40 min) 3.00 and 7.00 deg/h rms over the axes" in text
+        assert "no difference is proven between b and a: to the end (40 min) 3.00 and 7.00 deg/h rms over" in text
         assert "within the sigma (5.00 deg/h)" in text
         assert "best" not in text
 
@@ -61,30 +61,30 @@ def test_the_bound_is_the_larger_sigma(gap, tie):
 
 
 def test_the_same_config_twice_is_a_tie():
-    assert "no difference between a and b" in of({"a": coasting(3.0), "b": coasting(3.0)})
+    assert "no difference is proven between a and b" in of({"a": coasting(3.0), "b": coasting(3.0)})
 
 
 def test_a_third_that_is_worse_is_named_beside_a_tie():
     text = of({"a": coasting(30.0), "b": coasting(3.0), "c": coasting(4.0)})
-    assert "no difference between b and c" in text
+    assert "no difference is proven between b and c" in text
     assert "; worse: a 30.00 deg/h." in text
 
 
 def test_axes_that_do_not_agree_are_named():
     text = of({"a": coasting([2.0, 2.0, 20.0]), "b": coasting([60.0, 6.0, 2.0])})
-    assert "a coasts best" in text
+    assert "a predicts best" in text
     assert "more than the sigma (5.00 deg/h), but not on y and on z b is better." in text
     tied = of({"a": coasting([10.0, 2.0, 0.0]), "b": coasting([2.0, 10.0, 0.0])})
-    assert "no difference" in tied
+    assert "no difference is proven" in tied
     assert ", but a is better on y and b is better on x." in tied
 
 
 def test_ten_minutes_may_tell_another_story():
     slow, fast = coasting(1.0), coasting(30.0)
     slow = replace(slow, coast={**slow.coast, "10 min": np.full(3, 50 * DEG_H)})
-    assert of({"slow": slow, "fast": fast}).endswith("Over 10 min fast coasts best.")
+    assert of({"slow": slow, "fast": fast}).endswith("Over 10 min fast predicts best.")
     level = replace(slow, coast={**slow.coast, "10 min": np.full(3, 28 * DEG_H)})
-    assert of({"slow": level, "fast": fast}).endswith("Over 10 min there is no difference between slow and fast.")
+    assert of({"slow": level, "fast": fast}).endswith("Over 10 min none is proven between slow and fast.")
     assert "10 min" not in of({"slow": slow, "fast": fast}, span=500.0)
 
 
@@ -96,7 +96,7 @@ def test_a_horizon_that_one_run_has_no_score_for_decides_nothing():
     assert found is not None
     assert found.horizon == "5 min"
     nothing = replace(a, coast=dict.fromkeys(HORIZONS, none))
-    assert of({"a": nothing, "b": b}).startswith("The config that coasts best is not known")
+    assert of({"a": nothing, "b": b}).startswith("The config that predicts best is not known")
 
 
 def test_one_axis_has_no_axes_to_agree():
@@ -104,12 +104,12 @@ def test_one_axis_has_no_axes_to_agree():
     one, other = (coasting(v, sigma=1.0, axes=("R",), unit=1e-6) for v in (1.5, 20.0))
     text = of({"one": one, "other": other}, unit=ppm)
     assert (
-        "one coasts best: to the end (40 min) 1.5 ppm, other 20 ppm; they differ by more than the sigma (1 ppm)."
+        "one predicts best: to the end (40 min) 1.5 ppm, other 20 ppm; they differ by more than the sigma (1 ppm)."
         in text
     )
 
 
 def test_one_config_has_nothing_to_compare_with():
     assert of({"a": coasting(3.0)}) == (
-        "a coasts 3.00 deg/h off, to the end (40 min); there is nothing to compare it with."
+        "a predicts with an error of 3.00 deg/h, to the end (40 min); there is nothing to compare it with."
     )

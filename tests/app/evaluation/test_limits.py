@@ -155,12 +155,12 @@ def test_all_limits_in_a_line():
     )
     assert (
         verdict(check_limits(limits, {"coast": bad, "swing": good}))
-        == "FAIL: coast over 10 min (rms) (1 of 2 limits kept)"
+        == "FAIL: prediction over 10 min (rms) (1 of 2 limits kept)"
     )
     assert verdict(check_limits(limits, {"coast": good})).startswith(
         "INCOMPLETE: 1 of 2 limits kept; not measured: swing"
     )
-    assert verdict(check_limits(limits, {"coast": bad})).startswith("FAIL: coast")
+    assert verdict(check_limits(limits, {"coast": bad})).startswith("FAIL: prediction")
     lines = ["PASS: 2 of", "FAIL: x", "UNDECIDED: 1 of", "INCOMPLETE: 0 of"]
     assert [outcome(line) for line in lines] == ["pass", "fail", "undecided", "unknown"]
     assert [EXIT[outcome(line)] for line in lines] == [0, 1, 3, 3]
@@ -183,8 +183,8 @@ def test_units_are_counted_with_the_limits_that_decide():
         unit(noise="pass", coast="not measured"),
     ]  # fmt: skip
     assert verdict_of_units(units) == (
-        "limits: 1 pass; 3 fail (coast over 10 min (rms) 3, white noise 1); 1 undecided (white noise 1); "
-        "1 not measured (coast over 10 min (rms) 1)"
+        "limits: 1 pass; 3 fail (prediction over 10 min (rms) 3, white noise 1); 1 undecided (white noise 1); "
+        "1 not measured (prediction over 10 min (rms) 1)"
     )
     assert verdict_of_units([unit(noise="fail")]) == "limits: 0 pass; 1 fail (white noise 1)"
     assert verdict_of_units([[], []]) == ""

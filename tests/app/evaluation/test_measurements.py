@@ -46,7 +46,7 @@ def test_the_mean_over_many_coasts_is_between_the_limits_of_one_run(walk):
         one = of_coast(score(run, None, AXES), 5400.0 - align, align)
         below += list(one.low <= np.sqrt(mean))
         above += list(one.high >= np.sqrt(mean))
-    assert one.stands_on.startswith("8 coasts of 10 min")
+    assert one.stands_on.startswith("8 predictions of 10 min")
     assert np.mean(below) >= 0.9  # 95 %, of 90 draws
     assert np.mean(above) >= 0.9
 
@@ -138,7 +138,7 @@ def test_a_hysteresis_that_is_seen_stands_beside_the_verdict_where_no_limit_is_s
     assert [row.as_json(RATE).get("beside") for row in rows] == [beside]
     assert outcome(verdict(rows)) == "pass"
     two = verdict(check_limits(Limits(swing=1.0, coast=1.0), of_map(remembering(**seen))))
-    assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: coast")
+    assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: prediction")
     assert two.endswith(f"; {beside}")
     for memory in ({"answer": "none", "none_larger_than": [1e-7, 1e-7]}, {"answer": "undecided"}):
         assert "hysteresis" not in verdict(check_limits(Limits(swing=1.0), of_map(remembering(**memory))))

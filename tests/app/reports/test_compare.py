@@ -69,13 +69,13 @@ def test_the_sentence_the_bars_and_the_decisive_row_come_first(written, found, o
     begin = bars.locator(".bar").first.bounding_box()["x"]
     assert [(x - begin) / max(lengths) for x in ticks] == pytest.approx([s / max(errors) for s in sigmas], abs=0.02)
     row = shown.locator("h2:has-text('Error') ~ table tbody tr").first
-    assert row.inner_text().split()[:5] == ["coast,", "to", "the", "end", "rms"]
+    assert row.inner_text().split()[:5] == ["prediction,", "to", "the", "end", "x"]
 
 
 def test_each_config_has_its_limits_and_its_hash(written, result, opened):
     shown = opened(written)
     said = [line.inner_text().split(" limit")[0] for line in shown.locator(".verdict").all()[1:]]
-    assert said == ["slow: PASS: 1 of 1", "walks<fast>: FAIL: coast over 10 min (rms) (0 of 1"]
+    assert said == ["slow: PASS: 1 of 1", "walks<fast>: FAIL: prediction over 10 min (rms) (0 of 1"]
     assert shown.locator("table.limits").count() == 2
     assert "SN <7>" in shown.locator("p.lead").first.inner_text()
     sheet = shown.locator("table.sheet").inner_text()

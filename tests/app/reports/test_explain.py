@@ -35,7 +35,7 @@ HELD = outcome(BiasUnit("1", "ppm"), 3e-6)
 @pytest.mark.parametrize("found", [RATE, HELD], ids=["deg/h", "ppm"])
 def test_errors_are_shown_in_the_sensors_unit(found):
     rows = _cells(found)
-    assert [row[0] for row in rows][:2] == ["coast, to the end", "  its sigma"]
+    assert [row[0] for row in rows][:2] == ["prediction, to the end", "  its sigma"]
     assert [row[0] for row in rows][-2:] == ["bias, all", "bias, first 30 s"]
     for label, before, after, change in rows:
         assert (float(before[0]), float(after[0])) == (3.0, 1.5)

@@ -140,7 +140,7 @@ def test_a_page_shows_charts_and_bars_on_a_phone(tmp_path, opened):
 
     shown = outcome()
     sheet = Sheet("SN 7", "2026-11-22", "page", "c.yaml", "0" * 64, [], {}, [], [], [], "")
-    row = ("coast, to the end", ["3"] * 3, ["1"] * 3, "-67")
+    row = ("prediction, to the end", ["3"] * 3, ["1"] * 3, "-67")
     found = verdict(20)
     evidence = SimpleNamespace(axes=AXES, channel="gyro")
     search = SimpleNamespace(tried=20, evidence=evidence)

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browsers import assert_drawn_everywhere, overflow
+from browsers import assert_drawn_everywhere, assert_fits_on_paper, overflow
 from lines import AXES, DEG_H, line
 
 from driftlab.config import Limits
 from driftlab.evaluation.limits import verdict_of_units
 from driftlab.family.outliers import Outlier
-from driftlab.family.record import FIGURES
+from driftlab.family.record import FIGURES, figure_name
 from driftlab.reports import fleet as fleet_rows
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, control_charts, percentiles
@@ -102,7 +102,7 @@ def test_every_panel_and_every_figure_has_its_unit(path, opened):
     assert all("[" in label for label in labels if label != "units measured")
     shown.select_option("#columns", "all")
     heads = shown.locator(".rows th button").all_inner_texts()
-    figures = [head for head in heads if head.split()[0] in ("residual", "noise", "walk", "swing", "coast")]
+    figures = [head for head in heads if head.split()[0] in map(figure_name, FIGURES)]
     assert len(figures) == 15
     assert all(head.endswith("]") for head in figures)
 
@@ -222,6 +222,36 @@ def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):
     assert cells(shown, "state") == ["failed"] * 3
 
 
+def test_on_paper_no_table_is_wider_than_the_sheet(path, opened):
+    assert_fits_on_paper(opened(path, width=688))
+
+
+def test_the_headline_has_the_odd_units_of_the_list_below(opened, tmp_path):
+    calm = fleet(40, odd=(3, 11), remarks=())
+    records = line(40, 1)
+    calm = replace(calm, records=records, line=line_of(records, LIMITS))
+    write_fleet_report(tmp_path / "calm.html", calm)
+    shown = opened(tmp_path / "calm.html")
+    headline = shown.locator(".verdict").last.inner_text()
+    assert headline.startswith("2 of 40 units are odd. ")
+    assert "No change of the line" in headline  # that alone would say that nothing is to be looked at
+    assert "odd units back" in shown.locator("p.use").inner_text()
+
+
+def test_a_unit_far_off_leaves_the_scale_to_the_others_and_its_value_in_the_label(overview):
+    records = line(60, 2)
+    figure = records[20].figures["noise"]
+    far = figure.model_copy(update={"value": tuple(15 * value for value in figure.value)})
+    records[20] = records[20].model_copy(update={"figures": {**records[20].figures, "noise": far}})
+    (chart,) = [chart for chart in control_charts(line_of(records, LIMITS)) if chart.title.startswith("White noise")]
+    values = np.array([one.figures["noise"].value for k, one in enumerate(records) if k != 20]) * RATE.factor
+    for k, panel in enumerate(chart.panels):
+        assert panel.span[1] < 2 * values[:, k].max()
+        assert panel.label.endswith(f"beyond the axis: {records[20].unit} at {far.value[k] * RATE.factor:.3g}")
+        (beyond,) = [one for one in panel.lines if one.name == "beyond three sigma"]
+        assert np.any((beyond.x == 21) & (beyond.y <= panel.span[1]))  # at the edge, in sight
+
+
 def test_half_of_the_units_are_in_the_narrow_band():
     curves = np.random.default_rng(0).normal(size=(400, len(AXES), 5)).astype(np.float32)
     low, _, half, _, high = percentiles(curves)
@@ -272,7 +302,7 @@ def test_long_names_are_told_apart_on_a_phone_and_under_the_charts(opened, tmp_p
     assert overflow(shown) == 0
     reason = shown.locator(".reasons td").first
     assert reason.bounding_box()["x"] + reason.bounding_box()["width"] <= 390
-    said = shown.evaluate("driftlab.charts.at(-1).label(18)")
+    said = shown.evaluate("driftlab.charts.at(-1).label(18).split('\\n')[0]")
     assert said == "…l-2026-0017"  # the unit at place 18, by what no other unit has
     lefts = shown.eval_on_selector_all(
         ".rows td.left:first-child", "(all) => all.map((a) => getComputedStyle(a).position)"
@@ -292,6 +322,7 @@ def test_of_one_axis_all_figures_stand_side_by_side_at_once(opened, tmp_path):
     write_fleet_report(path, fleet(12, records=records, drawn=[], odd={}, line=line_of(records, None)))
     shown = opened(path)
     heads = [head.split()[0] for head in shown.locator(".rows th button").all_inner_texts()]
-    assert [head for head in heads if head in FIGURES] == list(FIGURES)
+    names = list(map(figure_name, FIGURES))
+    assert [head for head in heads if head in names] == names
     box, table = shown.locator(".rows").bounding_box(), shown.locator(".rows table").bounding_box()
     assert box["height"] < table["height"] + 40  # twelve rows need no window for twenty

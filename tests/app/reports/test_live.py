@@ -185,9 +185,11 @@ def test_the_map_that_is_fitted_meanwhile(shown, opened):
         axes=AXES,
     )  # fmt: skip
     shown.goes_on(1)
-    until(page, lambda: page.locator("#map canvas").count() == 1)
+    until(page, lambda: page.locator("#map canvas").count() == 3)  # an axis each: none is drawn over another
     expect(page.locator("#map-lines li")).to_have_text(shown.status.map.lines())
-    assert legend(page, 2) == ["gyro x", "gyro y", "gyro z", "not seen yet"]
+    assert legend(page, 2) == ["sigma", "not seen yet"]
+    labels = page.locator("#map .panels .label").all_inner_texts()
+    assert labels == [f"sigma of the map, gyro {axis} [deg/h]" for axis in AXES]
     assert tuple(range_of_x(page, 2)) == asked
 
 

@@ -92,7 +92,7 @@ def test_the_terminal_begins_with_the_verdict(run, capsys):
 def test_at_the_top_stand_serial_verdict_and_limits(page, opened):
     shown = opened(page)
     assert "CRS-0042" in shown.locator("p.lead").nth(1).inner_text()
-    verdict = shown.locator(".verdict")
+    verdict = shown.locator(".verdict").first
     assert verdict.get_attribute("class") == "verdict fail"
     assert verdict.bounding_box()["y"] < shown.locator("h2").first.bounding_box()["y"]
     assert shown.locator("table.limits td.pass").count() == 2
@@ -117,7 +117,7 @@ def test_every_figure_is_drawn_and_can_be_zoomed_and_read(page, opened):
     box = shown.locator("figure.chart").nth(1).locator(".u-over").first.bounding_box()
     shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     said = shown.locator("figure.chart").nth(1).locator(".read").inner_text()
-    assert re.search(r"error x \[deg/h\]: .*estimate less reference -?\d.*, coast less reference -?\d", said)
+    assert re.search(r"error x \[deg/h\]: .*estimate less reference -?\d.*, prediction less reference -?\d", said)
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -151,7 +151,7 @@ def test_errors_are_those_of_every_row_in_a_scale_of_their_own(run):
     windows = [np.mean(found.rate[(abs(found.t - t) < 15 + 1e-9) & found.still.astype(bool), 2])
                for t in found.t[still][::50]]  # fmt: skip
     error = (found.coast[still][::50, 2] - windows) * RATE.factor
-    line = drawn["coast less reference"].y
+    line = drawn["prediction less reference"].y
     assert np.nanmin(line) <= error.min() + 0.05
     assert np.nanmax(line) >= error.max() - 0.05
     low, high = chart.panels[2].span
@@ -174,7 +174,7 @@ def test_a_plot_shows_what_the_page_shows(run):
     axes = found.plot().axes
     assert [panel.get_ylabel() for panel in axes][3] == "error x [deg/h]"
     estimate = next(line for line in axes[0].get_lines() if line.get_label() == "estimate, ± 2σ")
-    dashed = next(line for line in axes[0].get_lines() if line.get_label() == "coast")
+    dashed = next(line for line in axes[0].get_lines() if line.get_label() == "prediction")
     assert (estimate.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
     assert estimate.get_color() != dashed.get_color()
 
@@ -203,7 +203,13 @@ def test_on_paper_no_heading_is_left_alone_and_there_is_where_to_sign(page, open
     assert headings <= set(every)
     for lines in pages:
         assert lines[-1] not in headings
-    assert any("measured by checked by date" in line for line in pages[0])  # beside the verdict
+    first = pages[0]
+    (signed,) = [k for k, line in enumerate(first) if "measured by checked by date" in line]
+    (result,) = [
+        k for k, line in enumerate(first) if line.startswith("Without updates the bias is predicted over 10 min")
+    ]
+    (error,) = [k for k, line in enumerate(first) if line.startswith("prediction, 10 min ")]
+    assert result < error < signed  # on the sheet that is signed
     assert "dark / light" not in every
 
 

@@ -30,7 +30,7 @@ def printed(table, width=80):
     return console.file.getvalue()
 
 
-COASTS = [part for name in ("to the end", "10 min", "5 min", "1 min") for part in (f"coast, {name}", "its sigma")]
+COASTS = [part for name in ("to the end", "10 min", "5 min", "1 min") for part in (f"prediction, {name}", "its sigma")]
 
 
 def test_the_longest_coast_is_first_and_the_filter_s_own_error_after_the_coasts():
@@ -43,7 +43,7 @@ def test_of_several_runs_the_rms_over_the_axes_comes_first():
     text = printed(yardstick_table({"a": yardsticks(1), "b": yardsticks(10)}, "t", GYRO))
     rows = re.findall(r"^│ +([a-z][^│]*?) +│", text, re.MULTILINE)
     assert rows[:16] == COASTS * 2
-    first = next(line for line in text.splitlines() if "coast, to the end" in line)
+    first = next(line for line in text.splitlines() if "prediction, to the end" in line)
     # sqrt((1 + 4 + 9) / 3)
     assert re.findall(r"\S+", first.replace("│", " "))[-3:] == ["rms", "2.16", "21.60"]
 

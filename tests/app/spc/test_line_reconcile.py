@@ -21,7 +21,7 @@ def test_a_lot_that_comes_and_goes_is_told_as_a_lot():
     lots, text = said(records, "L04")
     assert lots == ["L04"]
     assert "y noise rose" not in text
-    assert "No change of the line in 200 units but that of lot L04, which is off as a whole" in text
+    assert "Off as a whole: lot L04. Beside that no change of the line in 200 units" in text
 
 
 def test_a_change_that_stays_is_told_as_the_lines():

@@ -1,7 +1,7 @@
 """Pages of maps, noise and plans, opened as they are written; those of a run and a comparison have their own tests."""
 
 import pytest
-from browsers import assert_drawn_everywhere
+from browsers import assert_drawn_everywhere, assert_fits_on_paper
 from typer.testing import CliRunner
 
 import driftlab
@@ -27,6 +27,7 @@ source:
     accel: {path: accel, unit: m/s^2}
     temperature: {path: temperature, unit: degC}
 """
+SHEET = 688  # CSS pixels of A4 between its margins
 HOURS = ["0 s", "1800 s", "3600 s"]
 SOAK = {
     "kind": "synthetic",
@@ -39,7 +40,7 @@ RANGE = ("--range", "0..40 degC", "--hours", "1.5", "--lag", "2 min", "--effects
 PAGES = {
     "allan": (("allan", "unit.yaml", "--input", "soak.h5", "--out", "out"), "out/report.html", 2),
     "map": (("fit-map", "unit.yaml", "--input", "soak.h5", "--out", "map.json"), "map.report.html", 4),
-    "kinds": (("fit-map", "unit.yaml", "--input", "soak.h5", "--compare", "--out", "map.json"), "map.report.html", 6),
+    "kinds": (("fit-map", "unit.yaml", "--input", "soak.h5", "--compare", "--out", "map.json"), "map.report.html", 5),
     "size": (
         ("fit-map", "network.yaml", "--input", "soak.h5", "--select", "--neurons-max", "2", "--out", "map.onnx"),
         "map.report.html",
@@ -67,3 +68,30 @@ def test_it_is_drawn_on_every_screen(kind, soak, tmp_path, monkeypatch, opened):
     done = CliRunner().invoke(app, list(arguments))
     assert done.exit_code == 0, done.output
     assert_drawn_everywhere(opened, tmp_path / page, figures)
+    assert_fits_on_paper(opened(tmp_path / page, width=SHEET))
+
+
+def test_kinds_are_bars_with_their_names(soak, tmp_path, monkeypatch, opened):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "soak.h5").symlink_to(soak)
+    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
+    tried = driftlab.fit_map("unit.yaml", "soak.h5", compare=True)
+    tried.save("map.json")
+    shown = opened(tmp_path / "map.report.html")
+    bars = shown.locator("ol.bars li")
+    names = [row["name"] for row in sorted(tried.summary["compare"]["tried"], key=lambda row: row["error"])]
+    assert [text.removesuffix(" taken") for text in bars.locator(".name").all_inner_texts()] == names
+    assert bars.locator(".name strong").count() == 1
+    widths = [bars.nth(k).locator(".bar").bounding_box()["width"] for k in range(len(names))]
+    assert widths == sorted(widths)
+
+
+def test_a_plan_with_more_hours_is_never_worse(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
+    # in 1.5 h a second cycle does not fit, and one that is slower suffers more from the walk
+    found = driftlab.plan("unit.yaml", 1.5, range=(0.0, 40.0), lag="2 min").found
+    sigma = [point.best.score for point in found.pareto]
+    assert sigma == sorted(sigma, reverse=True)
+    assert found.chosen.score <= 1.05 * min(point.best.score for point in found.pareto if point.hours <= 1.5)
+    assert found.chosen.profile.hours < 1.5
