@@ -278,7 +278,7 @@ class Loss:
 
     def lines(self) -> list[str]:
         """Return all of it in words, a line each: for the screen, and for comments of a file."""
-        lost = [line for sensor in self.sensors for line in sensor.lines()]
+        lost = [text for sensor in self.sensors for text in sensor.lines()]
         texts = [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
         return [line(text) for text in texts]
 
