@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise, noise_of
-from driftlab.starter.names import Name, known_unit, leading, named, quantity_of, read_name
+from driftlab.starter.names import NO_SENSOR, Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
@@ -147,7 +147,8 @@ def _of_its_dimension(name: Name, unit: str | None) -> Name:
     known = None if unit is None else known_unit(unit.split(" since ")[0])
     if unit is None or known is None or (name.quantity is not None and _understood(unit, name.quantity)):
         return name
-    return replace(name, quantity=None if name.quantity else quantity_of(known))
+    unnamed = name.quantity is None and not NO_SENSOR.intersection(name.group)
+    return replace(name, quantity=quantity_of(known) if unnamed else None)
 
 
 def _by_values(

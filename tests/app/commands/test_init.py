@@ -358,3 +358,12 @@ def test_allan_measures_the_noise_that_a_config_lacks(tmp_path):
     (tmp_path / "bare.yaml").write_text(bare)
     assert driftlab("allan", tmp_path / "bare.yaml").exit_code == 0
     assert allan(tmp_path / "bare.yaml").config_lines == allan(done.path).config_lines
+
+
+def test_the_true_bias_of_a_simulated_recording_is_no_sensor(tmp_path):
+    """It has the gyro's unit, and stands before it by its letters."""
+    twin = {"source": {"kind": "synthetic", "rate": "1 Hz", "profile": {"kind": "ramp"}}}
+    simulate(twin, out=tmp_path / "twin.h5", seed=1, duration="10 min")
+    init(tmp_path / "twin.h5", out=tmp_path / "twin.yaml")
+    with h5py.File(tmp_path / "twin.h5") as file:
+        np.testing.assert_array_equal(samples(tmp_path / "twin.yaml")["gyro"], file["gyro"])
