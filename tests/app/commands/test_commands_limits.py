@@ -66,5 +66,5 @@ def test_run_says_each_limit_that_does_not_pass(status):
     said = CliRunner().invoke(app, ["run", "unit.yaml", "--input", "log.h5::0:300", "--out", "d"]).stdout.splitlines()
     lines = [line for line in said if line.startswith("  ") and "at most" in line]
     assert any("white noise" in line and ", fail (" in line for line in lines)
-    assert any("coast" in line and ", not measured (" in line for line in lines)
+    assert any("prediction" in line and ", not measured (" in line for line in lines)
     assert not any(", pass (" in line for line in lines)

@@ -56,3 +56,10 @@ def test_charts_say_the_sensors_unit(found, unit):
 def test_a_chart_shows_the_sensors_numbers():
     panel = prediction_chart(HELD, ["resistance"]).panels[0]
     np.testing.assert_allclose(panel.lines[0].y, 3.0)
+
+
+def test_where_nothing_was_added_one_model_is_drawn_and_not_the_same_twice():
+    both = {line.name for panel in prediction_chart(RATE, ["x"]).panels for line in panel.lines}
+    assert both == {"measured", "before, ± 2σ", "after, ± 2σ"}
+    one = {line.name for panel in prediction_chart(RATE, ["x"], changed=False).panels for line in panel.lines}
+    assert one == {"measured", "declared, ± 2σ"}
