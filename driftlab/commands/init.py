@@ -59,11 +59,11 @@ def init(
     interval: str | None = None,
     decimal: str | None = None,
 ) -> FirstConfig:
-    """Write a first config of a file, with every guess marked, and look into its data.
+    """Write a first config of a file, with every guess marked.
 
-    It has the source, channels, units and noise. FILE is a log of PX4 (.ulg) or ArduPilot (.bin), a ROS bag,
-    CSV or another text of a logger, Excel (.xlsx), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that
-    an installed framing knows; packed with gzip too. In a terminal it asks what it cannot know.
+    It has the source, channels, units and noise, and its data are looked into. FILE is a log of PX4 (.ulg) or ArduPilot
+    (.bin), a ROS bag, CSV or another text of a logger, Excel (.xlsx), HDF5, NetCDF, MATLAB's .mat, Parquet, or the
+    bytes of a device that an installed framing knows; packed with gzip too. In a terminal it asks what it cannot know.
 
     Parameters
     ----------

@@ -148,6 +148,8 @@ def _format(cells: list[str]) -> str | None:
     filled = [cell for cell in cells if cell]
     if all(re.fullmatch(r"[\d.eE+-]+ sec", cell) for cell in filled):
         return "sec"  # as MATLAB writes a duration
+    if not all(map(DATE.fullmatch, filled)):
+        return None
     years = "%Y" if all(re.search(r"\d{4}", cell) for cell in filled) else "%y"
     forms = [form for form in forms if years in form or form in HOURS]
     return next((form for form in forms if seconds_of(pl.Series(filled), form).is_not_null().all()), None)

@@ -23,7 +23,7 @@ from dataflash_writer import write_log
 from scipy.io import savemat
 from ulog_writer import sensor, write_ulog
 
-ROWS, RATE = 1500, 50.0
+ROWS, RATE = 600, 50.0
 BEGIN = datetime(2026, 3, 5, 14, 22, 1)
 G = 9.80665
 DEG = np.pi / 180
@@ -350,7 +350,7 @@ def _(u):
 
 LVM = ["LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab", "Multi_Headings\tNo",
        "X_Columns\tOne", "Time_Pref\tRelative", "Operator\tbench", "Date\t2026/03/05", "Time\t14:22:01,02",
-       "***End_of_Header***\t", "\t", "Channels\t7", "Samples\t1500\t1500\t1500\t1500\t1500\t1500\t1500",
+       "***End_of_Header***\t", "\t", "Channels\t7", "Samples\t600\t600\t600\t600\t600\t600\t600",
        "X_Dimension\tTime\tTime\tTime\tTime\tTime\tTime\tTime", "X0\t0\t0\t0\t0\t0\t0\t0",
        "Delta_X\t0,02\t0,02\t0,02\t0,02\t0,02\t0,02\t0,02", "***End_of_Header***\t\t\t\t\t\t\t"]  # fmt: skip
 LVM_SOURCE = "NI, 'Specification for the LabVIEW Measurement File (.lvm)'"

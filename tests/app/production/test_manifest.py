@@ -65,7 +65,7 @@ def test_what_spreadsheets_write_is_read(manifest, text):
 
 
 def test_a_manifest_may_be_called_tsv(manifest):
-    assert manifest("unit\trole\tpath\na\tcalibration\ta.h5\n", "units.tsv").units[0].name == "a"
+    assert manifest("unit\trole\tpath\na\tcalibration\ta.h5\n", "units.tsv").units[0].unit == "a"
 
 
 def test_the_same_recording_may_calibrate_and_train(manifest):

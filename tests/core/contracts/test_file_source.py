@@ -22,6 +22,7 @@ from fusion_core.errors import (
     UnreadableFile,
 )
 from fusion_core.faults import Faults, usable
+from fusion_core.host.registry import registry
 from fusion_plugins.sources import csv as csv_module
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
@@ -333,6 +334,7 @@ def test_every_kind_reads_a_gzip_archive_and_names_it(tmp_path, kind):
 
 
 def test_each_kind_names_the_other(tmp_path):
+    registry()  # whose sources are those that advice can name
     path = write(Csv, tmp_path / "a.csv", columns())
     with pytest.raises(UnreadableFile, match="is a text file, a file of kind hdf5 was expected; use kind: csv"):
         read(Hdf5(path=path, channels=TIME))
