@@ -195,14 +195,21 @@ def understood(document: Document, *, measuring: bool = False) -> Config:
     return config
 
 
+def _at(data: Any, *keys: object) -> Any:
+    """Return what is at keys within one another; None where there is nothing, or no mapping."""
+    for key in keys:
+        data = data.get(key) if isinstance(data, dict) and isinstance(key, str) else None
+    return data
+
+
 def _undeclared(data: Mapping[str, Any]) -> Iterator[str]:
     """Yield settings of the noise and walk that a config lacks: so large that nothing is taken for motion."""
     model = data.get("filter")
     if not isinstance(model, dict):
         return
     held = model.get("kind", "zupt") != "zupt"
-    channel = data.get("source", {}).get("channels", {}).get(model.get("channel"), {})
-    sections = {"": str(channel.get("unit", "1"))} if held else {".gyro": "deg/s", ".accel": "g"}
+    unit = _at(data, "source", "channels", model.get("channel"), "unit")
+    sections = {"": unit if isinstance(unit, str) else "1"} if held else {".gyro": "deg/s", ".accel": "g"}
     for place, unit in sections.items():
         section = model if held else model.get(place[1:])
         if isinstance(section, dict):

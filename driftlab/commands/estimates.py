@@ -161,7 +161,8 @@ class EstimatesWriter:
     possible: bool = True
 
     def __post_init__(self) -> None:
-        self.text, self.plugins = self.config.as_yaml(), participants(self.config)
+        plain = self.config.model_copy(update={"certificate": None})  # its texts change no result
+        self.text, self.plugins = plain.as_yaml(), participants(self.config)
         if isinstance(self.config.source, FileSource):
             self.recording = self.recording or self.config.source.path
 

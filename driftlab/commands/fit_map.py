@@ -34,6 +34,7 @@ from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_file, check_place, save, write_text
+from driftlab.storage.ownership import why_not_own
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
@@ -132,13 +133,20 @@ class FitMapResult(Result):
         beside = _beside(path, folder, names)
         for place, text in zip(beside, texts, strict=True):
             write_text(place, text, COMMAND)
+        if not certificate:  # that of an earlier map is not of this one
+            for place in _beside(path, folder, _names(selected=False, certificate=True)):
+                if "certificate" in place.name and place.is_file() and not why_not_own(place, COMMAND):
+                    place.unlink()
         self.written = (path, *beside)
 
     def _certificate(self, sheet: Sheet) -> Certificate:
-        verdict, lasted = self.verdict, self.map.record.lasted
+        verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
+        soak = verdict.soak if len(set(paths)) == len(paths) else None  # parts of one recording are no power-ups
+        remark = verdict.used.sentence() if verdict.used else None
         return Certificate(
-            COMMAND, self.config, sheet, self.limits, self.measured, self.map, verdict.soak, verdict.placements, lasted
-        )
+            COMMAND, self.config, sheet, self.limits, self.measured, self.map, soak, verdict.placements,
+            self.map.record.lasted, remarks=[remark] if remark else [],
+        )  # fmt: skip
 
 
 def fit_map(

@@ -44,7 +44,7 @@ from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import reading
 from driftlab.storage.json import write_json
 from driftlab.units import unit_of
-from fusion_core.contracts import MeasurementModel
+from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError
 from fusion_core.host.provenance import participants
 
@@ -141,15 +141,32 @@ class RunResult(Result):
         bias = Measured(overview.bias, self.model.tracked.axes, otherwise="the filter's deviations are not confirmed")
         if is_trusted(overview.nis):
             bias = normal(bias, overview.sigma, np.nan)
-        fitted_on = "" if fitted is None else fitted.record.provenance.get("recordings", "")
-        names = [Path(str(one["name"])).name for one in sheet.recordings]
-        seen = [f"the map was fitted on {name} too, so its prediction is of what it has seen" for name in names]
+        measured = None if T is None else (float(np.min(T)), float(np.max(T)))
         return Certificate(
             "run", self.config, sheet, self.judged, {"bias": bias, **self.measured}, fitted,
-            seconds=(overview.end - overview.start) * (1 - overview.yardsticks.moved),
-            domain=None if T is None else (float(np.min(T)), float(np.max(T))),
-            remarks=[text for name, text in zip(names, seen, strict=True) if name.partition("::")[0] in fitted_on],
+            seconds=overview.count * self.journal.alignments[0].dt * (1 - overview.yardsticks.moved),
+            domain=measured, remarks=self._remarks(fitted, measured, sheet),
         )  # fmt: skip
+
+    def _remarks(self, fitted: FittedMap | None, measured: tuple[float, float] | None, sheet: Sheet) -> list[str]:
+        """Return the remarks of a certificate: what of it this run has not measured."""
+        if fitted is None or measured is None:
+            return []
+        record, unit = fitted.record, unit_of(self.model.tracked)
+        remarks = [f"the bias over temperature is the map's, of another recording; this one was at {_span(*measured)}"]
+        T = float(self.overview.curves["temperature_raw"][-1])
+        if record.domain[0] <= T <= record.domain[1]:
+            less = (self.overview.bias - fitted.bias(np.array([T]))[0]) * unit.factor
+            values = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(record.axes, less, strict=True))
+            remarks.append(f"the bias at the end less the map's there is {values} {unit.shown}")
+        fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
+        names = [Path(str(one["name"])).name for one in sheet.recordings]
+        both = (name for name in names if name.partition("::")[0] in fitted_on)
+        return [*remarks, *(f"the map was fitted on {name} too, so it predicts what it has seen" for name in both)]
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.2f} to {high:.2f} °C"
 
 
 def run(

@@ -96,9 +96,9 @@ def bias_budget(
     else:
         sources.append(UncertaintySource("memory", "A", np.broadcast_to(half, shape)))
     if placements is not None:
-        level, unknown = _level(placements)
+        level, across = _level(placements)
         sources.append(UncertaintySource("placements", "A", np.broadcast_to(level, shape)))
-        missing += [unknown] if unknown else []
+        missing += across
     ups = None if soak is None or placements is not None else power_ups(fitted, soak)
     if ups is None:
         missing.append("the level after another power-up: it was not measured (three recordings or more measure it)")
@@ -133,17 +133,14 @@ def _memory(fitted: FittedMap) -> tuple[Array | None, str]:
     return np.sqrt(probable * np.nan_to_num(size**2 + sigma**2)) / 2, ""
 
 
-def _level(placements: Placements) -> tuple[Array, str]:
+def _level(placements: Placements) -> tuple[Array, list[str]]:
     """Return the deviation (d,) of the level that placements determine, and what they do not."""
     levels, d = placements.levels, len(placements.levels.bias)
     states = [levels.level(axis) for axis in range(d)]
-    known = {"told": levels.sigma, "scale": levels.given_scale, "tilt": np.zeros(d)}
-    missing = ""
-    if "tilt" in states:
-        missing = "the level of an axis across gravity, which is one with the tilt of the unit: its values are changes"
-    elif "scale" in states:
-        missing = "the scale factor's part of the level: these placements do not tell them apart"
-    return np.array([known[state][axis] for axis, state in enumerate(states)]), missing
+    across = ", ".join("xyz"[axis] for axis in range(d) if states[axis] == "tilt")
+    missing = [f"the level across gravity ({across}), which is one with the tilt of the unit: values are changes"]
+    sigma = np.where([state == "tilt" for state in states], 0.0, levels.sigma)  # that with an unknown scale factor too
+    return sigma, missing * bool(across)
 
 
 def power_ups(fitted: FittedMap, soak: SoakSummary) -> Array | None:

@@ -205,6 +205,10 @@ class UnitJobs:
         stage = Stage("certificates", total=len(records))
         for record in records:
             self.progress(stage)
+            if record.unit in self.without_recordings:
+                why = "its recordings are not there, and it may be of another config"
+                failed.append(f"unit {record.unit} has no certificate: {why}")
+                continue
             try:
                 signed = certificate_of(record, self.folder.unit(record.unit), config, sheet)
             except FusionError as error:

@@ -193,7 +193,7 @@ class Certificate:
             "item": {"serial": self.sheet.serial or self.name or None, "unit": self.name or None, **self._sensor()},
             "method": self._method(),
             "temperature_degC": self.domain or domain,
-            "valid_degC": domain or self.domain,
+            "valid_degC": _within(domain, self.domain) if self.command == "run" else domain or self.domain,
             "coverage_factor": K,
             "bias": self._bias(),
             "figures": [self._figure(name, one) for name, one in self.measured.items()],
@@ -327,3 +327,11 @@ class Certificate:
     def _size(self, value: float) -> str:
         unit = self.unit(value)
         return f"{two_digits(value * unit.factor)} {unit.shown}"
+
+
+def _within(first: tuple[float, float] | None, second: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the range that two ranges have in common; the one that is known where the other is not."""
+    if first is None or second is None:
+        return first or second
+    low, high = max(first[0], second[0]), min(first[1], second[1])
+    return (low, high) if low <= high else None

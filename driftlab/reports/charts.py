@@ -293,8 +293,9 @@ def without_spikes(values: Array, few: float = FEW) -> tuple[float, float]:
     """Return from where to where values are drawn: all, or without a few far ones that would squash the others."""
     low, high = np.percentile(values, (10, 90))
     room = FAR * (high - low)
-    inside = values[(values >= low - room) & (values <= high + room)]
-    drawn = inside if room and len(values) - len(inside) <= max(1.0, few * len(values)) else values
+    far = (values < low - room) | (values > high + room)
+    spikes = not np.any(far[:-2] & far[1:-1] & far[2:])  # three in a row are no spike
+    drawn = values[~far] if room and spikes and np.sum(far) <= max(1.0, few * len(values)) else values
     return float(np.min(drawn)), float(np.max(drawn))
 
 

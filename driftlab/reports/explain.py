@@ -82,7 +82,7 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         closed=closed,
         word=verdict.word.replace("_", " "),
         outcome="unknown" if worse else OUTCOME[verdict.word],
-        use=USE[verdict.word],
+        use="keep the declared config until another recording is predicted better." if worse else USE[verdict.word],
         changed=closed.anything,
         meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
         unit=unit.shown,

@@ -81,6 +81,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
     span = None if wide else _span(chart, (low, high), unit.factor)
     names = ", ".join(f"{line.units[chart.at[k]]} at {chart.value[k] * unit.factor:.3g}" for k in cut[:NAMED])
+    names += f" and {len(cut) - NAMED} more" if len(cut) > NAMED else ""
     label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"
     return Panel(tuple(lines), label, shades, log=wide, span=span)
 

@@ -142,12 +142,14 @@ def _use(verdict: MapVerdict, unit: BiasUnit) -> str:
     """Return the meaning of the verdict for use."""
     if verdict.seen:
         return "do not calibrate by this map alone: up and down differ; run `driftlab explain` first."
-    if verdict.good is None:
+    if verdict.sigma is None:
         return "check the map on another recording by `driftlab run`: its kind has no sigma."
     low, high = verdict.fitted.domain
-    off = text(2 * float(np.max(verdict.good)) * unit.factor)
+    off = text(2 * float(np.max(verdict.sigma)) * unit.factor)
     turned = f", {off} deg of heading an hour" if unit.shown == "deg/h" else ""
-    return f"from {low:.3g} to {high:.3g} °C count on {off} {unit.shown} (2 sigma) beside the level{turned}."
+    open_ = "" if verdict.memory.answer == "none" else ", and with a hysteresis or lag that this soak does not exclude"
+    span = f"from {low:.3g} to {high:.3g} °C"
+    return f"{span} count with up to {off} {unit.shown} (2 sigma) beside the level{turned}{open_}."
 
 
 def page_of(

@@ -93,11 +93,14 @@ def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[
     if name is None:
         return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""
     worst = int(np.argmax(scores.coast[name]))
-    error, sigma = float(scores.coast[name][worst]), float(scores.coast_sigma[name][worst])
+    unsure = int(np.nanargmax(scores.coast[name] / scores.coast_sigma[name]))
+    error, sigma = float(scores.coast[name][worst]), float(scores.coast_sigma[name][unsure])
+    ratio = float(scores.coast[name][unsure]) / sigma
     axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
     result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
-    trust = f"its sigma there, {unit.number(sigma)} {unit.shown}, " + (
-        "covers that" if error <= REFUTED * sigma else f"is too small by {error / sigma:.1f} times: widen walk or map"
+    of = axis and f" of {scores.axes[unsure]}"
+    trust = f"its sigma{of} there, {unit.number(sigma)} {unit.shown}, " + (
+        "covers the error" if ratio <= REFUTED else f"is too small by {ratio:.1f} times: widen walk or map"
     )
     turned = f"{name} without updates turn the heading by {np.rad2deg(scores.heading[name]):.2g} deg; " * heading
     return f"{result}.", f"{turned}{trust}."
@@ -109,9 +112,7 @@ def nis_sentence(nis: NisTest) -> str:
         return "The NIS is not known, no update was used."
     mean, bounds = f"The mean NIS a component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
     if nis.consistent:
-        return (
-            f"{mean}, within {bounds}: innovations are as large as the model says, so its sigma can be used as it is."
-        )
+        return f"{mean}, within {bounds}: innovations are as large as the model says, over one update."
     return f"{mean}, outside {bounds}: {inconsistency(nis.mean)}."
 
 

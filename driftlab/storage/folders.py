@@ -315,7 +315,7 @@ def output_folder(
 
 
 FILES = {  # of each command; the first says that all are there
-    "run": ("summary.json", "estimates.h5", "report.html", "certificate.*"),
+    "run": ("summary.json", "estimates.h5", "report.html", "certificate.html", "certificate.json"),
     "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
     "compare": ("summary.json", "report.html"),
     "plan": ("plan.json", "setpoints.csv", "report.html"),

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from driftlab.storage.folders import check_writable, refusals
-from driftlab.storage.ownership import OWN, check_own, put, seal, seal_of
+from driftlab.storage.ownership import check_own, put, seal, seal_of
 from driftlab.storage.system import sync
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, MapError
@@ -43,7 +43,7 @@ def write_text(path: Path, text: str, command: str) -> None:
     known = f"{text}<!-- {seal_of(command)} -->\n"
     if text[0] == "{":
         known = f'{{\n  "sha256": "{seal_of(command)}",{text[1:]}'
-    elif OWN in text:
+    elif seal_of(command) in text:
         known = text
     with _sealed(path, command, str(path)) as new:
         new.write_text(known, encoding="utf-8")
