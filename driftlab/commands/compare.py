@@ -75,7 +75,7 @@ def compare(
     channel: str | None = None,
     progress: Progress | None = None,
 ) -> CompareResult:
-    """Compare configs on one recording: which predicts best without updates.
+    """Compare configs on one recording: which predicts best.
 
     Parameters
     ----------

@@ -23,6 +23,7 @@ from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel
 from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel, UnitError
+from fusion_core.units import to_si
 
 COMMAND = "init"  # by which its files are known
 SIGNS = {"comma": ",", "point": "."}
@@ -117,6 +118,8 @@ def _answers(
                 raise ConfigError(f"{option} {field}={value}: no channel is called so; known: {', '.join(FIELDS)}")
     for field, unit in (units or {}).items():
         Channel(path="?", unit=unit).check(field)
+    if interval is not None and not to_si(interval, "s") > 0:
+        raise ConfigError(f"--interval {interval}: a positive time was expected; write e.g. 10 ms")
     if decimal is not None and decimal not in (*SIGNS, *SIGNS.values()):
         raise ConfigError(f"--decimal {decimal}: is no decimal sign; write comma or point")
     return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal))
@@ -226,7 +229,7 @@ def _ask(question: OpenQuestion) -> str:
     """Ask a person; return the answer, by its number or in words, the first where there is none."""
     say(f"\n{question.text}\n")
     say_lines(f"{k}) {choice}" for k, choice in enumerate(question.choices, 1))
-    several = question.option == "columns"
+    several = question.option == "columns" or question.needed  # or nothing is guessed
     sys.stdout.write("number or text: " if several else "number or text [1]: ")
     sys.stdout.flush()
     words = [word.strip() for word in sys.stdin.readline().split(",")]
@@ -258,7 +261,7 @@ def _fit(path: Path) -> None:
     from driftlab.commands import fit_map  # with all that fits, which a first config does not need
 
     options = {"select": False, "enforce_limits": False}
-    arguments = fit_map.arguments_of({"config": load(path), "compare": False}, options)
+    arguments = fit_map.arguments_of({"config": load(path), "compare": False, "certificate": False}, options)
     result = fit_map.fit_map(**arguments)
     fit_map.show(result, arguments)
     page = result.written[1].resolve()

@@ -157,7 +157,7 @@ def simulate(
     opened: Callable[[Mapping[str, Any]], None] | None = None,
     progress: Progress | None = None,
 ) -> SimulateResult:
-    """Write a simulated recording to a file, or play it out of a device.
+    """Simulate a recording: in a file, or out of a device.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from fusion_core.chunk import Chunk
@@ -67,6 +67,8 @@ class PseudoTerminal:
         """Send bytes; those that find no room in time are lost."""
         sent, until = 0, time.monotonic() + PATIENCE
         while sent < len(data) and self.heard and time.monotonic() < until:
+            with suppress(BlockingIOError):
+                os.read(self._master, 1 << 16)  # what the program says to the device: else it waits for room
             try:
                 sent += os.write(self._master, data[sent:])
             except BlockingIOError:
@@ -108,4 +110,6 @@ def served_at(link: Path | None) -> Iterator[PseudoTerminal]:
         try:
             yield terminal
         finally:
-            link.unlink(missing_ok=True)
+            with suppress(OSError):  # gone, or somebody's file by now
+                if os.readlink(link) == terminal.device:
+                    link.unlink()

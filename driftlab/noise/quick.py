@@ -71,6 +71,8 @@ def _walk(t: Array, values: Array, temperature: Array | None) -> tuple[Array, Fl
     """Return the walk (d,) of means beside curves of the temperature, and where it is known; else its upper limit."""
     T = np.zeros(len(t)) if temperature is None else temperature
     good = np.isfinite(t) & np.isfinite(T) & np.all(np.isfinite(values), axis=1)
+    if temperature is not None and np.sum(good) < MIN_SAMPLES:  # of rows of their own, as some loggers write
+        return _walk(t, values, None)
     n = max(1, int(np.sum(good)) // MEANS)
     K = int(np.sum(good)) // n
     cut = [x[good][: K * n].reshape(K, n, -1) for x in (t, T, values)]

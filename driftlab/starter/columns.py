@@ -107,6 +107,8 @@ def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
             )
             raise ConfigError(f"--column {field}={text}: '{word}': {like}; write the whole name of one")
         group.append(by_path[word if word in by_path else alike[0]])
+    if len(group) > 3:
+        raise ConfigError(f"--column {field}={text}: {len(group)} columns, one an axis was expected; leave some out")
     return [replace(name, axis=axis) for name, axis in zip(group, "xyz", strict=False)] if len(group) > 1 else group
 
 
@@ -133,6 +135,7 @@ def _in_order(by_field: Mapping[str, V]) -> dict[str, V]:
 
 def _step(t: Array | None) -> float | None:
     """Return the usual step of times (N,), s."""
+    t = None if t is None else t[np.isfinite(t)]
     return None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
 
 

@@ -56,7 +56,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     asked = [question.text for question in questions if question.needed]
     asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
-    lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
+    lines += [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in columns.settings.items()]
     if "time" not in channels.found and "interval" not in columns.settings:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")

@@ -19,6 +19,7 @@ from fusion_core.faults import Faults
 
 LOST = 0.05  # of the rows, without a number: more is said
 WINDOW = 10  # s in which a unit has to be at rest once
+DAY = 86_400.0  # s
 MOVING = np.deg2rad(0.3)  # rad/s, deviation of means over 1 s: more is no unit at rest
 
 
@@ -42,7 +43,11 @@ def problems_of(config: Config) -> Iterator[str]:
     for name in dict.fromkeys((model.tracked.channel, "temperature", *(s.channel for s in model.sensors))):
         if name in samples.channels:
             yield from _of_values(name, samples[name].reshape(len(samples), -1))
-    lasts = float(samples.t[-1] - samples.t[0])
+    t = samples.t[np.isfinite(samples.t)]
+    lasts = float(np.ptp(t)) if len(t) else 0.0
+    steps = np.diff(t)
+    if len(steps) and getattr(source, "dates", None) and (jump := float(np.max(steps))) > DAY / 2:
+        yield f"the date jumps by {jump / DAY:.3g} days: if the day stands before the month, correct source.dates"
     if len(samples) < ROWS and not lasts > model.align:
         yield f"it lasts {lasts:.3g} s, and {model.align:g} s at rest are needed to begin with: record a whole soak"
     if "gyro" in samples.channels and (least := _stillest(samples.t, samples["gyro"])) > MOVING:
@@ -68,7 +73,7 @@ def _of_values(name: str, values: Array) -> Iterator[str]:
     finite = np.all(np.isfinite(values), axis=1)
     if (lost := 1 - float(np.mean(finite))) > LOST:
         yield f"{name}: {lost:.0%} of the first {len(values):,} rows are no numbers"
-    elif np.any(np.ptp(values[finite], axis=0) == 0):
+    elif len(values) < ROWS and np.any(np.ptp(values[finite], axis=0) == 0):
         yield f"{name} does not change: it shows {', '.join(f'{v:.6g}' for v in values[finite][0])} in every row"
 
 

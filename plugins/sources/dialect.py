@@ -8,6 +8,7 @@ fields; between the two there may be lines of units.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,9 @@ NUMBER = {
 }
 MONTHS = "jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec"
 DATE = re.compile(
-    rf"(?=.*\d[-/.:]\d)\d{{1,4}}(?:[-/.:, T]+(?:\d+|{MONTHS}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?", re.I
+    r"(?!\d+\.\d*$)(?=.*\d[-/.:]\d)"  # no decimal number
+    rf"\d{{1,4}}(?:[-/.:, T]+(?:\d+|{MONTHS}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?",
+    re.I,
 )
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",
@@ -62,7 +65,8 @@ def fields_of(line: str, separator: str) -> list[str]:
 
 def dialect_of(lines: Sequence[str], known: Mapping[str, Any]) -> Dialect | None:
     """Return the likeliest dialect of the first lines of a text, of those that are as `known` says; None for prose."""
-    separators = [known["separator"]] if "separator" in known else SEPARATORS
+    tabs = 2 * sum("\t" in line for line in lines) >= len(lines)  # blanks are then within the cells
+    separators = [known["separator"]] if "separator" in known else [s for s in SEPARATORS if not (tabs and s == " ")]
     signs = [known["decimal"]] if "decimal" in known else list(NUMBER)
     found = [one for s in separators for d in signs if s != d and (one := _read(lines, s, d)) is not None]
     return max(found, key=lambda one: (round(one.share, 2), one.header > 0), default=None)
@@ -84,11 +88,11 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     if not usual:
         return None
     first = _longest_run(usual, lines)
-    share = sum(good[k] for k in usual) / sum(len(bare(cells)) for cells in cut[first:] if cells)
+    share = sum(good[k] for k in usual if k >= first) / sum(len(bare(cells)) for cells in cut[first:] if cells)
     header = _header(lines, first, width, separator, decimal)
     names = names_of(lines[header], separator) if header is not None else [str(k + 1) for k in range(width)]
     texts = {
-        name: [cut[k][j].strip() for k in usual[:50] if j < len(cut[k])]
+        name: [cut[k][j].strip() for k in usual if j < len(cut[k])]
         for j, name in enumerate(names)
         if name and names.count(name) == 1
     }
@@ -150,9 +154,19 @@ def _format(cells: list[str]) -> str | None:
         return "sec"  # as MATLAB writes a duration
     if not all(map(DATE.fullmatch, filled)):
         return None
-    years = "%Y" if all(re.search(r"\d{4}", cell) for cell in filled) else "%y"
+    years = "%Y" if all(re.search(r"\d{4}", cell.partition(":")[0]) for cell in filled) else "%y"
+    few, all_of = pl.Series(filled[:50]), pl.Series(filled)
     forms = [form for form in forms if years in form or form in HOURS]
-    return next((form for form in forms if seconds_of(pl.Series(filled), form).is_not_null().all()), None)
+    forms = [form for form in forms if seconds_of(few, form).is_not_null().all()]
+    spans = {form: _span(seconds_of(all_of, form)) for form in forms}
+    return min(spans, key=lambda form: spans[form], default=None)  # of days and months in turn: that of fewer days
+
+
+def _span(seconds: pl.Series) -> float:
+    """Return from the first to the last moment, s; infinity where one is not known."""
+    if seconds.null_count():
+        return math.inf
+    return float(seconds.max() - seconds.min())  # type: ignore[operator, arg-type]
 
 
 def seconds_of(texts: pl.Series, form: str) -> pl.Series:

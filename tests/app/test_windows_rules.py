@@ -46,7 +46,7 @@ def folder(tmp_path):
 
 def test_commands_work_by_the_rules_of_windows(folder):
     commands = [
-        ["init", "soak.h5", "--out", "first.yaml"],
+        ["init", "soak.h5", "--out", "first.yaml", "--unit", "gyro=deg/s"],
         ["check", "unit.yaml", "--input", "soak.h5"],
         ["fit-map", "unit.yaml", "--input", "soak.h5"],
         ["fit-map", "unit.yaml", "--input", "soak.h5"],  # in the place of the first

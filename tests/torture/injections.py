@@ -54,7 +54,7 @@ LINES = {".params": r"1\t1\t[A-Z0-9_]+\t[-+.\de]+\t[69]", ".parm": r"[A-Z0-9_]+ 
 def prepare(folder: Path) -> None:
     """Make a recording and a map."""
     base.write_h5(folder / "recording.h5", base.recording())
-    (folder / "recording.csv").write_text(base.csv_text(base.recording(60)))
+    (folder / "recording.csv").write_text(base.csv_text(base.recording(70)))
     base.fit_map(folder / "map.json", kind="polynomial", order=3)
 
 

@@ -21,6 +21,7 @@ from fusion_core.faults import Faults, usable
 from fusion_plugins.sources import csv as csv_module
 from fusion_plugins.sources import unpacked
 from fusion_plugins.sources.csv import Csv
+from fusion_plugins.sources.dialect import dialect_of
 
 GOOD = "t,g,h\n0,1,5\n1,2,6\n2,3,7\n"
 
@@ -414,3 +415,29 @@ def test_columns_of_blanks_and_columns_without_names(tmp_path):
     assert got["gyro"].tolist() == [[1, 2], [-1e-3, 4]]
     got = read(Csv(path=text(tmp_path, "0,1,2,\n1,5,4,\n"), channels=channels, header=0))
     assert got["gyro"].tolist() == [[1, 2], [5, 4]]
+
+
+@pytest.mark.parametrize("separator", ["\t", ";", " ", ","])
+def test_the_dialect_of_ordinary_tables_is_found_whatever_their_numbers(separator):
+    """Signed numbers with points, eleven columns: no cell is a date, and no comma a decimal sign."""
+    names = separator.join(["time_s", "wx", "wy", "wz", "ax", "ay", "az", "mx", "my", "mz", "temp"])
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        rows = np.column_stack(
+            [np.arange(300) / 100, rng.normal(size=(300, 9)) * rng.uniform(0.01, 10), np.full(300, 25)]
+        )
+        lines = [names, *(separator.join(f"{x:.5g}" for x in row) for row in rows)]
+        found = dialect_of(lines, {})
+        assert (found.separator, found.decimal, found.header, found.first_row) == (separator, ".", 1, 2), seed
+
+
+def test_days_and_months_are_told_by_the_span_and_years_by_the_date():
+    """Over midnight of 3 April the day can only stand first; fractions of four digits are no year."""
+    moments = [
+        f"0{3 + k // 30}/04/2024 {(23, 0)[k // 30]:02d}:{(59, 0)[k // 30]:02d}:{k % 30 + 30 * (k < 30):02d}"
+        for k in range(60)
+    ]
+    for year in ("2024", "24"):
+        lines = ["t;gx", *(f"{m.replace('2024', year)}.0000;{k / 7:.3f}" for k, m in enumerate(moments))]
+        (form,) = dialect_of(lines, {}).dates.values()
+        assert form.startswith("%d/%m/" + ("%Y" if year == "2024" else "%y"))
