@@ -157,7 +157,7 @@ class RunResult(Result):
         T = float(self.overview.curves["temperature_raw"][-1])
         if record.domain[0] <= T <= record.domain[1]:
             less = (self.overview.bias - fitted.bias(np.array([T]))[0]) * unit.factor
-            values = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(record.axes, less, strict=True))
+            values = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(self.model.tracked.axes, less, strict=True))
             remarks.append(f"the bias at the end less the map's there is {values} {unit.shown}")
         fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
         names = [Path(str(one["name"])).name for one in sheet.recordings]

@@ -330,7 +330,7 @@ def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path, monkeypatch):
     pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
     screen = Terminal()
     monkeypatch.setattr(sys, "stdout", screen)
-    monkeypatch.setattr(sys, "stdin", Terminal("2,3,4\n\n50 ms\n1\n"))
+    monkeypatch.setattr(sys, "stdin", Terminal("2,3,4\n1\n50 ms\n1\n"))
     arguments = init_command.arguments_of({"file": tmp_path / "rec.csv"}, {"json": False})
     asked = screen.getvalue()
     assert "the columns of the gyro's axes" in asked
