@@ -8,8 +8,10 @@ at, since the library makes room for all rows and columns up to the last one.
 from __future__ import annotations
 
 import io
+import lzma
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime, time, timedelta
@@ -18,15 +20,21 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from fusion_core.budget import PIECE, check_size
-from fusion_core.contracts import Source, foreign, head
-from fusion_core.errors import ConfigError, MissingChannel
+from fusion_core.contracts import Source, Table, foreign, head
+from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.csv import Csv, stream_of
+from fusion_plugins.sources.csv import Csv, CsvLines, stream_of
 from fusion_plugins.sources.unpacked import Stream, plain_file, translated
 
 SIGNATURE = b"PK\x03\x04"
 PARTS = re.compile(r"\[Content_Types\]\.xml|_rels/.*|xl/(?:[^/]*\.xml|_rels/.*|worksheets/[^/]*)")
-PLACE = re.compile(rb"\br\s*=\s*[\"']([A-Za-z]{0,3})(\d{1,9})[\"']")  # of a row or a cell
+PLACE = re.compile(  # of a cell; none where its tag does not name one of Excel's
+    rb"<(?:[^\s<>/:]+:)?c(?=[\s/>])"
+    rb"(?:(?:[ \t\r\n]+(?!r[ \t\r\n=])[^\s=<>\"'/]+[ \t\r\n]*=[ \t\r\n]*(?:\"[^\"<]*\"|'[^'<]*'))*"
+    rb"[ \t\r\n]+r[ \t\r\n]*=[ \t\r\n]*[\"']([A-Za-z]{1,3})(\d{1,7})[\"'])?"
+)
+SHARED, ITEM = re.compile(rb"\bt\s*=\s*[\"']s[\"']"), re.compile(rb"<(?:[^\s<>/:]+:)?si[\s/>]")  # texts: cell, list
 CELL = 64.0  # bytes that one takes
 
 
@@ -44,67 +52,126 @@ class Xlsx(Csv):
     @classmethod
     def settings_for(cls, path: Path, known: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings under which a sheet can be read: that of most rows."""
-        with _workbook(path) as book:
-            rows = {name: book.get_sheet_by_name(name).total_height for name in book.sheet_names}
+        book, names = _workbook(path)
+        rows = {name: _sheet(path, book, name).total_height for name in names}
         most = max(rows, key=lambda name: rows[name])
-        named = {} if most == next(iter(rows)) else {"sheet": most}
-        return super().settings_for(path, {**named, **known})
+        named = {} if most == names[0] else {"sheet": most}
+        found = super().settings_for(path, {"separator": "\t", **named, **known})
+        return {name: value for name, value in found.items() if name != "separator" or name in known}
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the sheet; raises UnreadableFile where the file is of another kind."""
+        with self.lines_of(path) as file:
+            yield _Rows(path, file, self, faults)
 
     @contextmanager
     def lines_of(self, path: Path) -> Iterator[Stream]:
         """Open a sheet as text; raises MissingChannel where there is none of its name."""
-        with _workbook(path) as book:
-            names = book.sheet_names
-            if self.sheet is not None and self.sheet not in names:
-                raise MissingChannel(
-                    f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet"
-                )
-            rows = book.get_sheet_by_name(self.sheet or names[0]).iter_rows()
-            lines = ("\t".join(map(_text, row)) + "\n" for row in rows)
-            with stream_of(path, lines) as text:
-                yield text
+        book, names = _workbook(path)
+        if self.sheet is not None and self.sheet not in names:
+            raise MissingChannel(
+                f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet"
+            )
+        rows = _rows(path, _sheet(path, book, self.sheet or names[0]))
+        with stream_of(path, ("\t".join(map(_text, row)) + "\n" for row in rows)) as text:
+            yield text
 
 
-@contextmanager
-def _workbook(path: Path) -> Iterator[Any]:
-    """Open a workbook; raises ConfigError without python-calamine, UnreadableFile where it is damaged or none."""
+class _Rows(CsvLines):
+    """The rows of a sheet as lines."""
+
+    def _check_header(self) -> None:
+        sign = next((s for s in ",;" if s in self.columns[0]), None)
+        if len(self.columns) == 1 and sign:
+            raise MissingChannel(
+                f"{self.path}: the header is the single cell '{self.columns[0][:40]}', a cell for each column was "
+                f"expected; split column A into columns at '{sign}'"
+            )
+        super()._check_header()
+
+
+def _workbook(path: Path) -> tuple[Any, list[str]]:
+    """Return a workbook and the names of its sheets of cells.
+
+    Raises ConfigError without python-calamine, UnreadableFile where it is damaged or none.
+    """
+    with plain_file(path) as place:
+        first = head(place)
+        if not first.startswith(SIGNATURE):
+            raise foreign(path, first, "xlsx")
+        with translated(path, zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, ValueError,
+                        LookupError, OSError):  # fmt: skip
+            content = _repacked(place)
     if find_spec("python_calamine") is None:
         raise ConfigError(
             "xlsx: the package python-calamine is not installed, it was expected for workbooks of Excel; "
             "pip install 'driftlab[excel]', or export the sheet as CSV"
         )
-    from python_calamine import CalamineError, CalamineWorkbook
+    from python_calamine import CalamineError, CalamineWorkbook, SheetTypeEnum
 
-    with plain_file(path) as place:
-        first = head(place)
-        if not first.startswith(SIGNATURE):
-            raise foreign(path, first, "xlsx")
-        with translated(path, zipfile.BadZipFile, CalamineError, ValueError, LookupError, NotImplementedError, OSError):
-            book = CalamineWorkbook.from_filelike(_repacked(place))
-        yield book
+    with translated(path, CalamineError, ValueError, LookupError, OSError):
+        book = CalamineWorkbook.from_filelike(content)
+    names = [sheet.name for sheet in book.sheets_metadata if sheet.typ is SheetTypeEnum.WorkSheet]
+    if not names:
+        raise UnreadableFile(f"{path}: has no sheet of cells, one with the recording was expected; check the path")
+    return book, names
+
+
+def _sheet(path: Path, book: Any, name: str) -> Any:
+    """Return a sheet; raises UnreadableFile where it is damaged."""
+    from python_calamine import CalamineError
+
+    with translated(path, CalamineError, ValueError, LookupError, OSError):
+        return book.get_sheet_by_name(name)
+
+
+def _rows(path: Path, sheet: Any) -> Iterator[list[Any]]:
+    """Yield the rows of a sheet; raises UnreadableFile where a cell is none."""
+    with translated(path, ValueError, ArithmeticError):
+        yield from sheet.iter_rows()
 
 
 def _repacked(path: Path) -> io.BytesIO:
     """Return the parts of a workbook that are read, unpacked; raises UnreadableFile where they are too large."""
     plain = io.BytesIO()
+    longest = cells = 0  # of the texts that cells share, and of the cells of a sheet that do
     with zipfile.ZipFile(path) as packed, zipfile.ZipFile(plain, "w") as parts:
         entries = [entry for entry in packed.infolist() if PARTS.fullmatch(entry.filename)]
         if not any(entry.filename == "xl/workbook.xml" for entry in entries):
-            raise ValueError("a zip archive that is no workbook")
+            raise UnreadableFile(
+                f"{path}: is a zip archive, a workbook of Excel was expected; unpack it, or save the workbook as .xlsx"
+            )
         check_size(path, "the workbook", sum(entry.file_size for entry in entries))
         for entry in entries:
             content = packed.read(entry)
-            if entry.filename.startswith("xl/worksheets/"):
-                places = PLACE.findall(content)
-                columns = {letters.upper() for letters, _ in places}
-                width = max(
-                    (sum((c - 64) * 26**k for k, c in enumerate(reversed(name))) for name in columns), default=0
-                )
-                height = max((int(number) for _, number in places), default=0)
-                check_size(path, f"a sheet of {height:,} rows and {width:,} columns", CELL * height * width, 2 * PIECE)
+            _check_places(path, entry.filename, content)
+            items = [len(item) for item in ITEM.split(content)[1:]]
+            plainly = b"<!" not in content and content.count(b"<?") < 2  # else an item may seem to end early
+            longest = max(longest, max(items) if items and plainly else len(content) * bool(items))
+            cells = max(cells, sum(1 for _ in SHARED.finditer(content)))
             parts.writestr(entry.filename, content)
+    check_size(path, f"a sheet of {cells:,} texts of up to {longest:,} bytes", float(longest) * cells, 2 * PIECE)
     plain.seek(0)
     return plain
+
+
+def _check_places(path: Path, part: str, content: bytes) -> None:
+    """Raise UnreadableFile where the cells of a part need too much room, or do not say where they are."""
+    columns, rows, count = set(), set(), 0
+    for cell in PLACE.finditer(content):
+        if cell[1] is None:
+            raise UnreadableFile(
+                f"{path}: {part} has a cell without a place, one from A1 to XFD1048576 was expected; "
+                "save it with Excel, or export the sheet as CSV"
+            )
+        count += 1
+        columns.add(cell[1].upper())
+        rows.add(cell[2])
+    width = max((sum((c - 64) * 26**k for k, c in enumerate(reversed(name))) for name in columns), default=0)
+    height = max(map(int, rows), default=0)
+    what = f"a sheet of {height:,} rows and {width:,} columns"
+    check_size(path, what, CELL * max(height * width, count), 2 * PIECE)
 
 
 def _text(cell: Any) -> str:

@@ -13,6 +13,7 @@ from fusion_plugins.sources import xlsx as module
 from fusion_plugins.sources.xlsx import Xlsx
 
 CHANNELS = {"time": {"path": "t", "unit": "s"}, "gyro": {"path": "g", "unit": "deg/s"}}
+SHEET = "xl/worksheets/sheet1.xml"
 ROWS = [["t", "g", "note"], [0, 1.5, "begin"], [1, -2.25, None], [2.5, 3, "end"]]
 
 
@@ -46,9 +47,87 @@ def test_a_sheet_is_a_table(tmp_path):
 
 @pytest.mark.parametrize("place", [b'r="XFD1048576"', b"r = 'XFD1048576'", b'r="xfd1048576"'])
 def test_a_cell_far_away_makes_no_room_for_all_before_it(tmp_path, place):
-    path = changed(book(tmp_path), "xl/worksheets/sheet1.xml", lambda data: data.replace(b'r="B4"', place))
+    path = changed(book(tmp_path), SHEET, lambda data: data.replace(b'r="B4"', place))
     with pytest.raises(UnreadableFile, match="a sheet of 1,048,576 rows and 16,384 columns takes"):
         read(Xlsx(path=path, channels=CHANNELS))
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        b'<c><v>1</v></c></row><row r="30000">',
+        b'<c r="AAAA1"><v>1</v></c>',
+        b"<c t=\"r='A1'\"><v>1</v></c>",
+        b'<x:c s="1"/>',
+    ],
+)
+def test_a_cell_says_where_it_is(tmp_path, cells):
+    path = changed(book(tmp_path), SHEET, lambda data: data.replace(b"</row>", cells + b"</row>", 1))
+    with pytest.raises(UnreadableFile, match=r"sheet1\.xml has a cell without a place, .* was expected; save it"):
+        read(Xlsx(path=path, channels=CHANNELS))
+
+
+def test_texts_that_cells_share_are_counted_for_each(tmp_path):
+    path = book(tmp_path, Data=[*ROWS, *([3 + k, 0, "end"] for k in range(2000))])
+    path = changed(path, "xl/sharedStrings.xml", lambda data: data.replace(b"end", b"e" * 1_000_000))
+    with pytest.raises(UnreadableFile, match=r"a sheet of 2,005 texts of up to 1,000,0.. bytes takes"):
+        read(Xlsx(path=path, channels=CHANNELS))
+
+
+def broken(name, change):
+    return lambda path: changed(path, name, change)
+
+
+def deflate_damaged(path):
+    data = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        at = archive.getinfo(SHEET).header_offset + 30 + len(SHEET)
+    data[at : at + 20] = b"\xff" * 20
+    path.write_bytes(data)
+
+
+def encrypted(path):
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"PK\3\4\x14\0\0", b"PK\3\4\x14\0\1").replace(
+        b"PK\1\2\x14\3\x14\0\0", b"PK\1\2\x14\3\x14\0\1"))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        broken(SHEET, lambda data: data[: len(data) // 2]),
+        broken(SHEET, lambda data: data.replace(b't="s"', b't="zz"')),
+        broken("xl/_rels/workbook.xml.rels", lambda data: data.replace(b"sheet1.xml", b"none.xml")),
+        deflate_damaged,
+        encrypted,
+    ],
+)
+def test_a_damaged_workbook_is_one(tmp_path, damage):
+    path = book(tmp_path)
+    damage(path)
+    for use in (lambda: read(Xlsx(path=path, channels=CHANNELS)), lambda: Xlsx.settings_for(path, {})):
+        with pytest.raises(UnreadableFile, match=r"r\.xlsx: is cut short or damaged \(.*\); copy or record it again$"):
+            use()
+
+
+def test_sheets_of_charts_are_skipped(tmp_path):
+    def chart(data):
+        return data.replace(b'worksheet" Target="worksheets/sheet1', b'chartsheet" Target="chartsheets/sheet1')
+
+    path = changed(book(tmp_path, Chart=[], Data=ROWS), "xl/_rels/workbook.xml.rels", chart)
+    assert Xlsx.settings_for(path, {}) == {}
+    assert len(read(Xlsx(path=path, channels=CHANNELS))) == 3
+    changed(book(tmp_path), "xl/_rels/workbook.xml.rels", chart)
+    with pytest.raises(UnreadableFile, match="has no sheet of cells"):
+        Xlsx.settings_for(path, {})
+
+
+def test_text_in_one_column_is_to_be_split(tmp_path):
+    path = book(tmp_path, Data=[["t,g"], ["0,1.5"], ["1,-2.25"]])
+    found = Xlsx.settings_for(path, {})
+    assert "separator" not in found
+    with pytest.raises(MissingChannel, match=r"the single cell 't,g', .* expected; split column A into columns at ','"):
+        read(Xlsx(path=path, channels=CHANNELS, **found))
 
 
 def test_what_is_no_workbook_is_refused(tmp_path, monkeypatch):
@@ -63,12 +142,16 @@ def test_what_is_no_workbook_is_refused(tmp_path, monkeypatch):
         archive.writestr("notes.txt", "of the night shift")
     for data, message in (
         (whole[: len(whole) // 2], "is cut short or damaged"),
-        ((tmp_path / "other.zip").read_bytes(), "a zip archive that is no workbook"),
+        ((tmp_path / "other.zip").read_bytes(), "is a zip archive, a workbook of Excel was expected; unpack it"),
         (b"t,g\n0,1\n", "is a text file, a file of kind xlsx was expected; use kind: csv"),
     ):
         path.write_bytes(data)
         with pytest.raises(UnreadableFile, match=message):
             read(Xlsx(path=path, channels=CHANNELS))
     monkeypatch.setattr(module, "find_spec", lambda name: None)
+    path.write_bytes((tmp_path / "other.zip").read_bytes())
+    with pytest.raises(UnreadableFile, match="is a zip archive"):
+        read(Xlsx(path=path, channels=CHANNELS))
+    path.write_bytes(whole)
     with pytest.raises(ConfigError, match=r"python-calamine is not installed.* pip install 'driftlab\[excel\]'"):
         read(Xlsx(path=path, channels=CHANNELS))
