@@ -153,16 +153,20 @@ class RunResult(Result):
         if fitted is None or measured is None:
             return []
         record, unit = fitted.record, unit_of(self.model.tracked)
-        remarks = [f"the bias over temperature is the map's, of another recording; this one was at {_span(*measured)}"]
+        fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
+        names = [Path(str(one["name"])).name for one in sheet.recordings]
+        both = [name for name in names if name.partition("::")[0] in fitted_on]
+        remarks = [f"the map was fitted on {name} too, so it predicts what it has seen" for name in both]
+        if not both:
+            remarks = [
+                f"the bias over temperature is the map's, of another recording; this one was at {_span(*measured)}"
+            ]
         T = float(self.overview.curves["temperature_raw"][-1])
         if record.domain[0] <= T <= record.domain[1]:
             less = (self.overview.bias - fitted.bias(np.array([T]))[0]) * unit.factor
-            values = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(self.model.tracked.axes, less, strict=True))
+            values = ", ".join(f"{axis} {v:.3g}" for axis, v in zip(self.model.tracked.axes, less, strict=True))
             remarks.append(f"the bias at the end less the map's there is {values} {unit.shown}")
-        fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
-        names = [Path(str(one["name"])).name for one in sheet.recordings]
-        both = (name for name in names if name.partition("::")[0] in fitted_on)
-        return [*remarks, *(f"the map was fitted on {name} too, so it predicts what it has seen" for name in both)]
+        return remarks
 
 
 def _span(low: float, high: float) -> str:

@@ -26,14 +26,23 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of
+from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of, unpacked_at_most
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
 from fusion_core.contracts.file_source import problem
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.dialect import JOINED, bare, dialect_of, fields_of, names_of, numbers_of, seconds_of
+from fusion_plugins.sources.dialect import (
+    JOINED,
+    bare,
+    dialect_of,
+    fields_of,
+    has_day,
+    names_of,
+    numbers_of,
+    seconds_of,
+)
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
@@ -42,11 +51,12 @@ COLUMNS = 10_000  # of a file
 SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file; TEXTS of them before its first row
 SLOW = 40  # times as many for each line that is left out by itself
 COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
-FIRST = re.compile(rb"^(?!#)[^\S\n]*\S", re.M)  # of a line that is neither
+FIRST = re.compile(rb"^(?!#)[^\S\n]*\S[^\n]*", re.M)  # line that is neither
 SEPARATORS = {",": ",", ";": ";", "\t": "\\t", " ": " "}  # and how each is shown
 BLANKS, EDGES = re.compile(rb"[ \t]+"), re.compile(rb"^[ \t]+|[ \t]+(?=\r?$)", re.M)
 MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}  # of encodings, at the beginning
 COMMA = str.maketrans(",.", ".,")
+DAY = 86_400.0  # s
 GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
 
 
@@ -66,7 +76,8 @@ class Csv(FileSource):
     first_row: Annotated[int, Field(ge=1)] | None = None
     """Line of the first row, where lines of units or the like are between it and the names."""
     dates: Mapping[str, str] = Field(default_factory=dict)
-    """Format of the dates of a column, as `%d.%m.%Y %H:%M:%S`; `Date + Time` is two columns, joined by a blank."""
+    """Format of the dates of a column, as `%d.%m.%Y %H:%M:%S`; `Date + Time` is two columns, joined by a blank. A time
+    without a day goes on over midnight."""
 
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
@@ -127,7 +138,7 @@ def stream_of(path: Path, texts: Iterator[str]) -> Iterator[Stream]:
     with tempfile.TemporaryFile() as file:
         for text in texts:
             check_all()
-            keep(path, text.encode(), file)
+            keep(path, text.encode(), file, unpacked_at_most(path))
         file.seek(0)
         yield io.BufferedReader(file.raw)
 
@@ -173,6 +184,7 @@ class CsvLines(Table):
             if (count := self.columns.count(part)) > 1:
                 raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
         at = {part: self.columns.index(part) for part in parts}
+        clocks = {path: _Clock() for path, form in self._dates(at) if not has_day(form)}
         for _, block, final in self._pieces():
             if self.separator == " ":
                 block = EDGES.sub(b"", BLANKS.sub(b" ", block))
@@ -182,6 +194,7 @@ class CsvLines(Table):
                 cells = self._without(block)
                 values = self._fast(cells, at) if cells and cells != block and not unfinished else None
                 values = self._careful(block, cells, at, final) if values is None else values
+            values |= {path: clock.unwrapped(values[path]) for path, clock in clocks.items()}
             rows = len(next(iter(values.values()), ()))
             if rows:
                 self.most = SKIPPED
@@ -213,20 +226,20 @@ class CsvLines(Table):
         return self._widened(names)
 
     def _next_line(self) -> str:
-        place = self.file.tell()
-        line = next(
-            (text for data in iter(partial(self.file.readline, LONGEST), b"") if (text := decoded(data)).strip()), ""
-        )
+        """Return the next line that is neither blank nor a comment, and stay before it."""
+        place, first = self.file.tell(), None
+        for offset, block, _ in self._pieces():
+            if (first := FIRST.search(block)) or offset - place > self.most:
+                break
         self.file.seek(place)
-        return line
+        return decoded(first.group()) if first else ""
 
     def _widened(self, names: list[str]) -> list[str]:
         """Return the names with an empty one, or less one, where rows end with a separator and these do not, or do."""
-        cells = self._fields(self._next_line().rstrip("\r\n"))
+        cells = self._fields(self._next_line())
         if len(cells) == len(names) + 1 and not cells[-1].strip():
             return [*names, ""]
-        spare = not names[-1] or self.settings.header is not None  # a column of comments, which no row has
-        return names[:-1] if len(cells) == len(names) - 1 > 0 and spare else names
+        return names[:-1] if len(cells) == len(names) - 1 > 0 and not names[-1] else names
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
@@ -308,16 +321,21 @@ class CsvLines(Table):
         last, extra = names[-2:]
         used = {names[k] for k in at.values()}
         texts = {names[at[part]] for part in self.texts if part in at}
+        pointed = self.settings.decimal == "," and b"." in block  # polars takes 12.345 for 12,345
+        number = pl.String if pointed else pl.Float64
         try:
             frame = pl.read_csv(
                 self.separator.encode() * n + b"\n" + block,  # polars counts the columns of the first line
                 has_header=False,
                 separator=self.separator,
                 comment_prefix="#",
-                schema={name: pl.Float64 if name in used - texts else pl.String for name in names},
+                schema={name: number if name in used - texts else pl.String for name in names},
                 decimal_comma=self.settings.decimal == ",",
                 columns=sorted(used | {last, extra}, key=names.index),
             )[1:]
+            if pointed:  # a cell with a point is no number then
+                cells = pl.col(sorted(used - texts)).str.strip_chars(" \t\r").str.replace(".", "?", literal=True)
+                frame = frame.with_columns(cells.str.replace(",", ".", literal=True).cast(pl.Float64))
         except pl.exceptions.PolarsError:
             return None
         whole = frame[last].null_count() == 0 and frame[extra].null_count() == len(frame) and b'"' not in block
@@ -390,10 +408,10 @@ class CsvLines(Table):
         for path, place in at.items():
             number = 0.0 if path in self.texts else self._number(fields[place])
             if number is None:
-                raise BadValue(
-                    f"{self.path}: line {where(k)}, column '{path}': '{fields[place][:40]}' is "
-                    "not a number; correct it, or leave the cell empty where the value is missing"
-                )
+                cell, remedy = fields[place][:40], "correct it, or leave the cell empty where the value is missing"
+                if self.settings.decimal == "," and "." in cell:
+                    remedy = "the decimal sign is ',': remove points between thousands, or correct source.decimal"
+                raise BadValue(f"{self.path}: line {where(k)}, column '{path}': '{cell}' is not a number; {remedy}")
             row.append(number)
         return row
 
@@ -409,6 +427,23 @@ class CsvLines(Table):
 
     def _number(self, cell: str) -> float | None:
         return _number(cell.translate(COMMA) if self.settings.decimal == "," else cell)
+
+
+class _Clock:
+    """A time of day, which goes on over midnight: a fall of more than half a day is a new day."""
+
+    def __init__(self) -> None:
+        self.last, self.days = np.nan, 0
+
+    def unwrapped(self, t: Array) -> Array:
+        """Return the next times of day (N,) in s since the first midnight."""
+        known = np.flatnonzero(np.isfinite(t))
+        days = self.days + np.cumsum(np.diff(t[known], prepend=self.last) < -DAY / 2)
+        if len(known):
+            self.last, self.days = t[known[-1]], days[-1]
+        whole = t.copy()
+        whole[known] += DAY * days
+        return whole
 
 
 def _number(cell: str) -> float | None:

@@ -34,6 +34,7 @@ DATE = re.compile(
     re.I,
 )
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
+FRACTION = r"(\d:\d\d:\d\d)(?:,(\d)|:(\d{6}|\d{3})(\D|$))"  # of a second, behind no point
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",
         "%d-%b-%Y", "%d-%m-%Y", "%Y%m%d")  # fmt: skip
 HOURS = ("%H:%M:%S", "%I:%M:%S %p", "%H:%M")
@@ -172,15 +173,20 @@ def _span(seconds: pl.Series) -> float:
 def seconds_of(texts: pl.Series, form: str) -> pl.Series:
     """Return dates as seconds since 1970, those without a day since midnight; null where a text is none.
 
-    Fractions of a second may stand behind a point, a comma or a colon, and a zone is left out.
+    Fractions of a second may stand behind a point or a comma, 3 or 6 digits behind a colon; a zone is left out.
     """
     if "%" not in form:
         return texts.str.strip_suffix(form).str.strip_chars().cast(pl.Float64, strict=False)
-    plain = texts.str.strip_chars().str.replace(ZONE, "${1}").str.replace(r"(\d:\d\d:\d\d)[,:](\d)", "${1}.${2}")
-    if "%d" not in form:
+    plain = texts.str.strip_chars().str.replace(ZONE, "${1}").str.replace(FRACTION, "${1}.${2}${3}${4}")
+    if not has_day(form):
         plain, form = "1970-01-01 " + plain, f"%Y-%m-%d {form}"
     moments = plain.str.to_datetime(form.replace("%S", "%S%.f"), time_unit="ns", strict=False)
     return moments.dt.timestamp("ns").cast(pl.Float64) / 1e9
+
+
+def has_day(form: str) -> bool:
+    """Return True where a format says more than the time of a day."""
+    return "%" not in form or re.search(r"%[-_0]?[cdDeFjsvx+]", form) is not None
 
 
 def numbers_of(cells: Sequence[str], form: str) -> Array:

@@ -367,3 +367,11 @@ def test_the_true_bias_of_a_simulated_recording_is_no_sensor(tmp_path):
     init(tmp_path / "twin.h5", out=tmp_path / "twin.yaml")
     with h5py.File(tmp_path / "twin.h5") as file:
         np.testing.assert_array_equal(samples(tmp_path / "twin.yaml")["gyro"], file["gyro"])
+
+
+def test_a_recording_over_midnight_whose_clock_has_no_day(tmp_path):
+    moments = [f"{int(s) // 3600 % 24:02}:{int(s) // 60 % 60:02}:{s % 60:06.3f}" for s in 86_300 + UNIT.t - UNIT.t[0]]
+    content = table(("Time", "g? (rad/s)", "a? (m/s^2)", "T (degC)"))
+    text = written(tmp_path, content | {"Time": moments}).text
+    assert "%H:%M:%S" in text
+    np.testing.assert_allclose(np.diff(samples(tmp_path / "rec.yaml").t), 0.05, atol=1e-6)

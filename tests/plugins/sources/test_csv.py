@@ -441,3 +441,80 @@ def test_days_and_months_are_told_by_the_span_and_years_by_the_date():
         lines = ["t;gx", *(f"{m.replace('2024', year)}.0000;{k / 7:.3f}" for k, m in enumerate(moments))]
         (form,) = dialect_of(lines, {}).dates.values()
         assert form.startswith("%d/%m/" + ("%Y" if year == "2024" else "%y"))
+
+
+@pytest.mark.parametrize("row", ["05.03.2026 14:22:02; 1,5;12.345\n", "05.03.2026 14:22:02;1.234,5;20\n"])
+def test_a_point_under_a_decimal_comma_is_refused(tmp_path, row):
+    """It stands between thousands, or the decimal sign is another: polars would take it for one."""
+    content = "when;g;T\n05.03.2026 14:22:01;-0,5;20\n" + row
+    forms = {"separator": ";", "decimal": ",", "dates": {"when": "%d.%m.%Y %H:%M:%S"}}
+    names = {"time": {"path": "when"}, "gyro": {"path": "g", "unit": "deg/s"}}
+    source = Csv(path=text(tmp_path, content), channels={**names, "temperature": {"path": "T", "unit": "K"}}, **forms)
+    remedy = "is not a number; the decimal sign is ',': remove points between thousands, or correct source.decimal"
+    with pytest.raises(BadValue, match=rf"line 3, column '[gT]': '[\d.,]+' {remedy}"):
+        read(source)
+
+
+def test_dates_with_points_beside_decimal_commas_are_left_to_polars(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_module.CsvLines, "_careful", lambda *_: pytest.fail("was read row by row"))
+    content = "when;g;T\r\n05.03.2026 14:22:01; -0,5;20\r\n05.03.2026 14:22:02;;1e1\r\n"
+    forms = {"separator": ";", "decimal": ",", "dates": {"when": "%d.%m.%Y %H:%M:%S"}}
+    names = {"time": {"path": "when"}, "gyro": {"path": "g", "unit": "rad/s"}}
+    path = text(tmp_path, content)
+    np.testing.assert_array_equal(read(Csv(path=path, channels=names, **forms))["gyro"], [[-0.5], [np.nan]])
+    with Csv(path=path, channels=names, **forms).open(path, Faults()) as table:
+        assert next(table.blocks(["when"], 9)).read("when").tolist() == [1772720521, 1772720522]
+
+
+@pytest.mark.parametrize("block", [30, 100, 8 << 20])
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_a_time_of_day_goes_on_over_midnight(tmp_path, monkeypatch, block, quote):
+    monkeypatch.setattr(csv_module, "BLOCK", block)
+    seconds = 86_390 + 7_200 * np.arange(30)
+    clock = [f"{s // 3600 % 24:02}:{s // 60 % 60:02}:{s % 60:02}" for s in seconds]
+    clock[3] = ""
+    path = text(tmp_path, "t,g\n" + "".join(f"{quote}{cell}{quote},{k}\n" for k, cell in enumerate(clock)))
+    names = {"time": {"path": "t"}, "gyro": {"path": "g", "unit": "rad/s"}}
+    source = Csv(path=path, channels=names, dates={"t": "%H:%M:%S"})
+    for _ in range(2):
+        got = read(source)
+        np.testing.assert_array_equal(got.t[got["gyro"][:, 0] != 3], np.delete(seconds, 3))
+
+
+def test_a_comment_below_the_names_does_not_count_as_a_row(tmp_path):
+    content = "t,g,h\n# s,deg/s,degC,\n\n0,1,5\n1,2,6\n"
+    assert read(simple(text(tmp_path, content)))["gyro"].tolist() == [[1], [2]]
+    assert read(simple(text(tmp_path, content.replace("degC,", "degC")), header=1)).t.tolist() == [0, 1]
+    assert read(simple(text(tmp_path, content.replace("5\n1,2,6", "5,\n1,2,6,")))).t.tolist() == [0, 1]
+
+
+def test_a_name_too_many_is_refused_below_a_preamble_too(tmp_path):
+    with pytest.raises(BadValue, match="line 3 has 2 fields, 3 were expected as in the header"):
+        read(simple(text(tmp_path, "Rec 1\nDate,t,g\n0,1\n1,2\n2,3\n"), header=2))
+    assert len(read(simple(text(tmp_path, "Rec 1\nt,g,\n0,1\n1,2\n"), header=2))) == 2
+
+
+def test_an_archive_of_utf_16_fills_no_more_than_its_budget(tmp_path, monkeypatch):
+    monkeypatch.setattr("fusion_core.budget.MIN_UNPACKED", 1_000)
+    packed = gzip.compress(("t,g,h\n" + "0,1,2\n" * 1_000_000).encode("utf-16"))
+    with pytest.raises(UnreadableFile, match=r"r.csv.gz: unpacks to more than .* MB, which is the limit"):
+        read(simple(text(tmp_path, packed, "r.csv.gz")))
+
+
+@pytest.mark.parametrize(("cell", "seconds"), [
+    ("10:00:00.5", 36_000.5), ("10:00:00,25", 36_000.25), ("10:00:00:005", 36_000.005),
+    ("10:00:00:000005", 36_000.000005), ("10:00:00:500 UTC", 36_000.5),
+    ("10:00:00:5", None), ("10:00:00:05", None), ("1:10:00:05", None), ("10:00:00:0005", None),
+])  # fmt: skip
+def test_a_colon_before_a_fraction_is_one_before_thousandths_or_millionths(tmp_path, cell, seconds):
+    source = Csv(
+        path=text(tmp_path, f't;g\n"{cell}";1\n'),
+        channels={"time": {"path": "t"}, "gyro": {"path": "g", "unit": "rad/s"}},
+        separator=";",
+        dates={"t": "%H:%M:%S"},
+    )
+    if seconds is None:
+        with pytest.raises(BadValue, match=f"line 2, column 't': '{cell}' is not a date as '%H:%M:%S'"):
+            read(source)
+    else:
+        np.testing.assert_allclose(read(source).t, [seconds], atol=1e-9)
