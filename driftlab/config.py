@@ -196,7 +196,7 @@ def understood(document: Document, *, measuring: bool = False) -> Config:
 
 
 def _at(data: Any, *keys: object) -> Any:
-    """Return what is at keys within one another; None where there is nothing, or no mapping."""
+    """Return the value at keys within one another; None where there is none, or no mapping."""
     for key in keys:
         data = data.get(key) if isinstance(data, dict) and isinstance(key, str) else None
     return data
