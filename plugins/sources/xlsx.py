@@ -25,7 +25,7 @@ from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.csv import Csv, CsvLines, stream_of
-from fusion_plugins.sources.unpacked import Stream, plain_file, translated
+from fusion_plugins.sources.unpacked import Stream, damaged, plain_file, translated
 
 SIGNATURE = b"PK\x03\x04"
 PARTS = re.compile(r"\[Content_Types\]\.xml|_rels/.*|xl/(?:[^/]*\.xml|_rels/.*|worksheets/[^/]*)")
@@ -108,9 +108,9 @@ def _workbook(path: Path) -> tuple[Any, list[str]]:
             "xlsx: the package python-calamine is not installed, it was expected for workbooks of Excel; "
             "pip install 'driftlab[excel]', or export the sheet as CSV"
         )
-    from python_calamine import CalamineError, CalamineWorkbook, SheetTypeEnum
+    from python_calamine import CalamineWorkbook, SheetTypeEnum
 
-    with translated(path, CalamineError, ValueError, LookupError, OSError):
+    with _calamine(path):
         book = CalamineWorkbook.from_filelike(content)
     names = [sheet.name for sheet in book.sheets_metadata if sheet.typ is SheetTypeEnum.WorkSheet]
     if not names:
@@ -118,17 +118,28 @@ def _workbook(path: Path) -> tuple[Any, list[str]]:
     return book, names
 
 
+@contextmanager
+def _calamine(path: Path) -> Iterator[None]:
+    """Turn the errors of the library, and its panics, which are no exceptions, into the error of a damaged file."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except BaseException as error:
+        if isinstance(error, Exception) or type(error).__name__ == "PanicException":
+            raise damaged(path, " ".join(str(error).split())[:160]) from None
+        raise
+
+
 def _sheet(path: Path, book: Any, name: str) -> Any:
     """Return a sheet; raises UnreadableFile where it is damaged."""
-    from python_calamine import CalamineError
-
-    with translated(path, CalamineError, ValueError, LookupError, OSError):
+    with _calamine(path):
         return book.get_sheet_by_name(name)
 
 
 def _rows(path: Path, sheet: Any) -> Iterator[list[Any]]:
     """Yield the rows of a sheet; raises UnreadableFile where a cell is none."""
-    with translated(path, ValueError, ArithmeticError):
+    with _calamine(path):
         yield from sheet.iter_rows()
 
 

@@ -1,7 +1,9 @@
 """Workbooks of Excel: sheets, dates, and what is too large or none."""
 
 import io
+import re
 import zipfile
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -108,6 +110,13 @@ def test_a_damaged_workbook_is_one(tmp_path, damage):
     for use in (lambda: read(Xlsx(path=path, channels=CHANNELS)), lambda: Xlsx.settings_for(path, {})):
         with pytest.raises(UnreadableFile, match=r"r\.xlsx: is cut short or damaged \(.*\); copy or record it again$"):
             use()
+
+
+def test_a_date_that_is_none_is_damage(tmp_path):
+    path = book(tmp_path, Data=[["t", "g"], [datetime(2026, 1, 1), 0]])
+    changed(path, SHEET, lambda data: re.sub(rb'(s="1"><v>)[^<]*', rb"\g<1>-1e300", data))
+    with pytest.raises(UnreadableFile, match="is cut short or damaged"):
+        Xlsx.settings_for(path, {})
 
 
 def test_sheets_of_charts_are_skipped(tmp_path):
