@@ -239,7 +239,8 @@ class CsvLines(Table):
         cells = self._fields(self._next_line())
         if len(cells) == len(names) + 1 and not cells[-1].strip():
             return [*names, ""]
-        return names[:-1] if len(cells) == len(names) - 1 > 0 and not names[-1] else names
+        spare = names[-1].strip().lower() in ("", "comment")  # as LabVIEW's, which only some rows have
+        return names[:-1] if len(cells) == len(names) - 1 > 0 and spare else names
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
