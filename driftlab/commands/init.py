@@ -23,6 +23,7 @@ from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel
 from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel, UnitError
+from fusion_core.escaping import line
 from fusion_core.units import to_si
 
 COMMAND = "init"  # by which its files are known
@@ -249,7 +250,9 @@ def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
     say_lines(result.asked, "fill in: ")
     say_lines(result.problems, "problem: ")
     if result.status:
-        say(f"written to {result.path}; say what is missing with --column, --unit or --interval, or write it there\n")
+        say(f"written to {result.path}\n")
+        remedy = "say what is missing with --column, --unit or --interval, or write it there"
+        sys.stderr.write(f"driftlab: {line(str(given['file']))}: is not ready for a map; {remedy}\n")
         return
     say(f"written to {result.path}; look at what is guessed, then: driftlab fit-map {result.path}\n")
     if given.get("go"):
