@@ -16,7 +16,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 CONFIG = """
-source: {kind: hdf5}
+source:
+  kind: hdf5
+  channels: {time: {path: time}, gyro: {path: gyro}, accel: {path: accel}, temperature: {path: temperature}}
 filter: {gyro: {noise: 3.18 deg/h/sqrt(Hz), bias: {kind: thermal_derivative, walk: 2.2e-5 deg/s/sqrt(s),
   map: {kind: polynomial, order: 3, path: map.json}}}}
 """
@@ -62,6 +64,9 @@ def main(pythons: list[str]) -> None:
             (work / "twin.yaml").write_text(TWIN)
             for arguments in COMMANDS:
                 call(program / "driftlab", *arguments, folder=work)
+            if shutil.which("gcc"):
+                sources = sorted((work / "firmware").glob("*.c"))
+                call("gcc", "-std=c99", "-Wall", "-Werror", "-c", *sources, folder=work)
             size = sum(file.stat().st_size for file in (work / "venv").rglob("*") if file.is_file()) / 1e6
             print(f"{python}: {wheel.name}, {size:.0f} MB installed, {time.monotonic() - began:.0f} s")
         (ROOT / "dist").mkdir(exist_ok=True)

@@ -1,11 +1,14 @@
 """Recipes of packages beside pyproject.toml: the same version, dependencies and commands."""
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
 import pytest
 import yaml
+
+from driftlab.config import load_config
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -40,3 +43,9 @@ def test_the_container_installs_extras_that_there_are():
 
 def test_the_citation_has_the_version_of_the_wheel():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == PROJECT["version"]
+
+
+@pytest.mark.parametrize("name", ["CONFIG", "TWIN"])
+def test_the_wheel_is_tried_with_configs_that_are_valid(tmp_path, name):
+    (tmp_path / "unit.yaml").write_text(runpy.run_path(str(ROOT / "packaging" / "try_wheel.py"))[name])
+    assert load_config(tmp_path / "unit.yaml", "soak.h5" if name == "CONFIG" else None).source is not None
