@@ -26,6 +26,7 @@ from pydantic import (
 
 from driftlab import __version__
 from driftlab.family.bands import Bands
+from driftlab.family.baseline import Baseline
 from driftlab.family.basis import SplineBasis
 from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
@@ -287,6 +288,8 @@ class Family(BaseModel):
         Why lots are off the others as a whole, a sentence each.
     laws : TailLaws or None
         Laws of the units' curves and figures, by which a new one is judged (`driftlab.family.outliers`).
+    baseline : Baseline or None
+        Limits of the line's control charts, by which units of later days are judged.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -316,6 +319,7 @@ class Family(BaseModel):
     common_effects: Annotated[dict[str, Any], AfterValidator(check_tree)] | None = None
     odd_lots: tuple[Plain, ...] = ()
     laws: TailLaws | None = None
+    baseline: Baseline | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> Family:

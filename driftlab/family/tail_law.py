@@ -61,6 +61,11 @@ class TailLaw(BaseModel):
             share=_weights(-u[u < 0], u[u > 0]), most=SURE * float(np.max(known)),
         )  # fmt: skip
 
+    def column(self, k: int) -> TailLaw | None:
+        """Return the law of one column alone; None where it had too few values."""
+        own = {name: (getattr(self, name)[k],) for name in ("centre", "below", "above")}
+        return self.model_copy(update=own) if self.below[k] > 0 else None
+
     def p(self, values: Array, *, upper: bool) -> Array:
         """Return the chance (n, m) of values as far out on either side, or only on the `upper`."""
         from scipy.special import stdtr

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.bands import deviation
+from driftlab.family.baseline import Baseline
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
@@ -31,8 +32,9 @@ from driftlab.production.store import UnitRef, UnitStore
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
-from driftlab.spc.charts import LEVEL, InControl, LineReport
-from driftlab.spc.line import line_of, reconcile
+from driftlab.recordings.identity import sha256
+from driftlab.spc.charts import InControl, LineReport
+from driftlab.spc.line import baseline_of, line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, quote
@@ -81,8 +83,11 @@ def analyse(
     known: Path | None,
     progress: FleetProgress,
     each: ParallelMap = serial,
+    rules: str | None = None,
 ) -> FamilyAnalysis:
     """Fit the family of the units that are done, or compare them with one that is `known`; `each` maps over them.
+
+    `rules` are run rules of the line's charts.
 
     Raises
     ------
@@ -99,16 +104,17 @@ def analyse(
             units = until_analysed.enter_context(UnitSpool(store, common, each)) if records else None
         progress(Stage("what the line did"))
         levels = {} if family is None or units is None else _levels(family, units)
-        before = None if known is None or family is None else {LEVEL: _level_law(family)}
-        line = line_of(records, config.limits, unit=unit, levels=levels or None, known=before)
+        before = None if known is None or family is None else _baseline(family)
+        line = line_of(records, config.limits, unit=unit, levels=levels or None, baseline=before, rules=rules)
         if family is None or units is None:
             return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
         outliers = find_outliers(family, units, records, shown=unit, fitted=known is None)
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
-        family = family.model_copy(update={"laws": outliers.laws})
         lots, line = reconcile(outliers.lots, line)
+        frozen = baseline_of(line, _level_law(family))
+        family = family.model_copy(update={"laws": outliers.laws, "baseline": frozen})
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
@@ -123,10 +129,15 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
     if known is None or family.laws is None:
         return []
     of = "one new unit" if count == 1 else f"{count:,} new units"
+    alone = f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}"
+    if family.baseline is None:
+        return [
+            f"{alone}, and levels are charted about theirs; other charts, changes and limits of the line are of {of}, "
+            "and do not say whether the line has moved since: the file has no limits of charts. Fit the family again."
+        ]
     return [
-        f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}, and levels are charted "
-        f"about theirs; other charts, changes and limits of the line are of {of}, and do not say whether the line has "
-        "moved since."
+        f"{alone}, and charted against limits that are frozen there (SHA-256 {sha256(known)[:12]}); changes of the "
+        f"line are looked for among {of}."
     ]
 
 
@@ -175,6 +186,12 @@ def _level_law(family: Family) -> list[InControl]:
     return [
         InControl(float(c @ B), float(np.sqrt(B @ C @ B))) for c, C in zip(before.c, before.covariance, strict=True)
     ]
+
+
+def _baseline(family: Family) -> Baseline:
+    """Return the frozen limits of a family; of one that has none, as of an earlier version, those of levels."""
+    levels = [(law.centre, law.spread) for law in _level_law(family)]
+    return family.baseline or Baseline.of_levels(family.units, family.axes, levels)
 
 
 def _mean_over_range(family: Family) -> Array:

@@ -24,7 +24,8 @@ from driftlab.production.tables import write_fleet
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
-from fusion_core.errors import ConfigError, DataError
+from driftlab.spc.run_rules import RULES
+from fusion_core.errors import ConfigError, DataError, quote
 from fusion_core.host.provenance import participants
 
 __all__ = ["FleetOptions", "fleet"]
@@ -45,6 +46,7 @@ def fleet(
     pages: Sequence[str] = (),
     certificate: bool = False,
     family: Place | None = None,
+    rules: str | None = None,
     force: bool = False,
     channel: str | None = None,
     progress: FleetProgress | None = None,
@@ -75,8 +77,11 @@ def fleet(
         Write a certificate of each unit too: one sheet with results, uncertainty and limits.
         As certificate.html and certificate.json in its folder; one of the same results stays as it is.
     family : path, optional
-        A family that is known: none is fitted.
+        A family that is known: none is fitted, and units are charted against its limits.
         Its `family.json`.
+    rules : str, optional
+        Run rules of the control charts, beside three sigma.
+        `western-electric` or `nelson`; they alarm more often, also of a line in control.
     force : bool
         Do every unit again.
     channel : as that of `run`
@@ -97,7 +102,9 @@ def fleet(
     """
     understood, report = config_of(config).tracking(channel), progress or (lambda stage: None)
     known = None if family is None else Path(family)
-    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, force)
+    if rules not in (None, *RULES):
+        raise ConfigError(f"--rules {quote(rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out")
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, rules, force)
     if wanted.scheduler is not None and wanted.workers is not None:
         raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
     manifest = read_manifest(str(units))
@@ -162,7 +169,7 @@ class _Command:
         # of matrices of forty rows more threads make less
         with threadpool_limits(1), Pool(options.workers) as pool:
             each = pool.ordered if len(units) > ALONE else serial
-            learned = partial(analyse, units, status, self.config, options.family, progress, each)
+            learned = partial(analyse, units, status, self.config, options.family, progress, each, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             pages = self._timed("pages", partial(jobs.make_pages, odd))
@@ -182,9 +189,10 @@ class _Command:
 
     def _key(self) -> str:
         """Return the key of family, tables and report: a hash of all that they are made of."""
-        jobs, known = self.jobs, self.jobs.options.family
-        family = "" if known is None else sha256(known)
-        return hashlib.sha256(repr((self.status.key, jobs.config, jobs.versions, family)).encode()).hexdigest()
+        jobs, options = self.jobs, self.jobs.options
+        family = "" if options.family is None else sha256(options.family)
+        parts = (self.status.key, jobs.config, jobs.versions, family, options.rules)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def _mark(self, **more: Any) -> dict[str, Any]:
         """Write `fleet.json`, and return its content."""

@@ -47,6 +47,7 @@ class FleetOptions:
     pages: Collection[str] = ()  # patterns of the units whose pages are wanted; `all`
     certificate: bool = False  # of each unit that is done
     family: Path | None = None  # one that is known already
+    rules: str | None = None  # run rules of the charts
     force: bool = False
 
     def crew(self) -> Workers:

@@ -18,10 +18,10 @@ import numpy as np
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
-from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, map_charts
+from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, joint_charts, map_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
-from driftlab.spc.sentences import by_how_much, place
+from driftlab.spc.sentences import alarms, by_how_much, place
 from driftlab.units import rounded
 
 FIRST = 20  # of them that are to be seen without opening the list
@@ -35,7 +35,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     failed = [record for record in records if record.state == "failed"]
     done = [record for record in records if record.state == "done"]
     limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
-    units = f"{len(records):,} unit{'s' * (len(records) != 1)}"
+    units, out = f"{len(records):,} unit{'s' * (len(records) != 1)}", [*alarms(line).items()]
     lead = [f"{units}: {len(records) - len(failed):,} done, {len(failed):,} failed", f"{odd:,} odd"]
     lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
     write_page(
@@ -54,7 +54,9 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
             overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
         ),
         lots=distributions(line),
-        charts=control_charts(line),
+        charts=[*joint_charts(line), *control_charts(line)],
+        alarms=[(line.units[k], overview.links.get(line.units[k], ""), "; ".join(why)) for k, why in out[:LISTED]],
+        alarms_count=len(out),
         line=line,
         changes=changes(line),
         effects=effects,

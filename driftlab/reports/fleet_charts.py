@@ -49,6 +49,28 @@ def control_charts(line: LineReport) -> list[Chart]:
     return result
 
 
+def joint_charts(line: LineReport) -> list[Chart]:
+    """Return the chart of T-squared, a panel an axis; none where no limits are frozen."""
+    panels = []
+    for joint in line.multivariate:
+        place, out = (joint.at + 1).astype(np.float64), joint.beyond
+        drawn = np.union1d(np.linspace(0, len(place) - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(out))
+        value, few = np.array([rounded(v, 4) for v in joint.value.tolist()]), np.unique([0, len(place) - 1])
+        span = (0.0, 1.1 * float(max(np.percentile(joint.value, 100 * (1 - MANY)), 2 * np.max(joint.limit))))
+        shown = np.minimum(value, span[1])
+        lines = (
+            Line(place[drawn], shown[drawn], "unit", "data", style="points"),
+            Line(place[out], shown[out], "beyond the limit", "alarm", style="points"),
+            Line(place[few], joint.limit[few], "limit", "limit", style="dashed"),
+        )
+        panels.append(Panel(lines, f"T-squared {joint.axis}", span=span))
+    if not panels:
+        return []
+    names = ", ".join(map(figure_name, line.multivariate[0].quantities))
+    caption = f"{names} of an axis together, by their frozen covariance: units that are unusual in what goes with what."
+    return [Chart(tuple(panels), "unit", "T-squared", caption, named="units-of-the-line")]
+
+
 def _by_quantity(line: LineReport) -> dict[str, list[ControlChart]]:
     """Return the charts of each quantity."""
     quantities = dict.fromkeys(chart.quantity for chart in line.controls)

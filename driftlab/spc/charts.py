@@ -26,12 +26,13 @@ chart, n values in general.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.family.baseline import Baseline, ScaleName
 from driftlab.family.record import PER
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
@@ -152,8 +153,8 @@ class ControlChart:
         Probability of values as little normal in that scale about their stretches, if they were.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
-    centre, spread : float
-        Of a line in control: its middle (SI), and the deviation between units in the scale.
+    centre : float
+        Middle of a line in control, SI.
     low, high : (m,) arrays
         Shewhart's limits.
     ewma, ewma_low, ewma_high : (m,) arrays
@@ -161,10 +162,16 @@ class ControlChart:
     beyond, drifting : (m,) bool arrays
         Alarms of either chart.
     changes : tuple of Change
-    trend : Trend or None
-        Where a straight line fits better than steps; then there are no changes.
     lots : tuple of Lot
         In the order of their first units.
+    z : (m,) array
+        Deviations from the centre, in sigmas.
+    law : InControl
+        Of the values in the scale: the limits stand on it.
+    trend : Trend or None
+        Where a straight line fits better than steps; then there are no changes.
+    patterns : mapping of str to (m,) bool array
+        Alarms of the run rules that were asked for, by rule.
     of_family : bool
         Whether centre and limits are those of a family that was known.
     """
@@ -178,7 +185,6 @@ class ControlChart:
     normal: float
     basis: tuple[int, int]
     centre: float
-    spread: float
     low: Array
     high: Array
     ewma: Array
@@ -188,8 +194,40 @@ class ControlChart:
     drifting: NDArray[np.bool_]
     changes: tuple[StepChange, ...]
     lots: tuple[LotPoint, ...]
+    z: Array
+    law: InControl
     trend: Trend | None = None
+    patterns: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     of_family: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TSquaredChart:
+    """Chart of Hotelling's T-squared of the figures of one axis, against a frozen covariance; m units have it.
+
+    Attributes
+    ----------
+    axis : str
+    quantities : tuple of str
+    at : (m,) int array
+        Places of the units in the line.
+    value, limit : (m,) arrays
+        A unit without some of the quantities has a limit of its own.
+    contributions : (m, p) array
+        Of each quantity: by how much T-squared would be less without it; NaN where it is not known.
+    """
+
+    axis: str
+    quantities: tuple[str, ...]
+    at: NDArray[np.intp]
+    value: Array
+    limit: Array
+    contributions: Array
+
+    @property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Alarms (m,)."""
+        return np.asarray(self.value > self.limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +246,9 @@ class LineReport:
     capability : tuple of Capability
     too_few : tuple of str
         Quantities without a chart because fewer than MIN_UNITS units have them.
+    multivariate : tuple of TSquaredChart
+    baseline : Baseline or None
+        Frozen limits on which the charts stand.
     sentences : tuple of str
         Changes, the present state, and the limits, in words.
     """
@@ -221,6 +262,8 @@ class LineReport:
     controls: tuple[ControlChart, ...] = ()
     capability: tuple[Capability, ...] = ()
     too_few: tuple[str, ...] = ()
+    multivariate: tuple[TSquaredChart, ...] = ()
+    baseline: Baseline | None = None
     sentences: tuple[str, ...] = ()
 
     def shown(self, quantity: str) -> BiasUnit:
@@ -319,9 +362,6 @@ def ewma_limit(n: int, weight: float = LAMBDA, width: float = L) -> Array:
     return np.asarray(width * np.sqrt(weight / (2 - weight) * (1 - (1 - weight) ** (2.0 * np.arange(1, n + 1)))))
 
 
-Name = Literal["log", "sqrt", "as it is"]
-
-
 @dataclass(frozen=True)
 class ChartScale:
     """Scale of values.
@@ -332,7 +372,7 @@ class ChartScale:
         `log`, `sqrt` or `as it is`.
     """
 
-    name: Name
+    name: ScaleName
 
     def to(self, values: Array) -> Array:
         """Return values in this scale."""

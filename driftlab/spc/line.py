@@ -11,7 +11,7 @@ Changes of the line that an odd lot explains, and odd lots that a change of the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
+from driftlab.family.baseline import Baseline, FrozenLimits, Together
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
+from driftlab.family.tail_law import TailLaw
 from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
@@ -35,6 +37,7 @@ from driftlab.spc.charts import (
     LotPoint,
     StepChange,
     Trend,
+    TSquaredChart,
     ewma,
     ewma_limit,
     huber,
@@ -44,6 +47,7 @@ from driftlab.spc.charts import (
     scale_of,
     share_beyond,
 )
+from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import sentences
 from driftlab.units import BiasUnit, default_unit
 from fusion_core.chunk import Array
@@ -54,7 +58,7 @@ BASIS = 20  # units on which limits should stand
 
 def line_of(
     records: Iterable[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
-    levels: Mapping[str, Array] | None = None, known: Mapping[str, Sequence[InControl]] | None = None,
+    levels: Mapping[str, Array] | None = None, baseline: Baseline | None = None, rules: str | None = None,
 ) -> LineReport:  # fmt: skip
     """Return the report of a line.
 
@@ -68,35 +72,42 @@ def line_of(
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
     levels : mapping of str to (d,) array, optional
         By unit: the mean of its map (SI) over the family's range.
-    known : mapping of str to sequence of InControl, optional
-        By quantity: what each axis does in control (SI), on which its limits then stand, also of few units.
+    baseline : Baseline, optional
+        Frozen laws, on which the limits of their quantities then stand, also of one unit.
+    rules : str, optional
+        Run rules beside three sigma, one of `driftlab.spc.run_rules.RULES`.
     """
-    known = known or {}
     line, table = _ordered(records, levels or {}, unit)
+    line = replace(line, baseline=baseline)
     names = (*FIGURES, *((LEVEL,) if levels else ()))
+    known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     enough = {
-        (name, axis): np.sum(np.isfinite(table[name][0, :, k])) >= (1 if name in known else MIN_UNITS)
+        (name, axis): np.sum(np.isfinite(table[name][0, :, k])) >= (1 if (name, axis) in known else MIN_UNITS)
         for name in names for k, axis in enumerate(line.axes)
     }  # fmt: skip
     alpha = FALSE / max(sum(enough.values()), 1)
     controls = tuple(
-        _control(line, name, k, table[name][:, :, k], alpha, known[name][k] if name in known else None)
+        _control(line, name, k, table[name][:, :, k], alpha, known.get((name, axis)), RULES.get(rules or "", {}))
         for name in names for k, axis in enumerate(line.axes) if enough[name, axis]
     )  # fmt: skip
     too_few = tuple(f"{axis} {name}" for (name, axis), many in enough.items() if not many)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
+    line = replace(line, multivariate=_multivariate(line))
     return replace(line, sentences=tuple(sentences(line)))
 
 
 def _control(
-    line: LineReport, name: str, k: int, figures: Array, alpha: float, known: InControl | None
-) -> ControlChart:
+    line: LineReport, name: str, k: int, figures: Array, alpha: float, known: FrozenLimits | None,
+    rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]],
+) -> ControlChart:  # fmt: skip
     """Return the chart of values and deviations (2, n) of a quantity of axis k."""
     values, sigmas = figures
     at = np.flatnonzero(np.isfinite(values))
     value = values[at]
-    scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale("as it is")
-    x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
+    scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
+    frozen = None if known is None else InControl(known.centre, known.spread, known.share)
+    usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
+    x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at], usual)
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
     level_steps = _steps(x, whole, alpha, _runs([line.lots[place] for place in at]))
     trend = _trend(x, whole, level_steps, scale)
@@ -104,32 +115,90 @@ def _control(
     edges = [0, *(step.at for step in level_steps), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
-    law = in_control(x[start:stop], own[start:stop]) if known is None else known
+    law = in_control(x[start:stop], own[start:stop]) if frozen is None else frozen
     sigma = np.maximum(law.sigma(own), 1e-100)  # of values that do not vary
     z = (x - law.centre) / sigma
-    w, reach, usual = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
+    z = z if known is None else known.scores(z)
+    w, reach, middle = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
     flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
 
-    def back(y: Array) -> Array:
-        return scale.back(law.centre + y)
+    def back(z: Array, sigma: Array | float) -> Array:
+        return scale.back(law.centre + sigma * (z if known is None else known.deviations(z)))
+
+    three = np.full(len(z), SIGMAS)
 
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
-        centre=float(scale.back(np.array(law.centre))), spread=law.spread, low=back(-SIGMAS * sigma),
-        high=back(SIGMAS * sigma), ewma=back(w * usual), ewma_low=back(-reach * usual), ewma_high=back(reach * usual),
+        centre=float(scale.back(np.array(law.centre))), low=back(-three, sigma), high=back(three, sigma),
+        ewma=back(w, middle), ewma_low=back(-reach, middle), ewma_high=back(reach, middle),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
         changes=_changes(level_steps, stretches, x, sigma, scale, at), lots=_lots(line, at, x, sigma, law, scale),
-        trend=trend, of_family=known is not None,
+        trend=trend, z=z, law=law, patterns={rule: alarms(z) for rule, alarms in rules.items()},
+        of_family=known is not None,
     )  # fmt: skip
 
 
-def _of_the_usual(scale: ChartScale, value: Array, sigma: Array) -> Array:
-    """Return the deviations (n,) that values (n,) would have in the scale, were each as usual, as limits have it.
+def _multivariate(line: LineReport) -> tuple[TSquaredChart, ...]:
+    """Return the charts of T-squared of the axes of which the baseline has a covariance."""
+    result = []
+    for together in () if line.baseline is None else line.baseline.together:
+        z = {name: np.full(len(line.units), np.nan) for name in together.quantities}
+        for chart in line.controls:
+            if chart.axis == together.axis and chart.quantity in z:
+                z[chart.quantity][chart.at] = chart.z
+        value, limit, contributions = together.judged(z)
+        at = np.flatnonzero(np.isfinite(value))
+        some = (value[at], limit[at], contributions[at])
+        result.append(TSquaredChart(together.axis, together.quantities, at, *some))
+    return tuple(result)
+
+
+def baseline_of(line: LineReport, levels: Sequence[InControl]) -> Baseline:
+    """Return the limits of a line, frozen; those of levels, which lots may shift, are `levels`, an axis each.
+
+    Tails and covariances are of deviations from the middle of each stretch without a change; tails of a quantity are
+    learnt from all axes.
+    """
+    frozen: list[FrozenLimits] = []
+    scores: dict[str, dict[str, Array]] = {axis: {} for axis in line.axes}
+    for name in dict.fromkeys(chart.quantity for chart in line.controls):
+        charts = [chart for chart in line.controls if chart.quantity == name]
+        laws = [levels[line.axes.index(chart.axis)] if name == LEVEL else chart.law for chart in charts]
+        u = np.stack([_about_stretches(line, chart) for chart in charts], axis=1)
+        u *= [chart.law.spread / law.spread if name == LEVEL else 1.0 for chart, law in zip(charts, laws, strict=True)]
+        tails = None if name == LEVEL else TailLaw.of(u)
+        for k, (chart, law) in enumerate(zip(charts, laws, strict=True)):
+            own = None if tails is None else tails.column(k)
+            limits = FrozenLimits(
+                quantity=name, axis=chart.axis, scale=chart.scale.name, centre=law.centre, spread=law.spread,
+                share=law.share, tails=own,
+            )  # fmt: skip
+            frozen.append(limits)
+            scores[chart.axis][name] = limits.scores(u[:, k])
+    joint = (Together.of(axis, of_axis) for axis, of_axis in scores.items())
+    dates = sorted(filter(None, (date[:10] for date in line.dates))) or [""]
+    return Baseline(
+        units=len(line.units), first=dates[0], last=dates[-1], limits=tuple(frozen),
+        together=tuple(one for one in joint if one is not None),
+    )  # fmt: skip
+
+
+def _about_stretches(line: LineReport, chart: ControlChart) -> Array:
+    """Return the deviations (U,) from the middle of each stretch without a change, in sigmas; NaN where not known."""
+    z = np.full(len(line.units), np.nan)
+    z[chart.at] = chart.z
+    for start, stop in pairwise([0, *(change.at for change in chart.changes), len(z)]):
+        part = z[start:stop]
+        part -= np.nanmedian(part) if np.any(np.isfinite(part)) else 0.0
+    return z
+
+
+def _of_the_usual(scale: ChartScale, value: Array, sigma: Array, usual: float) -> Array:
+    """Return the deviations (n,) that values (n,) would have in the scale, were each as `usual` (SI).
 
     What comes out large by chance has a large deviation of its own, and what comes out small a small one.
     """
-    usual = float(np.median(value))
     if not usual > 0:
         return scale.sigma(value, sigma)
     own = scale.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))

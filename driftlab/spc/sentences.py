@@ -21,6 +21,7 @@ def sentences(line: LineReport) -> list[str]:
     """Return the changes in their order, each that others share once; then the charts, and the limits."""
     if not line.controls:
         return ["Too few units for charts of the line."]
+    judged = _against_baseline(line)
     lines = [_change(line, group) for group in _together(line.controls)]
     lines += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
     if all(len(chart.at) < MIN_UNITS for chart in line.controls):
@@ -29,7 +30,63 @@ def sentences(line: LineReport) -> list[str]:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
         lines = [f"{off} change of the line in {len(line.units):,} units, {line.order}."]
-    return [*lines, *_now(line), *_limits(line)]
+    return [*judged, *lines, *_now(line), *_limits(line)]
+
+
+NAMED = 5  # units that a sentence names
+
+
+def alarms(line: LineReport) -> dict[int, list[str]]:
+    """Return why units are out of control, by their places in the line: T-squared, limits, EWMA, then run rules.
+
+    Against frozen limits, of the EWMA where it leaves them; of run rules on all charts.
+    """
+    reasons: dict[int, list[str]] = {}
+    for joint in line.multivariate:
+        for k in np.flatnonzero(joint.beyond):
+            order = np.argsort(-np.nan_to_num(joint.contributions[k]))[:2]
+            most = ", ".join(f"{figure_name(joint.quantities[i])} {joint.contributions[k, i]:.3g}" for i in order)
+            text = f"{joint.axis} T-squared {joint.value[k]:.3g}, limit {joint.limit[k]:.3g} (of it {most})"
+            reasons.setdefault(int(joint.at[k]), []).append(text)
+    for chart in line.controls:
+        unit = line.shown(chart.quantity)
+        for k in np.flatnonzero(chart.beyond & chart.of_family):
+            value, low, high = (values[k] * unit.factor for values in (chart.value, chart.low, chart.high))
+            text = f"{_called(chart)} {value:.3g} {unit.shown}, limits {low:.3g} to {high:.3g}"
+            reasons.setdefault(int(chart.at[k]), []).append(text)
+        left = chart.drifting & ~np.concatenate([[False], chart.drifting[:-1]])
+        for k in np.flatnonzero(left & chart.of_family):
+            reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: the EWMA leaves its limits here")
+        for rule, found in chart.patterns.items():
+            for k in np.flatnonzero(found):
+                reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: {rule}")
+    return dict(sorted(reasons.items()))
+
+
+def _against_baseline(line: LineReport) -> list[str]:
+    """Return how many units are beyond frozen limits, which, and how many of a line in control would be."""
+    base = line.baseline
+    if base is None or not base.together:
+        return []
+    frozen = [chart for chart in line.controls if chart.of_family]
+    out = [chart.at[chart.beyond] for chart in frozen] + [joint.at[joint.beyond] for joint in line.multivariate]
+    places = sorted({int(k) for part in out for k in part})
+    tests = len(frozen) + len(line.multivariate)
+    days = f", made from {base.first} to {base.last}" if base.first else ""
+    by = f"frozen limits (of {base.units:,} units{days})"
+    chance = f"of a line in control up to {len(line.units) * tests / 370:.2g} would be by chance, of {tests} charts"
+    moved = ", ".join(_called(chart) for chart in frozen if chart.drifting[-1])
+    if not places and moved:
+        return [
+            f"No single unit of {len(line.units):,} is beyond its {by}, but the EWMA is: the line has moved, {moved}."
+        ]
+    if not places:
+        seen = "a unit that is off by three sigma in one figure shows one time in two, by one sigma one in 44"
+        return [f"No unit of {len(line.units):,} is beyond its {by}; {seen}."]
+    names = ", ".join(line.units[k] for k in places[:NAMED])
+    names += f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
+    verb = "is" if len(places) == 1 else "are"
+    return [f"{len(places):,} of {len(line.units):,} units {verb} beyond {by}: {names}; {chance}."]
 
 
 def place(line: LineReport, k: int) -> str:

@@ -5,11 +5,11 @@ import pytest
 from lines import AXES, DEG_H, SPREAD, TYPICAL, line, record
 
 from driftlab.config import Limits
+from driftlab.family.baseline import Baseline
 from driftlab.spc.change_points import least_alike, parts, scores, shares, steps
 from driftlab.spc.charts import (
     LAMBDA,
     SIGMAS,
-    InControl,
     L,
     ewma,
     ewma_limit,
@@ -192,10 +192,10 @@ def test_the_level_of_the_map_is_watched_where_it_is_given():
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_levels_are_charted_about_a_family_that_is_known(count):
     """A line that has moved since shows at once, also by few units; by its own units it would be in control."""
-    rng, law = np.random.default_rng(1), [InControl(0.0, 60 * DEG_H)] * 3
+    rng, law = np.random.default_rng(1), Baseline.of_levels(30, AXES, [(0.0, 60 * DEG_H)] * 3)
     records = line(count)
     levels = {one.unit: (rng.normal(size=3) * 20 + [240, 0, 0]) * DEG_H for one in records}
-    found = line_of(records, None, levels=levels, known={"level": law})
+    found = line_of(records, None, levels=levels, baseline=law)
     charts = {c.axis: c for c in found.controls if c.quantity == "level"}
     assert all(chart.of_family for chart in charts.values())
     assert np.mean(charts["x"].beyond) > 0.7

@@ -1,0 +1,118 @@
+"""Frozen limits: alarms of lines in control whatever their law, planted units, and Hotelling's limit."""
+
+import numpy as np
+import pytest
+from lines import AXES, DEG_H, line, record
+
+from driftlab.family.baseline import Baseline, Together
+from driftlab.spc.charts import InControl
+from driftlab.spc.line import baseline_of, line_of
+from driftlab.spc.sentences import alarms
+
+LEVEL = [InControl(0.0, 60 * DEG_H)] * 3
+
+
+def levels(records, seed):
+    rng = np.random.default_rng(seed)
+    return {one.unit: rng.normal(size=3) * 60 * DEG_H for one in records}
+
+
+def frozen(count, seed, **more):
+    records = line(count, seed, **more)
+    found = line_of(records, None, levels=levels(records, seed))
+    return Baseline.model_validate_json(baseline_of(found, LEVEL).model_dump_json())
+
+
+def judged(records, baseline, **more):
+    return line_of(records, None, levels=levels(records, 99), baseline=baseline, **more)
+
+
+# the law of the values is none that the limits assume: t with three degrees of freedom, and an exponential
+@pytest.mark.parametrize("law", ["normal", "heavy", "skew"])
+def test_a_line_in_control_hardly_alarms_whatever_its_law(law):
+    single, joint, values = 0, 0, 0
+    for seed in range(3):
+        found = judged(line(300, 50 + seed, law=law), frozen(150, seed, law=law))
+        single += sum(int(np.sum(chart.beyond)) for chart in found.controls)
+        joint += sum(int(np.sum(chart.beyond)) for chart in found.multivariate)
+        values += 300
+    assert single / (values * 18) < 1 / 120
+    assert joint / (values * 3) < 1 / 120
+
+
+@pytest.mark.parametrize("law", ["normal", "heavy", "skew"])
+def test_a_shifted_lot_alarms_against_frozen_limits_and_not_against_its_own(law):
+    """All of a day off alike: by its own units that would be the usual."""
+    new = line(12, 7, law=law, planted=[("noise", "x", 0, 12, 4 if law == "normal" else 8)])
+    found = judged(new, frozen(150, 3, law=law))
+    chart = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
+    assert np.median(chart.z) > 2.5
+    assert chart.drifting[-1]
+    assert "frozen limits (of 150 units, made from 2026-01-05" in found.sentences[0]
+    assert any(text.startswith("x noise: the EWMA leaves") for reasons in alarms(found).values() for text in reasons)
+    single = np.any(chart.beyond)
+    assert ("units are beyond" in found.sentences[0]) == single
+    assert ("the line has moved, x noise" in found.sentences[0]) != single
+
+
+def test_one_unit_is_enough():
+    base = frozen(100, 1)
+    (good,), (bad,) = line(1, 4), line(1, 4, planted=[("walk", "z", 0, 1, 9)])
+    quiet, found = judged([good], base), judged([bad], base)
+    assert not alarms(quiet)
+    assert quiet.sentences[0].startswith("No unit of 1 is beyond its frozen limits")
+    assert "one time in two" in quiet.sentences[0]
+    ((place, reasons),) = alarms(found).items()
+    assert place == 0
+    assert any(text.startswith("z T-squared") and "(of it walk" in text for text in reasons)
+    assert any(text.startswith("z walk 0.1") and "deg/h/sqrt(s), limits" in text for text in reasons)
+
+
+def test_what_goes_together_is_missed_by_single_limits_and_seen_by_t_squared():
+    """Residual and noise go together; a unit with more of one and less of the other is within either limit."""
+    rng, records = np.random.default_rng(0), []
+    for k in range(120):
+        common, own = rng.normal(size=3), rng.normal(size=(2, 3))
+        values = [2.0 * np.exp(0.1 * (common + 0.2 * one)) * DEG_H for one in own]
+        records.append(record(k, {"residual": values[0], "noise": values[1]}))
+    base = baseline_of(line_of(records, None), LEVEL)
+    odd = {"residual": np.full(3, 2.0 * np.exp(0.2)) * DEG_H, "noise": np.full(3, 2.0 * np.exp(-0.2)) * DEG_H}
+    found = line_of([record(0, odd)], None, baseline=base)
+    assert not any(np.any(chart.beyond) for chart in found.controls)
+    assert all(np.all(chart.beyond) for chart in found.multivariate)
+    assert len(found.multivariate) == 3
+
+
+def test_t_squared_alarms_as_rarely_as_it_says_also_of_few_units():
+    """Montgomery 11.3: with the factor of F for a covariance that is estimated; without it one unit in 70 alarms."""
+    rng, out, units = np.random.default_rng(2), 0, 0
+    mix = np.linalg.cholesky(0.6 + 0.4 * np.eye(4))
+    for _ in range(3000):
+        known, new = rng.normal(size=(25, 4)) @ mix.T, rng.normal(size=(40, 4)) @ mix.T
+        together = Together.of("x", dict(zip("abcd", known.T, strict=True)))
+        value, limit, contributions = together.judged(dict(zip("abcd", (new - known.mean(axis=0)).T, strict=True)))
+        out += int(np.sum(value > limit))
+        units += len(value)
+        assert np.all(contributions >= -1e-9)
+    assert out / units == pytest.approx(0.0027, rel=0.25)
+
+
+def test_a_unit_without_a_figure_is_judged_by_the_others():
+    rng = np.random.default_rng(1)
+    together = Together.of("x", {name: rng.normal(size=50) for name in "abc"})
+    z = {"a": np.array([4.5, 4.5, np.nan]), "b": np.array([np.nan, 0.0, np.nan]), "c": np.array([0.0, 0.0, np.nan])}
+    value, limit, contributions = together.judged(z)
+    assert limit[0] < limit[1]
+    assert np.isnan(value[2])
+    assert np.isnan(contributions[0, 1])
+    assert value[0] > limit[0]
+
+
+def test_run_rules_are_those_that_were_asked_for():
+    records = line(60, 3, planted=[("noise", "y", 30, 60, 1.5)])
+    assert not any(chart.patterns for chart in line_of(records, None).controls)
+    found = line_of(records, None, rules="nelson")
+    said = [text for reasons in alarms(found).values() for text in reasons]
+    assert any(text.startswith("y noise: 9 units in a row") for text in said)
+    base = Baseline.of_levels(30, AXES, [(0.0, 1.0)] * 3)
+    assert "frozen" not in " ".join(judged(records, base).sentences)
