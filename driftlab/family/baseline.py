@@ -31,6 +31,7 @@ MOST = 3.0  # sigmas to which a deviation counts in S
 PER_FIGURE = 3  # units that S needs, for each of its figures
 SURE = 1e-15  # least p-value, a score of eight
 GRID = np.sinh(np.linspace(-6.0, 6.0, 1201))  # deviations, up to 200 sigmas
+WHOLE = 0.9  # of the range: a soak over less is over a part
 ALARM = 0.0027  # chance of an alarm of a line in control, as beyond three sigma
 
 
@@ -143,6 +144,8 @@ class Baseline(BaseModel):
 
     Attributes
     ----------
+    domain : (low, high), optional
+        Temperatures that most of them were soaked over, degC.
     limits : tuple of FrozenLimits
     together : tuple of Together
         Of the axes of which enough units have two quantities or more.
@@ -153,12 +156,20 @@ class Baseline(BaseModel):
     units: Annotated[int, Field(ge=0)]
     first: Plain = ""
     last: Plain = ""
+    domain: tuple[FiniteFloat, FiniteFloat] | None = None
     limits: tuple[FrozenLimits, ...]
     together: tuple[Together, ...] = ()
 
     def of(self, quantity: str, axis: str) -> FrozenLimits | None:
         """Return the law of a quantity of an axis; None where there is none."""
         return next((one for one in self.limits if (one.quantity, one.axis) == (quantity, axis)), None)
+
+    def covered(self, domain: tuple[float, float] | None) -> bool:
+        """Return True if a soak over a `domain` (degC) is one over the range of the baseline's units."""
+        if self.domain is None or domain is None:
+            return True
+        (low, high), least = self.domain, WHOLE * (self.domain[1] - self.domain[0])
+        return min(domain[1], high) - max(domain[0], low) >= least
 
     @classmethod
     def of_levels(cls, units: int, axes: Sequence[str], levels: Sequence[tuple[float, float]]) -> Baseline:

@@ -237,6 +237,8 @@ class LineReport:
     Attributes
     ----------
     units, lots, dates : tuple of str
+    domains : tuple of (low, high) or None
+        Temperatures that each unit was soaked over, degC.
     order : str
         Basis of the order, in a sentence.
     axes : tuple of str
@@ -249,6 +251,8 @@ class LineReport:
     multivariate : tuple of TSquaredChart
     baseline : Baseline or None
         Frozen limits on which the charts stand.
+    partial : int
+        Units that were soaked over less than the range of the baseline: neither swing nor prediction is charted.
     sentences : tuple of str
         Changes, the present state, and the limits, in words.
     """
@@ -256,6 +260,7 @@ class LineReport:
     units: tuple[str, ...] = ()
     lots: tuple[str, ...] = ()
     dates: tuple[str, ...] = ()
+    domains: tuple[tuple[float, float] | None, ...] = ()
     order: str = ""
     axes: tuple[str, ...] = ()
     unit: BiasUnit = RATE
@@ -264,6 +269,7 @@ class LineReport:
     too_few: tuple[str, ...] = ()
     multivariate: tuple[TSquaredChart, ...] = ()
     baseline: Baseline | None = None
+    partial: int = 0
     sentences: tuple[str, ...] = ()
 
     def shown(self, quantity: str) -> BiasUnit:

@@ -54,6 +54,7 @@ from fusion_core.chunk import Array
 
 FALSE = 0.05  # changes found in a line without any, over all its charts
 BASIS = 20  # units on which limits should stand
+OF_THE_RANGE = ("swing", "coast")  # figures that a soak over a part of the range does not have
 
 
 def line_of(
@@ -79,6 +80,11 @@ def line_of(
     """
     line, table = _ordered(records, levels or {}, unit)
     line = replace(line, baseline=baseline)
+    if baseline is not None:
+        part = np.array([not baseline.covered(domain) for domain in line.domains], dtype=bool)
+        for name in OF_THE_RANGE:
+            table[name][:, part] = np.nan
+        line = replace(line, partial=int(np.sum(part)))
     names = (*FIGURES, *((LEVEL,) if levels else ()))
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     enough = {
@@ -179,9 +185,18 @@ def baseline_of(line: LineReport, levels: Sequence[InControl]) -> Baseline:
     joint = (Together.of(axis, of_axis) for axis, of_axis in scores.items())
     dates = sorted(filter(None, (date[:10] for date in line.dates))) or [""]
     return Baseline(
-        units=len(line.units), first=dates[0], last=dates[-1], limits=tuple(frozen),
+        units=len(line.units), first=dates[0], last=dates[-1], domain=_domain(line), limits=tuple(frozen),
         together=tuple(one for one in joint if one is not None),
     )  # fmt: skip
+
+
+def _domain(line: LineReport) -> tuple[float, float] | None:
+    """Return the temperatures, degC, between which most units were soaked."""
+    known = [domain for domain in line.domains if domain is not None]
+    if not known:
+        return None
+    low, high = np.median(known, axis=0).tolist()
+    return low, high
 
 
 def _about_stretches(line: LineReport, chart: ControlChart) -> Array:
@@ -299,11 +314,12 @@ def _ordered(
     """
     axes: tuple[str, ...] = ()
     si = ""
-    names, rows = [], []
+    names, rows, domains = [], [], []
     for record in records:
         if record.state == "done":
             axes, si = axes or record.axes, si or record.bias_unit
             names.append((record.unit, record.lot, record.date))
+            domains.append(record.domain)
             rows.append(record.table(FIGURES, len(axes)))
     place, order = _places([date for _, _, date in names])
     n, d = len(rows), len(axes)
@@ -314,7 +330,9 @@ def _ordered(
         level[0, k] = levels.get(name, np.nan)
     table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
     unit = default_unit(si) if unit is None else unit
-    return LineReport(units=units, lots=lots, dates=dates, order=order, axes=axes, unit=unit), table
+    spans = tuple(domains[j] for j in place)
+    line = LineReport(units=units, lots=lots, dates=dates, domains=spans, order=order, axes=axes, unit=unit)
+    return line, table
 
 
 def _places(dates: list[str]) -> tuple[list[int], str]:

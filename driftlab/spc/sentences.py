@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.record import figure_name
 from driftlab.spc.charts import MIN_UNITS, SIGMAS
@@ -29,7 +30,13 @@ def sentences(line: LineReport) -> list[str]:
     elif not lines:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
-        lines = [f"{off} change of the line in {len(line.units):,} units, {line.order}."]
+        within = "within these" if judged else "in"
+        lines = [f"{off} change of the line {within} {len(line.units):,} units, {line.order}."]
+    if line.partial:
+        soaked = "unit was" if line.partial == 1 else "units were"
+        judged.append(
+            f"{line.partial:,} {soaked} soaked over a part of the range: no swing, no prediction on the charts."
+        )
     return [*judged, *lines, *_now(line), *_limits(line)]
 
 
@@ -39,7 +46,7 @@ NAMED = 5  # units that a sentence names
 def alarms(line: LineReport) -> dict[int, list[str]]:
     """Return why units are out of control, by their places in the line: T-squared, limits, EWMA, then run rules.
 
-    Against frozen limits, of the EWMA where it leaves them; of run rules on all charts.
+    Against frozen limits; of the EWMA and of run rules, on all charts, the unit at which they begin to alarm.
     """
     reasons: dict[int, list[str]] = {}
     for joint in line.multivariate:
@@ -52,15 +59,20 @@ def alarms(line: LineReport) -> dict[int, list[str]]:
         unit = line.shown(chart.quantity)
         for k in np.flatnonzero(chart.beyond & chart.of_family):
             value, low, high = (values[k] * unit.factor for values in (chart.value, chart.low, chart.high))
+            low = low if chart.quantity == "level" else max(low, 0.0)
             text = f"{_called(chart)} {value:.3g} {unit.shown}, limits {low:.3g} to {high:.3g}"
             reasons.setdefault(int(chart.at[k]), []).append(text)
-        left = chart.drifting & ~np.concatenate([[False], chart.drifting[:-1]])
-        for k in np.flatnonzero(left & chart.of_family):
+        for k in _beginnings(chart.drifting & chart.of_family):
             reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: the EWMA leaves its limits here")
         for rule, found in chart.patterns.items():
-            for k in np.flatnonzero(found):
+            for k in _beginnings(found):
                 reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: {rule}")
     return dict(sorted(reasons.items()))
+
+
+def _beginnings(alarms: NDArray[np.bool_]) -> list[int]:
+    """Return the places (m,) of alarms before which there is none."""
+    return np.flatnonzero(alarms & ~np.concatenate([[False], alarms[:-1]])).tolist()
 
 
 def _against_baseline(line: LineReport) -> list[str]:
