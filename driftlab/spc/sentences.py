@@ -50,14 +50,14 @@ def alarms(line: LineReport) -> dict[int, list[str]]:
     """
     reasons: dict[int, list[str]] = {}
     for joint in line.multivariate:
-        for k in np.flatnonzero(joint.beyond):
+        for k in np.flatnonzero(joint.beyond).tolist():
             order = np.argsort(-np.nan_to_num(joint.contributions[k]))[:2]
             most = ", ".join(f"{figure_name(joint.quantities[i])} {joint.contributions[k, i]:.3g}" for i in order)
             text = f"{joint.axis} T-squared {joint.value[k]:.3g}, limit {joint.limit[k]:.3g} (of it {most})"
             reasons.setdefault(int(joint.at[k]), []).append(text)
     for chart in line.controls:
         unit = line.shown(chart.quantity)
-        for k in np.flatnonzero(chart.beyond & chart.of_family):
+        for k in np.flatnonzero(chart.beyond & chart.of_family).tolist():
             value, low, high = (values[k] * unit.factor for values in (chart.value, chart.low, chart.high))
             low = low if chart.quantity == "level" else max(low, 0.0)
             text = f"{_called(chart)} {value:.3g} {unit.shown}, limits {low:.3g} to {high:.3g}"
