@@ -25,6 +25,7 @@ from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, 
 from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
 from driftlab.spc.run_rules import RULES
+from driftlab.spc.sentences import alarms
 from fusion_core.errors import ConfigError, DataError, quote
 from fusion_core.host.provenance import participants
 
@@ -178,6 +179,7 @@ class _Command:
         family = FamilySummary(
             units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
             line=analysis.line.sentences, judged=analysis.judged,
+            alarms={analysis.line.units[k]: why for k, why in alarms(analysis.line).items()},
         )  # fmt: skip
         return self._mark(complete=True, key=key, family=family, pages=pages)
 

@@ -93,13 +93,17 @@ MAX_PAGES = 20  # pages of units that stand out and were not asked for
 
 
 class FamilySummary(BaseModel):
-    """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line."""
+    """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
+
+    `alarms` are why units are out of control, by frozen limits and run rules.
+    """
 
     units: int
     fitted: bool = True
     odd: dict[str, list[str]] = {}
     lines: list[str] = []
     line: list[str] = []
+    alarms: dict[str, list[str]] = {}
     judged: bool = True
 
     def sentences(self) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import figure_name
-from driftlab.spc.charts import MIN_UNITS, SIGMAS
+from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
 
 if TYPE_CHECKING:
     from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
@@ -78,7 +78,7 @@ def _beginnings(alarms: NDArray[np.bool_]) -> list[int]:
 def _against_baseline(line: LineReport) -> list[str]:
     """Return how many units are beyond frozen limits, which, and how many of a line in control would be."""
     base = line.baseline
-    if base is None or not base.together:
+    if base is None or all(limits.quantity == LEVEL for limits in base.limits):
         return []
     frozen = [chart for chart in line.controls if chart.of_family]
     out = [chart.at[chart.beyond] for chart in frozen] + [joint.at[joint.beyond] for joint in line.multivariate]

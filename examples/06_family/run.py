@@ -49,12 +49,15 @@ class Found:
         Rms over range and axes of the map of each new unit, deg/h, by where the map is from.
     held : float
         Share of temperatures and axes at which the error is within two deviations of the family's map.
+    day : dict
+        Content of `fleet.json` of the later day.
     """
 
     odd: dict[str, str]
     told: Mapping[str, Any]
     errors: dict[str, np.ndarray]
     held: float
+    day: Mapping[str, Any]
 
 
 def prove(line: Line, out: Path, console: Console) -> Found:
@@ -67,12 +70,14 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     known = out / "fleet" / "family.json"
     _fleet(line.folder / "new.csv", out / "short", console, family=known)
     _fleet(line.folder / "whole.csv", out / "whole", console)
+    console.print(f"3. a later day, {len(line.later)} units against the limits of the first {len(line.units)}")
+    day = _fleet(line.folder / "later.csv", out / "later", console, family=known)
     table = pl.read_parquet(out / "fleet" / "units.parquet")
     why = pl.coalesce("odd_why", pl.concat_str(pl.lit("failed: "), "error"))
     rows = table.filter(pl.col("odd") | (pl.col("state") == "failed")).unique("unit").select("unit", why).rows()
     errors, held = _errors(line, out)
-    found = Found(dict(rows), told, errors, held)
-    for made in (of_the_line(line, found), of_the_soaks(line, found)):
+    found = Found(dict(rows), told, errors, held, day)
+    for made in (of_the_line(line, found), of_the_soaks(line, found), of_the_day(line, found)):
         console.print()
         console.print(made)
     return found
@@ -146,6 +151,26 @@ def _lines(found: Found, about: str) -> list[str]:
     """Return the fleet's sentences about a subject."""
     told = found.told["family"]
     return [line for line in [*told["lines"], *told.get("line", [])] if about.lower() in line.lower()]
+
+
+def of_the_day(line: Line, found: Found) -> Table:
+    """Return the planted faults of the later day beside what frozen limits show."""
+    made = Table(title="a later day", title_justify="left", show_lines=True)
+    for heading in ("planted", "found"):
+        made.add_column(heading)
+    judged = found.day["family"]
+    half = next((unit.name for unit in line.later if unit.lot == planted.LATER), "none")
+    for unit in (unit for unit in line.later if unit.odd):
+        why = [*judged["odd"].get(unit.name, []), *judged["alarms"].get(unit.name, [])]
+        made.add_row(Text(f"{unit.name}: {unit.odd}"), Text(why[0] if why else "nothing is said of it"))
+    for about, figure in (
+        (f"from {half} on x shifted by {planted.SHIFT:g} deg/h", "x level"),
+        (f"noise of y grows by {100 * planted.TREND:g} % a unit", "y noise"),
+    ):
+        said = [text for text in judged["line"] if figure in text]
+        said += [f"{name}: {text}" for name, why in judged["alarms"].items() for text in why if text.startswith(figure)]
+        made.add_row(Text(about), Text("\n".join(said[:3]) or "nothing is said of it"))
+    return made
 
 
 def of_the_soaks(line: Line, found: Found) -> Table:

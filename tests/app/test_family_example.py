@@ -15,7 +15,7 @@ import json, planted, run
 from rich.console import Console
 if __name__ == "__main__":
     out = run.Path({out!r})
-    line = planted.make(out / "line", 14, 1 / 3, fresh=4)
+    line = planted.make(out / "line", 14, 1 / 3, fresh=4, later=6)
     found = run.prove(line, out, Console(stderr=True, width=200))
     print(json.dumps([sorted(found.odd), line.odd, {{k: v.tolist() for k, v in found.errors.items()}}, found.held]))
 """
@@ -44,6 +44,14 @@ def test_odd_units_are_named_and_the_tables_say_so(proof):
     assert f"{len(set(odd) & set(planted))} of {len(planted)}" in said
 
 
+def test_a_later_day_is_held_against_frozen_limits(proof):
+    *_, said = proof
+    assert "frozen limits (of 14 units" in said
+    shown = said[said.rindex("a later day") :]
+    assert "x shifted by 250 deg/h" in shown
+    assert shown.count("nothing is said of it") <= 2  # of six units soaked for 20 minutes, against fourteen
+
+
 def test_a_shifted_lot_that_is_named_is_shown_as_found():
     """A lot that is off is a sentence of the family, not of the line's level: the table finds either."""
     with importable(FOLDER):
@@ -52,9 +60,9 @@ def test_a_shifted_lot_that_is_named_is_shown_as_found():
         import run
     from rich.console import Console
 
-    line = planted.Line(family.deal(20, 1), [], "L07", 2.0, 0.8, Path())
+    line = planted.Line(family.deal(20, 1), [], [], "L07", 2.0, 0.8, Path())
     said = "Lot L07: x is off the other lots by 253 deg/h at 22 °C."
-    found = run.Found({}, {"family": {"lines": [said], "line": []}}, {}, 1.0)
+    found = run.Found({}, {"family": {"lines": [said], "line": []}}, {}, 1.0, {})
     console = Console(record=True, width=200, file=io.StringIO())
     console.print(run.of_the_line(line, found))
     shown = console.export_text()
