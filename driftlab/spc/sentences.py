@@ -44,7 +44,7 @@ NAMED = 5  # units that a sentence names
 
 
 def alarms(line: LineReport) -> dict[int, list[str]]:
-    """Return why units are out of control, by their places in the line: T-squared, limits, EWMA, then run rules.
+    """Return the reasons of units out of control, by place in the line: T-squared, limits, EWMA, then run rules.
 
     Against frozen limits; of the EWMA and of run rules, on all charts, the unit at which they begin to alarm.
     """
@@ -76,7 +76,7 @@ def _beginnings(alarms: NDArray[np.bool_]) -> list[int]:
 
 
 def _against_baseline(line: LineReport) -> list[str]:
-    """Return how many units are beyond frozen limits, which, and how many of a line in control would be."""
+    """Return the number of units beyond frozen limits, their names, and the number that chance alone would give."""
     base = line.baseline
     if base is None or all(limits.quantity == LEVEL for limits in base.limits):
         return []
