@@ -132,7 +132,7 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
         if path.is_file():
             (tmp_path / path.name).symlink_to(path.resolve())
     if page.stem == "calibrate_a_production_line":
-        planted.make(tmp_path, count=14, hours=0.25, fresh=2)
+        planted.make(tmp_path, count=14, hours=0.25, fresh=2, later=3)
     with ExitStack() as running:
         follow(page, tmp_path, running)
 
