@@ -97,13 +97,14 @@ lint: $(VENV)/ready
 types: $(VENV)/ready
 	$(VENV)/bin/mypy
 
-# the documentation as a site, in site/; a broken link or image fails
-$(VENV)/docs: $(VENV)/ready
+# the documentation as a site, in site/ (one minute); a link, an anchor or an image that is missing fails
+$(VENV)/docs: $(VENV)/ready pyproject.toml
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 docs: $(VENV)/docs
-	$(VENV)/bin/mkdocs build --strict --quiet
+	rm -rf site
+	$(VENV)/bin/sphinx-build --quiet --fail-on-warning -c docs/.site -d .cache/docs docs site
 
 clean:
 	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out site
