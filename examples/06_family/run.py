@@ -20,9 +20,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 import planted
 from family import DEG_H, HIGH, LOW, Unit
+from pictures import BLUE, GREY, RED, picture, save
 from planted import Line
 
 import driftlab
@@ -163,12 +164,28 @@ def of_the_soaks(line: Line, found: Found) -> Table:
     return made
 
 
+def draw(line: Line, found: Found, path: Path) -> None:
+    """Draw the error of each new unit's map, by where the map is from."""
+    known, whole = (np.median(found.errors[name]) for name in ("short soak and family", "whole soak"))
+    short = f"{100 * planted.PART:.0f} % of a soak"
+    title = f"{short} and {len(line.units)} units before it: {known:.1f} deg/h of map error; a whole soak: {whole:.1f}"
+    figure, (panel,) = picture(title, columns=1, height=2.8)
+    for k, (rms, colour) in enumerate(zip(found.errors.values(), (RED, BLUE, GREY), strict=True)):
+        panel.semilogx(rms, np.full(len(rms), k) + np.linspace(-0.2, 0.2, len(rms)), "o", ms=5, color=colour)
+        panel.plot([np.median(rms)] * 2, [k - 0.35, k + 0.35], color=colour, lw=2)
+    panel.set_yticks(range(len(found.errors)), list(found.errors))
+    panel.invert_yaxis()
+    panel.set_xlabel(f"error of the map of each of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians")
+    save(figure, path)
+
+
 def main() -> None:
     """Make the line, run it, and print the results."""
     begun = time.monotonic()
     shutil.rmtree(OUT, ignore_errors=True)
     console = Console(soft_wrap=True, highlight=False)
-    prove(planted.make(OUT / "line"), OUT, console)
+    line = planted.make(OUT / "line")
+    draw(line, prove(line, OUT, console), OUT / "family.png")
     console.print(
         f"\n{time.monotonic() - begun:.0f} s; everything is in {OUT.relative_to(ROOT)}/: look at fleet/report.html"
     )
