@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator autopilot family paper tools test torture wheels lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -38,6 +38,18 @@ autopilot: $(VENV)/ready
 # a line of 200 gyros with odd units, a shifted lot and a hidden hysteresis: what is found, and new units with 40 % of a soak (five minutes)
 family: $(VENV)/ready
 	$(VENV)/bin/python examples/06_family/run.py
+
+# a planned soak beside a staircase of the same hours, on simulated units (40 s)
+planned: $(VENV)/ready
+	$(VENV)/bin/python examples/07_planned_soak/run.py
+
+# a measured voltage reference, in ppm, while it warms (10 s)
+reference: $(VENV)/ready
+	$(VENV)/bin/python examples/08_voltage_reference/run.py
+
+# a hysteresis in one simulated soak, and a unit without any (10 s)
+hysteresis: $(VENV)/ready
+	$(VENV)/bin/python examples/09_hysteresis/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready

@@ -40,7 +40,7 @@ napoleon_use_ivar = True  # a field that is documented in two places is one
 suppress_warnings = ["ref.python"]  # of types in docstrings: several classes have an attribute called `n`
 
 html_theme = "furo"
-html_additional_pages = {"index": "to_start.html"}  # opens README.html
+html_additional_pages = {"index": "to_start.html"}  # opens gallery.html
 templates_path = ["."]
 html_math_renderer = "mathml"
 html_copy_source = False

@@ -166,16 +166,19 @@ def of_the_soaks(line: Line, found: Found) -> Table:
 
 def draw(line: Line, found: Found, path: Path) -> None:
     """Draw the error of each new unit's map, by where the map is from."""
-    known, whole = (np.median(found.errors[name]) for name in ("short soak and family", "whole soak"))
-    short = f"{100 * planted.PART:.0f} % of a soak"
-    title = f"{short} and {len(line.units)} units before it: {known:.1f} deg/h of map error; a whole soak: {whole:.1f}"
+    alone, known, whole = (f"{np.median(rms):.2g}" for rms in found.errors.values())
+    title = (
+        f"{100 * planted.PART:.0f} % of a soak: {alone} deg/h of map error alone, {known} with {len(line.units)} units "
+        f"before it ({whole} after a whole soak)"
+    )
     figure, (panel,) = picture(title, columns=1, height=2.8)
     for k, (rms, colour) in enumerate(zip(found.errors.values(), (RED, BLUE, GREY), strict=True)):
         panel.semilogx(rms, np.full(len(rms), k) + np.linspace(-0.2, 0.2, len(rms)), "o", ms=5, color=colour)
         panel.plot([np.median(rms)] * 2, [k - 0.35, k + 0.35], color=colour, lw=2)
     panel.set_yticks(range(len(found.errors)), list(found.errors))
     panel.invert_yaxis()
-    panel.set_xlabel(f"error of the map of each of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians")
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.set_xlabel(f"error of the map of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians")
     save(figure, path)
 
 
