@@ -12,7 +12,9 @@ from PIL import Image
 GREY, BLUE, RED, DARK = "#9a9a9a", "#0b6e99", "#c8553d", "#333333"
 
 
-def picture(title: str, rows: int = 1, columns: int = 2, height: float = 3.6, **how: object) -> tuple[Figure, list[Axes]]:
+def picture(
+    title: str, rows: int = 1, columns: int = 2, height: float = 3.6, **how: object
+) -> tuple[Figure, list[Axes]]:
     """Return a figure with a title, and its panels row by row."""
     figure = Figure(figsize=(8.4, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")

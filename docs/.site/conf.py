@@ -19,10 +19,12 @@ PAGES = {  # the side bar under a page, part by part: first pages in this order,
         "Start": "gallery tutorial/first_run",
         "How to": "how-to/read_your_files how-to/read_a_serial_device how-to/fit_a_thermal_map how-to/plan_a_soak "
         "how-to/sign_a_calibration how-to/close_the_loop how-to/*",
-        "Reference": "reference/config reference/command_line reference/output_files reference/* reference/api/*",
+        "Reference": "reference/config reference/command_line reference/output_files reference/* "
+        "reference/plugins/README reference/api/*",
         "Explanation": "explanation/theory explanation/*",
         "Decisions": "adr/README",
     },
+    "reference/plugins/README": {"Families": "*"},
     "adr/README": {"All": "0*"},
 }
 

@@ -178,7 +178,9 @@ def draw(line: Line, found: Found, path: Path) -> None:
     panel.set_yticks(range(len(found.errors)), list(found.errors))
     panel.invert_yaxis()
     panel.xaxis.set_major_formatter("{x:g}")
-    panel.set_xlabel(f"error of the map of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians")
+    panel.set_xlabel(
+        f"error of the map of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians"
+    )
     save(figure, path)
 
 

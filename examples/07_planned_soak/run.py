@@ -56,7 +56,9 @@ def draw(plan: PlanResult, found: dict[str, np.ndarray], rms: dict[str, float], 
     for name, colour in (("staircase", RED), ("planned", BLUE)):
         right.plot(GRID, found[name].T, color=colour, lw=0.7, alpha=0.7)
     sigma = plan["sigma"][:, 0] / DEG_H
-    right.fill_between(plan["temperature"], -2 * sigma, 2 * sigma, color=BLUE, alpha=0.15, lw=0, label="± 2 sigma of plan")
+    right.fill_between(
+        plan["temperature"], -2 * sigma, 2 * sigma, color=BLUE, alpha=0.15, lw=0, label="± 2 sigma of plan"
+    )
     right.set(xlabel="temperature [°C]", ylabel="map less truth, x [deg/h]", xlim=(GRID[0], GRID[-1]))
     for panel in (left, right):
         panel.legend(frameon=False, fontsize=9)
