@@ -137,7 +137,8 @@ def draw(rows: Mapping[str, Errors], path: Path) -> None:
     """Draw the error of each way to the end of the day, all axes together."""
     errors = {way: float(np.linalg.norm(found["to the end"])) / DEG_H for way, found in rows.items()}
     best = min(errors[way] for way in errors if way != "none")
-    title = f"A calibration takes {100 * (1 - best / errors['none']):.0f} % of a day's drift away; who fits it decides little"
+    share = 100 * (1 - best / errors["none"])
+    title = f"A calibration takes {share:.0f} % of a day's drift away; who fits it decides little"
     figure, (panel,) = picture(title, columns=1, height=3.2)
     bars = panel.barh(list(errors), list(errors.values()), color=[GREY, *[BLUE] * (len(errors) - 1)])
     panel.bar_label(bars, fmt="%.0f", padding=4)

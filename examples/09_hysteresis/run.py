@@ -23,8 +23,8 @@ PLANTED = {"width": "4 K", "gain": "6 deg/h/K"}  # warming and cooling differ by
 
 def soaked(hysteresis: dict[str, str] | None, seed: int) -> tuple[SimulateResult, FitMapResult]:
     """Return a simulated soak, and the map that is fitted on it."""
-    source = CONFIG["source"]
-    config = {**CONFIG, "source": {**source, "gyro": {**source["gyro"], "hysteresis": hysteresis}}}
+    gyro = {**CONFIG["source"]["gyro"], "hysteresis": hysteresis}
+    config = {**CONFIG, "source": {**CONFIG["source"], "gyro": gyro}}
     soak = driftlab.simulate(config, seed=seed)
     return soak, driftlab.fit_map(config, soak)
 
@@ -33,9 +33,7 @@ def main(out: Path) -> dict[str, FitMapResult]:
     """Fit both units, print what is said of a memory, and draw what each map leaves."""
     units = {"with a hysteresis": soaked(PLANTED, 1), "without": soaked(None, 2)}
     for name, (_, fitted) in units.items():
-        print(f"unit {name}:")
-        for line in fitted.lines():
-            print(f"   {line}")
+        print(f"unit {name}:", *fitted.lines(), sep="\n   ")
     draw(units, out / "hysteresis.png")
     return {name: fitted for name, (_, fitted) in units.items()}
 
@@ -44,7 +42,7 @@ def draw(units: dict[str, tuple[SimulateResult, FitMapResult]], path: Path) -> N
     """Draw means of ten minutes less the map, while the unit warms and while it cools."""
     memory, other = (fitted.summary["judged"]["memory"] for _, fitted in units.values())
     size, sigma = (abs(memory[key][0]) / DEG_H for key in ("size", "sigma"))
-    title = f"One soak: warming and cooling differ by {size:.0f} ± {sigma:.1f} deg/h (24 planted); control: {other['answer']}"
+    title = f"One soak: up and down differ by {size:.0f} ± {sigma:.1f} deg/h (24 planted); control: {other['answer']}"
     figure, panels = picture(title, height=3.4, sharey=True)
     for panel, (name, (soak, fitted)) in zip(panels, units.items(), strict=True):
         rows = len(soak["time"]) // 600 * 600
@@ -53,10 +51,8 @@ def draw(units: dict[str, tuple[SimulateResult, FitMapResult]], path: Path) -> N
         warms = np.arange(len(T)) < np.argmax(T)
         for which, colour, label in ((warms, RED, "warming"), (~warms, BLUE, "cooling")):
             panel.plot(T[which], left[which] - np.mean(left), "o-", ms=3, lw=1, color=colour, label=label)
-        panel.set_title(f"unit {name}", fontsize=10)
-        panel.set_xlabel("temperature [°C]")
-    panels[0].set_ylabel("bias x less the map [deg/h]")
-    panels[0].legend(frameon=False, fontsize=9)
+        panel.set(title=f"unit {name}", xlabel="temperature [°C]", ylabel="bias x less the map [deg/h]")
+        panel.legend(frameon=False, fontsize=9)
     save(figure, path)
 
 
