@@ -32,11 +32,11 @@ def errors(profile: dict[str, object], units: int) -> np.ndarray:
 def main(units: int, out: Path) -> dict[str, float]:
     """Plan, soak units both ways, and return the rms of their maps' errors, deg/h."""
     plan = driftlab.plan(CONFIG, hours=4, range="-20..50 degC")
-    print(plan.headline)
     knots = {"time": [f"{t} s" for t in plan["time"]], "temperature": [f"{T} degC" for T in plan["set_point"]]}
     found = {"staircase": errors(STAIRS, units), "planned": errors({"kind": "table", **knots}, units)}
     rms = {name: float(np.sqrt(np.mean(error**2))) for name, error in found.items()}
     title = f"Four hours, planned: {rms['planned']:.1f} deg/h of map error; a staircase leaves {rms['staircase']:.1f}"
+    print(plan.headline, title, sep="\n")
     draw(title, plan, found, out / "planned_soak.png")
     return rms
 
