@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator autopilot family paper tools test torture wheels lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -38,6 +38,18 @@ autopilot: $(VENV)/ready
 # a line of 200 gyros with odd units, a shifted lot and a hidden hysteresis: what is found, and new units with 40 % of a soak (five minutes)
 family: $(VENV)/ready
 	$(VENV)/bin/python examples/06_family/run.py
+
+# a planned soak beside a staircase of the same hours, on simulated units (40 s)
+planned: $(VENV)/ready
+	$(VENV)/bin/python examples/07_planned_soak/run.py
+
+# a measured voltage reference, in ppm, while it warms (10 s)
+reference: $(VENV)/ready
+	$(VENV)/bin/python examples/08_voltage_reference/run.py
+
+# a hysteresis in one simulated soak, and a unit without any (10 s)
+hysteresis: $(VENV)/ready
+	$(VENV)/bin/python examples/09_hysteresis/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready
@@ -97,13 +109,14 @@ lint: $(VENV)/ready
 types: $(VENV)/ready
 	$(VENV)/bin/mypy
 
-# the documentation as a site, in site/; a broken link or image fails
-$(VENV)/docs: $(VENV)/ready
+# the documentation as a site, in site/ (one minute); a link, an anchor or an image that is missing fails
+$(VENV)/docs: $(VENV)/ready pyproject.toml
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 docs: $(VENV)/docs
-	$(VENV)/bin/mkdocs build --strict --quiet
+	rm -rf site
+	$(VENV)/bin/sphinx-build --quiet --fail-on-warning -c docs/.site -d .cache/docs docs site
 
 clean:
 	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out site

@@ -1,4 +1,4 @@
-"""Draw measured and predicted on ramp 3, after run.py: `python examples/02_oven_resistor/figure.py FILE.svg`."""
+"""Draw measured and predicted on ramp 3, after run.py: `python examples/02_oven_resistor/figure.py FILE.png`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from run import DATA, OUT, PPM
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from pictures import picture, save
 
 STYLE = {"before": ("#c8553d", "by the declared cubic"), "after": ("#0b6e99", "with what was added")}
 EVERY = 3  # rows are drawn
@@ -34,21 +36,21 @@ def draw(upper: Axes, lower: Axes, which: str) -> None:
 
 def main(path: Path) -> None:
     """Draw both resistors side by side, with the oven's temperature."""
-    figure = Figure(figsize=(10, 6.2), layout="constrained")
-    panels = figure.subplots(3, 2, sharex=True, sharey="row", gridspec_kw={"height_ratios": (3, 3, 1.4)})
+    title = "A lag behind the oven is found, and predicts the next ramp; nothing is added to the control"
+    shape = {"sharex": True, "sharey": "row", "gridspec_kw": {"height_ratios": (3, 3, 1.4)}}
+    figure, found = picture(title, rows=3, height=5.4, **shape)
+    panels = np.array(found).reshape(3, 2)
     for column, which in enumerate(("lagging", "control")):
         draw(panels[0, column], panels[1, column], which)
         table = np.genfromtxt(DATA / f"{which}.csv", delimiter=",", names=True)
         ramp = table["time"] >= 18_300
         panels[2, column].plot(table["time"][ramp] / 3600, table["oven"][ramp], color="#333333", lw=1)
         panels[2, column].set_xlabel("time [h]")
-        panels[1, column].legend(fontsize=8, loc="lower right", frameon=False)
+        panels[1, column].legend(fontsize=7, loc="lower right", frameon=False)
     panels[0, 0].legend(fontsize=8, loc="upper right", frameon=False)
-    for panel, label in zip(panels[:, 0], ("resistance [ppm]", "error less its mean [ppm]", "oven [°C]"), strict=True):
+    for panel, label in zip(panels[:, 0], ("resistance [ppm]", "error, mean off [ppm]", "oven [°C]"), strict=True):
         panel.set_ylabel(label)
-    for panel in panels.flat:
-        panel.grid(alpha=0.25)
-    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+    save(figure, path)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ import cats
 import ways
 from coasts import DEG_H
 from days import DEVICE, HORIZONS, Errors, Placement, of_filter, of_firmware
+from pictures import BLUE, GREY, picture, save
 
 from driftlab.commands.explain import explain
 from driftlab.commands.export import export
@@ -132,12 +133,28 @@ def _coasted(config: Path, folder: Path, flown: Placement) -> Errors:
     return of_filter(np.asarray(result["coast"]), np.asarray(result["t"]), flown)
 
 
+def draw(rows: Mapping[str, Errors], path: Path) -> None:
+    """Draw the error of each way to the end of the day, all axes together."""
+    errors = {way: float(np.linalg.norm(found["to the end"])) / DEG_H for way, found in rows.items()}
+    best = min(errors[way] for way in errors if way != "none")
+    share = 100 * (1 - best / errors["none"])
+    title = f"A calibration takes {share:.0f} % of a day's drift away; who fits it decides little"
+    figure, (panel,) = picture(title, columns=1, height=3.2)
+    bars = panel.barh(list(errors), list(errors.values()), color=[GREY, *[BLUE] * (len(errors) - 1)])
+    panel.bar_label(bars, fmt="%.0f", padding=4)
+    panel.invert_yaxis()
+    panel.margins(x=0.1)
+    panel.set_xlabel("error of the gyro's bias on the day that is flown, rms [deg/h]")
+    save(figure, path)
+
+
 def main() -> None:
     """Run the proof."""
     console = Console(soft_wrap=True, highlight=False)
     rows = prove(OUT, cats.recording(console), console)
     console.print()
     Console(width=120).print(table(rows))
+    draw(rows, OUT / "autopilot.png")
     console.print(f"written to {OUT.relative_to(cats.ROOT)}/: logs, maps, parameters, code, loss.json")
 
 

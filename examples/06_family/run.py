@@ -20,9 +20,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent))
 import planted
 from family import DEG_H, HIGH, LOW, Unit
+from pictures import BLUE, GREY, RED, picture, save
 from planted import Line
 
 import driftlab
@@ -188,12 +190,33 @@ def of_the_soaks(line: Line, found: Found) -> Table:
     return made
 
 
+def draw(line: Line, found: Found, path: Path) -> None:
+    """Draw the error of each new unit's map, by where the map is from."""
+    alone, known, whole = (f"{np.median(rms):.2g}" for rms in found.errors.values())
+    title = (
+        f"{100 * planted.PART:.0f} % of a soak: {alone} deg/h of map error alone, {known} with {len(line.units)} units "
+        f"before it ({whole} after a whole soak)"
+    )
+    figure, (panel,) = picture(title, columns=1, height=2.8)
+    for k, (rms, colour) in enumerate(zip(found.errors.values(), (RED, BLUE, GREY), strict=True)):
+        panel.semilogx(rms, np.full(len(rms), k) + np.linspace(-0.2, 0.2, len(rms)), "o", ms=5, color=colour)
+        panel.plot([np.median(rms)] * 2, [k - 0.35, k + 0.35], color=colour, lw=2)
+    panel.set_yticks(range(len(found.errors)), list(found.errors))
+    panel.invert_yaxis()
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.set_xlabel(
+        f"error of the map of {len(line.fresh)} new units, {LOW:g} to {HIGH:g} °C, rms [deg/h]; bars: medians"
+    )
+    save(figure, path)
+
+
 def main() -> None:
     """Make the line, run it, and print the results."""
     begun = time.monotonic()
     shutil.rmtree(OUT, ignore_errors=True)
     console = Console(soft_wrap=True, highlight=False)
-    prove(planted.make(OUT / "line"), OUT, console)
+    line = planted.make(OUT / "line")
+    draw(line, prove(line, OUT, console), OUT / "family.png")
     console.print(
         f"\n{time.monotonic() - begun:.0f} s; everything is in {OUT.relative_to(ROOT)}/: look at fleet/report.html"
     )

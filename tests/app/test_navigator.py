@@ -88,4 +88,4 @@ def test_the_script_prints_its_table_and_draws(tmp_path):
     code = f"import run; run.main(1, run.Path({str(tmp_path)!r}), cycles=2)"
     done = subprocess.run([sys.executable, "-c", code], cwd=FOLDER, capture_output=True, text=True, check=True)
     assert done.stdout.count("| random walk") == 2
-    assert (tmp_path / "navigator.svg").stat().st_size > 10_000
+    assert (tmp_path / "navigator.png").stat().st_size > 10_000

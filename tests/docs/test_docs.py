@@ -12,6 +12,7 @@ import sys
 import time
 from contextlib import ExitStack, chdir, contextmanager
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import jsonschema
@@ -25,6 +26,7 @@ from units_at_rest import unit_at_rest
 from yaml12 import read
 
 from driftlab.cli import app
+from fusion_core import contracts
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.parent.name != "adr")]
@@ -109,7 +111,7 @@ def bench(tmp_path_factory):
             write_formats(folder, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
-    config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
+    config = next(text for _, text, _ in blocks(ROOT / "README.md") if text.startswith("# unit.yaml"))
     (folder / "unit.yaml").write_text(config)
     run_in(folder, "fit-map", "unit.yaml", "--input", "soak.h5")
     return folder
@@ -147,6 +149,9 @@ def follow(page, tmp_path, running):
                 (tmp_path / made).unlink(missing_ok=True)
             with chdir(tmp_path):
                 exec(compile(text, page.name, "exec"), {})
+        elif kind == "python" and page.name == "README.md":
+            with chdir(tmp_path):
+                exec(compile(text, page.name, "exec"), {**vars(contracts), "np": np, "Literal": Literal})
         elif kind == "shell":
             for command in commands(text):
                 if command[0] == "simulate" and (made := tmp_path / command[command.index("--out") + 1]).is_symlink():
