@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise
-from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
+from driftlab.starter.columns import SENSORS, Channels, GuessedChannel, of_accel
 from driftlab.starter.names import Name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
@@ -28,6 +28,7 @@ UNITS_OF = {
     "temperature": ("degC", "degF", "K"),
 }  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
+AXES = tuple(str.maketrans("xX", pair) for pair in ("xX", "yY", "zZ"))
 
 
 class OpenQuestion(NamedTuple):
@@ -53,6 +54,8 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
     questions = tuple(_questions(columns, channels))
+    if held is not None and not (question := of_a_sensor(columns)).needed:
+        questions = (question, *questions)
     asked = [question.text for question in questions if question.needed]
     asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
@@ -113,6 +116,8 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
 
 
 def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
+    if "time" not in channels.found and "interval" not in columns.settings:
+        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
     for field, channel in channels.found.items():
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
@@ -120,8 +125,16 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
             yield OpenQuestion(
                 "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
             )
-    if "time" not in channels.found and "interval" not in columns.settings:
-        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
+
+
+def of_a_sensor(columns: FileColumns) -> OpenQuestion:
+    """Return the question for the gyro's columns, where no name says it: three that differ by the axis are the guess."""
+    known = columns.values
+    triads = [triad for path in known if len(triad := {path.translate(axis): 0 for axis in AXES}.keys() & known) == 3]
+    triads.sort(key=lambda triad: of_accel(np.column_stack([known[path] for path in sorted(triad)])).unit is not None)
+    choices = (*[",".join(sorted(triad)) for triad in triads[:1]], *known)
+    text = "the columns of the gyro's axes: no name says which they are"
+    return OpenQuestion("columns", "gyro", text, choices, needed=not triads)
 
 
 def _noises(channels: Channels) -> Iterator[str]:

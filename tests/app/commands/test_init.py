@@ -16,6 +16,7 @@ from dataflash_writer import write_log
 from device_frames import one, vectornav
 from scipy.io import savemat
 from typer.testing import CliRunner
+from typists import at_a_terminal
 from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
@@ -319,26 +320,57 @@ def test_what_is_no_recording_writes_nothing(tmp_path, content, message):
     assert not (tmp_path / "rec.yaml").exists()
 
 
-class Terminal(io.StringIO):
+ENTER, DOWN, STOP = "\r", "\x1b[B", "\x03"
+
+
+def answered(tmp_path, *keys, **environment):
+    """Status of `init` of a file that says too little, and what it showed to a person who answers with these keys."""
+    content = table(("when", "q?", "b?", "temperature"), "deg/s", "g")
+    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
+    asked = [("]:" if environment.get("TERM") == "dumb" else "text:", key) for key in keys]
+    return at_a_terminal("init", "rec.csv", cwd=tmp_path, answers=asked, **environment)
+
+
+def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path):
+    """Arrow keys lead to the answers, the guess first; a number, or text, is an answer too."""
+    _, shown = answered(tmp_path, ENTER, "5" + ENTER, "50 ms" + ENTER, DOWN + ENTER, ENTER)
+    assert "the columns of the gyro's axes: no name says which they are" in shown
+    assert "> 1) qx,qy,qz   (the guess)" in shown
+    assert re.search(r"the unit of gyro \(mean .*: rad/s or deg/s\?\)", shown)
+    assert re.search(r"the unit of temperature \(15.2 to 34.8\).*> 1\) degC   \(the guess\)", shown, re.DOTALL)
+    assert "'5' has no unit" in shown  # and is asked again
+    source = load_config(tmp_path / "rec.yaml").source
+    assert source.channels["gyro"].paths == ("qx", "qy", "qz")
+    assert source.channels["gyro"].unit == "deg/s"  # the first, below the last one
+    assert source.interval == 0.05
+
+
+class Lines(io.StringIO):
     def isatty(self):
         return True
 
 
-def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path, monkeypatch):
+def test_in_a_dumb_terminal_answers_are_lines(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    content = table(("when", "?", "q?", "case"), "deg/s", "g")
-    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
-    screen = Terminal()
-    monkeypatch.setattr(sys, "stdout", screen)
-    monkeypatch.setattr(sys, "stdin", Terminal("2,3,4\n1\n50 ms\n1\n"))
-    arguments = init_command.arguments_of({"file": tmp_path / "rec.csv"}, {"json": False})
-    asked = screen.getvalue()
-    assert "the columns of the gyro's axes" in asked
-    assert "2) x" in asked
-    assert arguments["columns"] == {"gyro": "x,y,z"}
+    monkeypatch.setenv("TERM", "dumb")
+    pl.DataFrame(table(("when", "q?", "b?", "case"), "deg/s", "g")).write_csv("rec.csv")
+    monkeypatch.setattr(sys, "stdout", screen := Lines())
+    monkeypatch.setattr(sys, "stdin", Lines("3,4,5\n50 ms\n1\n"))
+    arguments = init_command.arguments_of({"file": Path("rec.csv")}, {"json": False})
+    assert "1) qx,qy,qz   (the guess)" in screen.getvalue()
+    assert arguments["columns"] == {"gyro": "qx,qy,qz"}
     assert arguments["interval"] == "50 ms"
-    assert arguments["units"]["gyro"] in ("deg/s", "rad/s")
+    assert arguments["units"]["gyro"] == "deg/s"
     assert arguments["out"] == Path("rec.yaml")
+
+
+@pytest.mark.parametrize("kind", ["xterm", "dumb"])
+def test_an_interview_that_is_stopped_ends_in_one_line(tmp_path, kind):
+    status, shown = answered(tmp_path, STOP, TERM=kind)
+    assert status == 130
+    assert shown.rstrip().endswith("driftlab: interrupted; nothing was written")
+    assert "Traceback" not in shown
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.csv"]
 
 
 def test_go_fits_the_map_at_once(tmp_path, monkeypatch):
