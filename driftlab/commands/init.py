@@ -153,10 +153,9 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
     frames = None if file.is_dir() else reading.framing_of(file)
     if frames is None:
         raise reading.nothing_reads(file, errors)
-    samples = reading.samples_of(file, frames)
-    return config_text.of_frames(
-        path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
-    )
+    frames, samples = reading.samples_of(file, frames, given.interval)
+    channels = None if samples is None else channels_in(samples)
+    return config_text.of_frames(path, file.name, frames, channels, _map_name(file))
 
 
 def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answers) -> Starter:
@@ -258,11 +257,12 @@ def _typed(text: str, rows: list[str], usual: int) -> str:
 def _picked(text: str, rows: list[str], usual: int) -> str:
     """Return a line that a person types, or the number of the row that the arrow keys lead to."""
     from prompt_toolkit import prompt
+    from prompt_toolkit.formatted_text import AnyFormattedText
     from prompt_toolkit.key_binding import KeyBindings, KeyPressEvent
 
     keys, place = KeyBindings(), usual
 
-    def screen() -> list[tuple[str, str]]:
+    def screen() -> AnyFormattedText:
         begin = max(0, min(place - SHOWN // 2, len(rows) - SHOWN))
         shown = list(enumerate(rows))[begin : begin + SHOWN]
         marked = [("bold", f"> {row}\n") if k == place else ("", f"  {row}\n") for k, row in shown]

@@ -41,6 +41,9 @@ class OpenQuestion(NamedTuple):
     needed: bool = True
 
 
+APART = OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
+
+
 @dataclass(frozen=True)
 class Starter:
     """A config as text, and the places to be filled in, a sentence each; `questions` a person can be asked."""
@@ -88,18 +91,24 @@ def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | N
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
     lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
     lines += ["source:", f"  kind: {frames.source}", f"  path: {yaml_text(path)}"]
-    asked = ["the interval between samples: the frames have no clock"]
+    asked, questions = [] if channels is None else list(_noises(channels)), tuple[OpenQuestion, ...]()
     if channels is None:
+        questions = (APART._replace(text="the interval between samples: the frames have no clock"),)
+        asked = [questions[0].text]
         lines.append("  # interval: 10 ms       # fill in: between samples, as the device is set")
         channels = Channels({}, {}, (), None)
-    else:
-        asked = list(_noises(channels))
+    elif frames.interval is not None:
+        lines.append(f"  interval: {frames.interval}")
     if not frames.product:
         settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
-        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
+        if not channels.found:
+            settings.pop("interval", None)
+        elif "interval" in settings:
+            settings["interval"] = f"{settings['interval']:.9g} s"
+        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items())
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
     lines += [SITE, *_filter(channels, map_name)]
-    return _starter(lines, asked)
+    return replace(_starter(lines, asked), questions=questions)
 
 
 def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
@@ -117,7 +126,7 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
 
 def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
     if "time" not in channels.found and "interval" not in columns.settings:
-        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
+        yield APART
     for field, channel in channels.found.items():
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
@@ -128,7 +137,7 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
 
 
 def of_a_sensor(columns: FileColumns) -> OpenQuestion:
-    """Return the question for the gyro's columns, where no name says it: three that differ by the axis are the guess."""
+    """Return the question for the gyro's columns; three that differ by the axis alone are the guess."""
     known = columns.values
     triads = [triad for path in known if len(triad := {path.translate(axis): 0 for axis in AXES}.keys() & known) == 3]
     triads.sort(key=lambda triad: of_accel(np.column_stack([known[path] for path in sorted(triad)])).unit is not None)

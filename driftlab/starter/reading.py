@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
 from fusion_core.host.registry import registry
+from fusion_core.units import to_si
 
 ROWS = 200_000  # that are looked at
 WIDEST = 1024  # values of an array that is a channel
@@ -49,6 +51,7 @@ class FoundFraming:
     product: str | None
     framing: Framing
     count: int
+    interval: str | None = None  # between frames without a clock
 
 
 def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
@@ -144,14 +147,24 @@ def framing_of(path: Path) -> FoundFraming | None:
     return best if kind and best is not None and best.count >= FRAMES else None
 
 
-def samples_of(path: Path, frames: FoundFraming) -> Chunk | None:
-    """Return the first samples in SI; None where the frames have no clock."""
-    settings = {"kind": frames.source, "path": str(path), "framing": frames.framing}
-    try:
-        source = _file_sources()[frames.source].model_validate(settings)
-    except ValidationError:
-        return None
-    return next(source.chunks(ROWS, Faults()), None)
+def samples_of(path: Path, frames: FoundFraming, interval: str | None) -> tuple[FoundFraming, Chunk | None]:
+    """Return the framing with its interval, and the first samples in SI; None without clock and interval.
+
+    A framing whose values are those of an interval, as angles are, has that of the clock, or the one that is said.
+    """
+    timed, framing = {} if interval is None else {"interval": interval}, frames.framing
+    for known in ({}, timed):
+        settings = {"kind": frames.source, "path": str(path), "framing": framing, **known}
+        with suppress(ValidationError):
+            source = _file_sources()[frames.source].model_validate(settings)
+            samples = next(source.chunks(ROWS, Faults()), None)
+            if getattr(framing, "interval", None) is not None and samples is not None:
+                step = float(np.median(np.diff(samples.t))) if interval is None else to_si(interval, "s")
+                framing = framing.model_validate({**framing.model_dump(), "interval": f"{step:.9g} s"})
+                source = source.model_validate({**settings, "framing": framing})
+                samples = next(source.chunks(ROWS, Faults()), None)
+            return replace(frames, framing=framing, interval=interval if known else None), samples
+    return frames, None
 
 
 def _count(framing: Framing, data: bytes) -> int:

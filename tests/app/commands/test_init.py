@@ -2,6 +2,7 @@
 
 import io
 import re
+import struct
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from bags import FIELDS, unit
 from bags import write as bag
 from bench import FRAMING, frame
 from dataflash_writer import write_log
-from device_frames import one, vectornav
+from device_frames import kvh, one, vectornav, xsens
 from scipy.io import savemat
 from typer.testing import CliRunner
 from typists import at_a_terminal
@@ -225,6 +226,37 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
         UnreadableFile, match=r"no installed source reads it.* describe its frames under source\.framing"
     ):
         init(tmp_path / "unknown.bin", out=tmp_path / "unknown.yaml")
+
+
+def without_a_clock(k, gyro, g):
+    """Message of Xsens, with the packet counter alone."""
+    three = [(0x4020, struct.pack(">3f", *9.8 * g)), (0x8020, struct.pack(">3f", *gyro))]
+    return xsens((0x1020, struct.pack(">H", k)), (0x0810, struct.pack(">f", 20 + k / 100)), *three)
+
+
+@pytest.mark.parametrize("unit", ["kvh A", "kvh B", "xsens"])
+def test_bytes_without_a_clock_need_an_interval_which_is_then_in_the_config(tmp_path, monkeypatch, unit):
+    """Angles become rates by it: those of KVH with a clock are 5 ms apart by themselves."""
+    monkeypatch.chdir(tmp_path)
+    rates = 0.01 + 1e-4 * np.random.default_rng(3).standard_normal((15_000, 3))
+    g = [0, 0, 1] + 1e-3 * np.random.default_rng(4).standard_normal((15_000, 3))
+    frames = enumerate(zip(rates, g, strict=True))
+    if unit == "xsens":
+        data = b"".join(without_a_clock(k, *values) for k, values in frames)
+    else:
+        data = b"".join(kvh(k, unit[-1], 20 + k // 200, 0.005 * rate, f, us=5000) for k, (rate, f) in frames)
+    Path("unit.bin").write_bytes(data)
+    if unit != "kvh B":
+        done = driftlab("init", "unit.bin")
+        assert done.exit_code == 1
+        assert "fill in: the interval between samples: the frames have no clock" in done.output
+    done = driftlab("init", "unit.bin", *(() if unit == "kvh B" else ("--interval", "5 ms")))
+    assert done.exit_code == 0, done.output
+    got = samples(tmp_path / "unit.yaml")
+    np.testing.assert_allclose(got["gyro"], rates, rtol=1e-5)
+    np.testing.assert_allclose(np.diff(got.t), 0.005)
+    for command in (("check",), ("run", "--out", "out")):
+        assert driftlab(command[0], "unit.yaml", *command[1:]).exit_code == 0
 
 
 def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
