@@ -101,11 +101,8 @@ def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | N
         lines.append(f"  interval: {frames.interval}")
     if not frames.product:
         settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
-        if not channels.found:
-            settings.pop("interval", None)
-        elif "interval" in settings:
-            settings["interval"] = f"{settings['interval']:.9g} s"
-        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items())
+        known = (key for key in settings if key != "interval" or channels.found)
+        text = "".join(f", {key}: {json.dumps(settings[key])}" for key in known)
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
     lines += [SITE, *_filter(channels, map_name)]
     return replace(_starter(lines, asked), questions=questions)
