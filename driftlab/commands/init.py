@@ -61,6 +61,7 @@ def init(
     units: Mapping[str, str] | None = None,
     interval: str | None = None,
     decimal: str | None = None,
+    dates: str | None = None,
 ) -> FirstConfig:
     """Write a first config of a file, with every guess marked.
 
@@ -85,6 +86,8 @@ def init(
         Time between rows, e.g. '10 ms', where no column is a time.
     decimal : str, optional
         Decimal sign of a text: comma or point.
+    dates : str, optional
+        First part of dates as 03/04/2026: day or month.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def init(
         If nothing reads the file, it has no rows, or no channel that is known.
     """
     path, place = Path(file), None if out is None else Path(out)
-    answers = _answers(columns, units, interval, decimal)
+    answers = _answers(columns, units, interval, decimal, dates)
     if place is not None:
         check_file(place, COMMAND, f"--out {place}", "name another file")
     with of_all(path, "finding out what it holds"):
@@ -112,7 +115,11 @@ def init(
 
 
 def _answers(
-    columns: Mapping[str, str] | None, units: Mapping[str, str] | None, interval: str | None, decimal: str | None
+    columns: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    interval: str | None,
+    decimal: str | None,
+    dates: str | None,
 ) -> Answers:
     for option, given in (("--column", columns or {}), ("--unit", units or {})):
         for field, value in given.items():
@@ -124,7 +131,9 @@ def _answers(
         raise ConfigError(f"--interval {interval}: a positive time was expected; write e.g. 10 ms")
     if decimal is not None and decimal not in (*SIGNS, *SIGNS.values()):
         raise ConfigError(f"--decimal {decimal}: is no decimal sign; write comma or point")
-    return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal))
+    if dates is not None and dates not in reading.ORDERS:
+        raise ConfigError(f"--dates {dates}: is no part of a date that stands first; write day or month")
+    return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal), dates)
 
 
 def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
@@ -144,7 +153,7 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
-            columns = reading.columns_of(file, cls, known)
+            columns = reading.columns_of(file, cls, known, given.dates)
         except DataError as error:
             check_all()
             errors.append(error)
@@ -210,7 +219,7 @@ def _interview(arguments: dict[str, Any]) -> None:
     """Ask what the file does not say, one by one, and put the answers among the arguments."""
     asked, question, before = set[tuple[str, str]](), None, None
     while True:
-        given = {name: arguments.get(name) for name in ("columns", "units", "interval", "decimal")}
+        given = {name: arguments.get(name) for name in ("columns", "units", "interval", "decimal", "dates")}
         try:
             with of_all(arguments["file"], "finding out what it holds"):
                 questions = _guess(arguments["file"], "", _answers(**given)).questions

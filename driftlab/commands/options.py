@@ -35,8 +35,8 @@ FLAGS = {
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
     "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
-    "data": RECORDING, "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json", "fit_map": "MAP",
-    "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR", "pages": "NAME|GLOB|all",
+    "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json",
+    "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR", "pages": "NAME|GLOB|all",
     "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR", "run": "DIR", "scheduler": "ADDRESS",
     "seed": "N", "settings": "KEY=VALUE", "sigma": "SIGMA", "start": "TEMPERATURE", "train": RECORDING,
     "units": "CHANNEL=UNIT", "walk": "WALK", "web": "[PORT]", "without": "KIND",

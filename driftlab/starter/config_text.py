@@ -41,6 +41,7 @@ class OpenQuestion(NamedTuple):
     needed: bool = True
 
 
+DOUBTED = {"decimal": "the decimal sign", "dates": "what stands first in dates"}
 APART = OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 
 
@@ -62,7 +63,9 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     asked = [question.text for question in questions if question.needed]
     asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
-    lines += [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in columns.settings.items()]
+    guessed = {key: f"   # guess: {doubt.why}" for key, doubt in columns.doubts.items()}
+    settings = ((key, json.dumps(value, ensure_ascii=False)) for key, value in columns.settings.items())
+    lines += [f"  {key}: {text}{guessed.get(key, '')}" for key, text in settings]
     if "time" not in channels.found and "interval" not in columns.settings:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
@@ -122,6 +125,8 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
 
 
 def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
+    for option, doubt in columns.doubts.items():
+        yield OpenQuestion(option, "", f"{DOUBTED[option]}: {doubt.why}", doubt.ways, needed=False)
     if "time" not in channels.found and "interval" not in columns.settings:
         yield APART
     for field, channel in channels.found.items():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -27,7 +28,15 @@ WIDEST = 1024  # values of an array that is a channel
 GZIP = b"\x1f\x8b"
 HEAD = 4096  # bytes by which a format is recognised
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
+ORDERS = {"month": "%m/%d", "day": "%d/%m"}  # of dates between strokes
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
+
+
+class Doubt(NamedTuple):
+    """The reason why a setting is a guess, and the ways in which it can be said, the guess first."""
+
+    why: str
+    ways: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,7 @@ class FileColumns:
     values: dict[str, Array]  # the first rows, (N,) or (N, d), of those that are numbers
     units: dict[str, str]  # as the file gives them
     more: bool  # whether the file has more rows than were looked at
+    doubts: dict[str, Doubt] = field(default_factory=dict)  # by settings
 
 
 @dataclass(frozen=True)
@@ -84,9 +94,38 @@ def beginning(path: Path, most: int) -> bytes:
         return first
 
 
-def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any]) -> FileColumns:
-    """Read the first rows of every column; `known` are settings of the user. Raises DataError where it cannot."""
+def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any], first: str | None = None) -> FileColumns:
+    """Read the first rows of every column; `known` are settings of the user, `first` is what stands first in dates.
+
+    Dates as 03/04/2026 are read with the day or the month first, as all of these rows can be. Raises DataError where
+    the file cannot be read.
+    """
     settings = dict(cls.settings_for(path, known))
+    dates, doubts = settings.get("dates", {}), dict[str, Doubt]()
+    if settings.get("decimal") == "," and "decimal" not in known and _may_be_thousands(path):
+        doubts["decimal"] = Doubt("all commas have three digits behind them, as thousands have", ("comma", "point"))
+    usual = next((order for order, form in ORDERS.items() if any(form in text for text in dates.values())), None)
+    if usual is None:
+        return _columns(path, cls, settings, doubts)
+    orders = sorted(ORDERS, key=usual.__ne__) if first is None else [first]
+    read = {}
+    for order in orders:
+        forms = {name: re.sub("|".join(ORDERS.values()), ORDERS[order], form) for name, form in dates.items()}
+        read[order] = _columns(path, cls, {**settings, "dates": forms}, doubts)
+    good = [order for order in orders if dates.keys() <= read[order].values.keys()] or orders[:1]
+    if len(good) > 1:
+        doubts["dates"] = Doubt("whichever of day and month stands first, all dates can be read", tuple(good))
+    return read[good[0]]
+
+
+def _may_be_thousands(path: Path) -> bool:
+    """Return True where each number with a comma has three digits behind it, and no zero before it."""
+    text = beginning(path, TRIED).decode("latin-1")
+    groups = re.findall(r"(?<![\d.,])(\d+),(\d+)(?=\D)", text)
+    return all(len(last) == 3 and len(head) <= 3 and head[0] != "0" for head, last in groups)
+
+
+def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts: dict[str, Doubt]) -> FileColumns:
     # a log's rows are those of the first channel; which column is a time, the names will tell
     source = cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
     with source.open(path, Faults()) as table:
@@ -95,7 +134,7 @@ def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any]) -> F
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
-    return FileColumns(source.kind, noun, settings, names, values, units, more)
+    return FileColumns(source.kind, noun, settings, names, values, units, more, doubts)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:

@@ -4,6 +4,7 @@ import io
 import re
 import struct
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -439,3 +440,37 @@ def test_a_recording_over_midnight_whose_clock_has_no_day(tmp_path):
     text = written(tmp_path, content | {"Time": moments}).text
     assert "%H:%M:%S" in text
     np.testing.assert_allclose(np.diff(samples(tmp_path / "rec.yaml").t), 0.05, atol=1e-6)
+
+
+def day_of(day, month, **given):
+    """The line of `dates` that is written of a recording which begins on a day, and the day of its first time."""
+    content = table(("Time", "g? (rad/s)", "a? (m/s^2)", "T (degC)"))
+    moments = [f"{day(k)}/{month}/2026 {k // 3600:02}:{k // 60 % 60:02}:{k % 60:02}" for k in range(3600)]
+    pl.DataFrame({k: v[:3600] for k, v in content.items()} | {"Time": moments}).write_csv("rec.csv")
+    text = init("rec.csv", out="rec.yaml", **given).text
+    first = datetime.fromtimestamp(samples(Path("rec.yaml")).t[0], UTC)
+    return next(line for line in text.splitlines() if "dates:" in line), (first.day, first.month)
+
+
+def test_a_day_that_may_be_a_month_is_a_guess_until_it_is_said_or_a_later_row_tells(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line, _ = day_of(lambda k: "03", "04")
+    assert "# guess: whichever of day and month stands first" in line
+    for first, expected in (("day", (3, 4)), ("month", (4, 3))):
+        line, date = day_of(lambda k: "03", "04", dates=first)
+        assert "guess" not in line
+        assert date == expected
+    line, date = day_of(lambda k: "12" if k < 3000 else "13", "04")
+    assert "guess" not in line
+    assert date == (12, 4)
+    with pytest.raises(ConfigError, match="--dates year: is no part of a date that stands first; write day or month"):
+        init("rec.csv", dates="year")
+
+
+@pytest.mark.parametrize(("number", "guessed"), [("{},{:03}", True), ("0,{}{:03}", False), ("{},{:03}5", False)])
+def test_a_comma_before_three_digits_may_part_thousands(tmp_path, number, guessed):
+    rng = np.random.default_rng(5)
+    rows = [";".join(number.format(*rng.integers([1, 0], [9, 1000])) for _ in range(3)) for _ in range(500)]
+    (tmp_path / "rec.csv").write_text("t;gx;gy;gz\n" + "".join(f"{k};{row}\n" for k, row in enumerate(rows)))
+    assert ("# guess: all commas have three digits behind" in init(tmp_path / "rec.csv").text) == guessed
+    assert "# guess: all commas" not in init(tmp_path / "rec.csv", decimal="comma").text
