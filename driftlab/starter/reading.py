@@ -102,20 +102,38 @@ def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any], firs
     """
     settings = dict(cls.settings_for(path, known))
     dates, doubts = settings.get("dates", {}), dict[str, Doubt]()
-    if settings.get("decimal") == "," and "decimal" not in known and _may_be_thousands(path):
-        doubts["decimal"] = Doubt("all commas have three digits behind them, as thousands have", ("comma", "point"))
+    if "decimal" in (settings if "decimal" not in known else ()) and _may_be_thousands(path):
+        why = "all commas have three digits behind them; if they part thousands, take them out of the file"
+        doubts["decimal"] = Doubt(why, ("comma",))
     usual = next((order for order, form in ORDERS.items() if any(form in text for text in dates.values())), None)
-    if usual is None:
-        return _columns(path, cls, settings, doubts)
-    orders = sorted(ORDERS, key=usual.__ne__) if first is None else [first]
-    read = {}
-    for order in orders:
-        forms = {name: re.sub("|".join(ORDERS.values()), ORDERS[order], form) for name, form in dates.items()}
-        read[order] = _columns(path, cls, {**settings, "dates": forms}, doubts)
-    good = [order for order in orders if dates.keys() <= read[order].values.keys()] or orders[:1]
-    if len(good) > 1:
-        doubts["dates"] = Doubt("whichever of day and month stands first, all dates can be read", tuple(good))
-    return read[good[0]]
+    if usual is not None:
+        orders = sorted(ORDERS, key=usual.__ne__) if first is None else [first]
+        ways = {order: _dated(settings, order) for order in orders}
+        good = [order for order in orders if _reads(path, cls, ways[order])] or orders
+        settings = ways[good[0]]
+        if len(good) > 1:
+            doubts["dates"] = Doubt("whichever of day and month stands first, all dates can be read", tuple(good))
+    return _columns(path, cls, settings, doubts)
+
+
+def _dated(settings: Mapping[str, Any], order: str) -> dict[str, Any]:
+    """Return settings with the day or the month first in all dates."""
+    forms = settings["dates"].items()
+    return {**settings, "dates": {name: re.sub("|".join(ORDERS.values()), ORDERS[order], text) for name, text in forms}}
+
+
+def _reads(path: Path, cls: type[FileSource], settings: Mapping[str, Any]) -> bool:
+    """Return True if the dates of the first rows can be read."""
+    try:
+        _rows(_source(path, cls, settings), path, list(settings["dates"]))
+    except DataError:
+        return False
+    return True
+
+
+def _source(path: Path, cls: type[FileSource], settings: Mapping[str, Any]) -> FileSource:
+    # a log's rows are those of the first channel; which column is a time, the names will tell
+    return cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
 
 
 def _may_be_thousands(path: Path) -> bool:
@@ -126,8 +144,7 @@ def _may_be_thousands(path: Path) -> bool:
 
 
 def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts: dict[str, Doubt]) -> FileColumns:
-    # a log's rows are those of the first channel; which column is a time, the names will tell
-    source = cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
+    source = _source(path, cls, settings)
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}

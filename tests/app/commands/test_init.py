@@ -445,8 +445,8 @@ def test_a_recording_over_midnight_whose_clock_has_no_day(tmp_path):
 def day_of(day, month, **given):
     """The line of `dates` that is written of a recording which begins on a day, and the day of its first time."""
     content = table(("Time", "g? (rad/s)", "a? (m/s^2)", "T (degC)"))
-    moments = [f"{day(k)}/{month}/2026 {k // 3600:02}:{k // 60 % 60:02}:{k % 60:02}" for k in range(3600)]
-    pl.DataFrame({k: v[:3600] for k, v in content.items()} | {"Time": moments}).write_csv("rec.csv")
+    moments = [f"{day(k)}/{month}/2026 {k // 3600:02}:{k // 60 % 60:02}:{k % 60:02}" for k in range(900)]
+    pl.DataFrame({k: v[:900] for k, v in content.items()} | {"Time": moments}).write_csv("rec.csv")
     text = init("rec.csv", out="rec.yaml", **given).text
     first = datetime.fromtimestamp(samples(Path("rec.yaml")).t[0], UTC)
     return next(line for line in text.splitlines() if "dates:" in line), (first.day, first.month)
@@ -460,7 +460,7 @@ def test_a_day_that_may_be_a_month_is_a_guess_until_it_is_said_or_a_later_row_te
         line, date = day_of(lambda k: "03", "04", dates=first)
         assert "guess" not in line
         assert date == expected
-    line, date = day_of(lambda k: "12" if k < 3000 else "13", "04")
+    line, date = day_of(lambda k: "12" if k < 800 else "13", "04")
     assert "guess" not in line
     assert date == (12, 4)
     with pytest.raises(ConfigError, match="--dates year: is no part of a date that stands first; write day or month"):
