@@ -84,6 +84,7 @@ def test_importing_loads_no_plugin_and_no_heavy_library(module):
         "scipy",
         "h5py",
         "polars",
+        "prompt_toolkit",
         "onnx",
         "onnxruntime",
         "matplotlib",

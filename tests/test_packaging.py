@@ -12,7 +12,7 @@ from driftlab.config import load_config
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-CONDA = {"matplotlib": "matplotlib-base"}  # without a toolkit for windows
+CONDA = {"matplotlib": "matplotlib-base", "prompt-toolkit": "prompt_toolkit"}  # the first without a toolkit for windows
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import webbrowser
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import load, say, say_lines
+from driftlab.commands.console import load, say, say_lines, session
 from driftlab.commands.inputs import Place, config_of
 from driftlab.config import with_recording
 from driftlab.starter import config_text, reading
@@ -28,7 +29,7 @@ from fusion_core.units import to_si
 
 COMMAND = "init"  # by which its files are known
 SIGNS = {"comma": ",", "point": "."}
-ROUNDS = 4  # of questions, of which one may come of the answer to another
+SHOWN = 12  # answers at a time
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ class FirstConfig:
 
 
 class NoSensor(MissingChannel):
-    """There is no column that is known as a sensor's."""
+    """There is no column that is known as a sensor's; `question` is one that a person can answer."""
 
-    names: tuple[str, ...] = ()
+    question: OpenQuestion
 
 
 def init(
@@ -60,6 +61,7 @@ def init(
     units: Mapping[str, str] | None = None,
     interval: str | None = None,
     decimal: str | None = None,
+    dates: str | None = None,
 ) -> FirstConfig:
     """Write a first config of a file, with every guess marked.
 
@@ -84,6 +86,8 @@ def init(
         Time between rows, e.g. '10 ms', where no column is a time.
     decimal : str, optional
         Decimal sign of a text: comma or point.
+    dates : str, optional
+        First part of dates as 03/04/2026: day or month.
 
     Returns
     -------
@@ -98,7 +102,7 @@ def init(
         If nothing reads the file, it has no rows, or no channel that is known.
     """
     path, place = Path(file), None if out is None else Path(out)
-    answers = _answers(columns, units, interval, decimal)
+    answers = _answers(columns, units, interval, decimal, dates)
     if place is not None:
         check_file(place, COMMAND, f"--out {place}", "name another file")
     with of_all(path, "finding out what it holds"):
@@ -111,7 +115,11 @@ def init(
 
 
 def _answers(
-    columns: Mapping[str, str] | None, units: Mapping[str, str] | None, interval: str | None, decimal: str | None
+    columns: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    interval: str | None,
+    decimal: str | None,
+    dates: str | None,
 ) -> Answers:
     for option, given in (("--column", columns or {}), ("--unit", units or {})):
         for field, value in given.items():
@@ -123,7 +131,9 @@ def _answers(
         raise ConfigError(f"--interval {interval}: a positive time was expected; write e.g. 10 ms")
     if decimal is not None and decimal not in (*SIGNS, *SIGNS.values()):
         raise ConfigError(f"--decimal {decimal}: is no decimal sign; write comma or point")
-    return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal))
+    if dates is not None and dates not in reading.ORDERS:
+        raise ConfigError(f"--dates {dates}: is no part of a date that stands first; write day or month")
+    return Answers(columns or {}, units or {}, interval, SIGNS.get(decimal or "", decimal), dates)
 
 
 def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
@@ -143,7 +153,7 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
         if cls.product is not None:
             return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
-            columns = reading.columns_of(file, cls, known)
+            columns = reading.columns_of(file, cls, known, given.dates)
         except DataError as error:
             check_all()
             errors.append(error)
@@ -152,10 +162,9 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
     frames = None if file.is_dir() else reading.framing_of(file)
     if frames is None:
         raise reading.nothing_reads(file, errors)
-    samples = reading.samples_of(file, frames)
-    return config_text.of_frames(
-        path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
-    )
+    frames, samples = reading.samples_of(file, frames, given.interval)
+    channels = None if samples is None else channels_in(samples)
+    return config_text.of_frames(path, file.name, frames, channels, _map_name(file))
 
 
 def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answers) -> Starter:
@@ -178,7 +187,7 @@ def _no_sensor(file: Path, columns: reading.FileColumns) -> NoSensor:
         f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name those of its axes, "
         "as in --column gyro=wx,wy,wz"
     )
-    error.names = tuple(columns.values)
+    error.question = config_text.of_a_sensor(columns)
     return error
 
 
@@ -198,44 +207,90 @@ def _stem(file: Path) -> str:
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """Name the config as the file, in the working directory, where no other place is given; ask, in a terminal."""
     arguments = {"out": Path(f"{_stem(arguments['file'])}.yaml"), **arguments}
-    if sys.stdin.isatty() and sys.stdout.isatty() and not options["json"]:
-        _interview(arguments)
+    if sys.stdin.isatty() and sys.stdout.isatty() and not (options["json"] or session().quiet):
+        try:
+            _interview(arguments)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("nothing was written") from None
     return arguments
 
 
 def _interview(arguments: dict[str, Any]) -> None:
-    """Ask what the file does not say, and put the answers among the arguments."""
-    asked: set[tuple[str, str]] = set()
-    for _ in range(ROUNDS):
-        given = {name: arguments.get(name) for name in ("columns", "units", "interval", "decimal")}
+    """Ask what the file does not say, one by one, and put the answers among the arguments."""
+    asked, question, before = set[tuple[str, str]](), None, None
+    while True:
+        given = {name: arguments.get(name) for name in ("columns", "units", "interval", "decimal", "dates")}
         try:
             with of_all(arguments["file"], "finding out what it holds"):
                 questions = _guess(arguments["file"], "", _answers(**given)).questions
         except NoSensor as error:
-            text = "the columns of the gyro's axes, as in 2,3,4"
-            questions = (OpenQuestion("columns", "gyro", text, error.names, needed=False),)
-        new = [question for question in questions if (question.option, question.field) not in asked]
-        if not new:
+            questions = (error.question,)
+        except (ConfigError, UnitError) as error:
+            if question is None:
+                raise
+            say(f"{error}\n")  # and ask again
+            arguments[question.option], questions = before, (question,)
+            asked.discard((question.option, question.field))
+        question = next((q for q in questions if (q.option, q.field) not in asked), None)
+        if question is None:
             return
-        for question in new:
-            asked.add((question.option, question.field))
-            answer = _ask(question)
-            if answer and question.field:
-                arguments[question.option] = {**(arguments.get(question.option) or {}), question.field: answer}
-            elif answer:
-                arguments[question.option] = answer
+        asked.add((question.option, question.field))
+        before = arguments.get(question.option)
+        if answer := _ask(question):
+            arguments[question.option] = {**(before or {}), question.field: answer} if question.field else answer
 
 
 def _ask(question: OpenQuestion) -> str:
-    """Ask a person; return the answer, by its number or in words, the first where there is none."""
-    say(f"\n{question.text}\n")
-    say_lines(f"{k}) {choice}" for k, choice in enumerate(question.choices, 1))
-    several = question.option == "columns" or question.needed  # or nothing is guessed
-    sys.stdout.write("number or text: " if several else "number or text [1]: ")
+    """Ask a person; return the answer, by its number or in words: without one the guess, or nothing."""
+    from prompt_toolkit.utils import is_dumb_terminal
+
+    choices = (*question.choices, "") if question.needed else question.choices
+    rows = [f"{k}) {choice or 'leave it open'}" for k, choice in enumerate(choices, 1)]
+    usual = len(rows) - 1 if question.needed else 0
+    rows[0] += "" if question.needed else "   (the guess)"
+    answer = (_typed if is_dumb_terminal() else _picked)(line(question.text), list(map(line, rows)), usual)
+    known = {str(k): choice for k, choice in enumerate(choices, 1)}
+    words = (word.strip() for word in (answer.strip(", \n") or str(usual + 1)).split(","))
+    return ",".join(known.get(word, word) for word in words)
+
+
+def _typed(text: str, rows: list[str], usual: int) -> str:
+    """Return a line that a person types."""
+    signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))  # after that of polars, which goes on reading
+    say_lines(["", text, *rows])
+    sys.stdout.write(f"number or text [{usual + 1}]: ")
     sys.stdout.flush()
-    words = [word.strip() for word in sys.stdin.readline().split(",")]
-    known = {str(k): choice for k, choice in enumerate(question.choices, 1)}
-    return ",".join(known.get(word or ("" if several else "1"), word) for word in words)
+    return sys.stdin.readline()
+
+
+def _picked(text: str, rows: list[str], usual: int) -> str:
+    """Return a line that a person types, or the number of the row that the arrow keys lead to."""
+    from prompt_toolkit import prompt
+    from prompt_toolkit.formatted_text import AnyFormattedText
+    from prompt_toolkit.key_binding import KeyBindings, KeyPressEvent
+
+    keys, place = KeyBindings(), usual
+
+    def screen() -> AnyFormattedText:
+        begin = max(0, min(place - SHOWN // 2, len(rows) - SHOWN))
+        shown = list(enumerate(rows))[begin : begin + SHOWN]
+        marked = [("bold", f"> {row}\n") if k == place else ("", f"  {row}\n") for k, row in shown]
+        return [("", f"\n{text}\n"), *marked, ("", "arrow keys and Enter (Tab: several), a number, or text: ")]
+
+    @keys.add("up")
+    @keys.add("down")
+    def move(event: KeyPressEvent) -> None:
+        nonlocal place
+        place = (place + (1 if event.key_sequence[0].key == "down" else -1)) % len(rows)
+
+    @keys.add("tab")
+    def take(event: KeyPressEvent) -> None:
+        event.current_buffer.insert_text(f"{place + 1},")
+
+    try:
+        return prompt(screen, key_bindings=keys) or str(place + 1)
+    except EOFError:
+        return ""
 
 
 def content_of(result: FirstConfig, given: Mapping[str, Any]) -> Any:

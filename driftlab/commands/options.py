@@ -35,12 +35,12 @@ FLAGS = {
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
     "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
-    "data": RECORDING, "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json", "fit_map": "MAP",
-    "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR", "pages": "NAME|GLOB|all",
-    "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR", "rules": "western-electric|nelson",
-    "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE", "sigma": "SIGMA",
-    "start": "TEMPERATURE", "train": RECORDING,
-    "units": "CHANNEL=UNIT", "walk": "WALK", "web": "[PORT]", "without": "KIND",
+    "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json",
+    "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR",
+    "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
+    "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
+    "sigma": "SIGMA", "start": "TEMPERATURE", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
+    "web": "[PORT]", "without": "KIND",
 }  # fmt: skip
 PAIRS = {
     "settings": ("--set", "KEY=VALUE", "'step=0.5 K'"),

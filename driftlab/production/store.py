@@ -133,10 +133,15 @@ class FleetFolder:
         if all(as_written) and all(one.get("identification") == content["identification"] for one in before):
             return
         for name, own in zip(files, as_written, strict=True):
-            if os.path.lexists(place / name) and not own:
+            if own:
+                remove(place / name)
+            elif os.path.lexists(place / name):
                 os.rename(place / name, free(place / name))
+        self.note(
+            record.model_copy(update={"written": record.written | _digests(files)})
+        )  # known before they are there
+        for name in files:
             self.write(f"{UNITS}/{unit}/{name}", files[name])
-        self.note(record.model_copy(update={"written": record.written | _digests(files)}))
 
     def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
         """Return a new folder beside those of the units, with files in it."""

@@ -51,12 +51,13 @@ class Channels:
 
 @dataclass(frozen=True)
 class Answers:
-    """The choices of the user: columns and units by channel, the interval between rows, the decimal sign."""
+    """The choices of the user: columns and units by channel, the interval of rows, decimal sign, order of dates."""
 
     columns: Mapping[str, str]
     units: Mapping[str, str]
     interval: str | None = None
     decimal: str | None = None
+    dates: str | None = None
 
 
 def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]) -> Channels:

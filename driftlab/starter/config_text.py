@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise
-from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
+from driftlab.starter.columns import SENSORS, Channels, GuessedChannel, of_accel
 from driftlab.starter.names import Name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
@@ -28,6 +28,7 @@ UNITS_OF = {
     "temperature": ("degC", "degF", "K"),
 }  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
+AXES = tuple(str.maketrans("xX", pair) for pair in ("xX", "yY", "zZ"))
 
 
 class OpenQuestion(NamedTuple):
@@ -38,6 +39,10 @@ class OpenQuestion(NamedTuple):
     text: str
     choices: tuple[str, ...]
     needed: bool = True
+
+
+DOUBTED = {"decimal": "the decimal sign", "dates": "what stands first in dates"}
+APART = OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
 
 
 @dataclass(frozen=True)
@@ -53,10 +58,14 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
     questions = tuple(_questions(columns, channels))
+    if held is not None and not (question := of_a_sensor(columns)).needed:
+        questions = (question, *questions)
     asked = [question.text for question in questions if question.needed]
     asked += _noises(channels) if held is None else ()
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
-    lines += [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in columns.settings.items()]
+    guessed = {key: f"   # guess: {doubt.why}" for key, doubt in columns.doubts.items()}
+    settings = ((key, json.dumps(value, ensure_ascii=False)) for key, value in columns.settings.items())
+    lines += [f"  {key}: {text}{guessed.get(key, '')}" for key, text in settings]
     if "time" not in channels.found and "interval" not in columns.settings:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
@@ -85,18 +94,21 @@ def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | N
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
     lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
     lines += ["source:", f"  kind: {frames.source}", f"  path: {yaml_text(path)}"]
-    asked = ["the interval between samples: the frames have no clock"]
+    asked, questions = [] if channels is None else list(_noises(channels)), tuple[OpenQuestion, ...]()
     if channels is None:
+        questions = (APART._replace(text="the interval between samples: the frames have no clock"),)
+        asked = [questions[0].text]
         lines.append("  # interval: 10 ms       # fill in: between samples, as the device is set")
         channels = Channels({}, {}, (), None)
-    else:
-        asked = list(_noises(channels))
+    elif frames.interval is not None:
+        lines.append(f"  interval: {frames.interval}")
     if not frames.product:
         settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
-        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
+        known = (key for key in settings if key != "interval" or channels.found)
+        text = "".join(f", {key}: {json.dumps(settings[key])}" for key in known)
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
     lines += [SITE, *_filter(channels, map_name)]
-    return _starter(lines, asked)
+    return replace(_starter(lines, asked), questions=questions)
 
 
 def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
@@ -113,6 +125,10 @@ def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]
 
 
 def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestion]:
+    for option, doubt in columns.doubts.items():
+        yield OpenQuestion(option, "", f"{DOUBTED[option]}: {doubt.why}", doubt.ways, needed=False)
+    if "time" not in channels.found and "interval" not in columns.settings:
+        yield APART
     for field, channel in channels.found.items():
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
@@ -120,8 +136,16 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
             yield OpenQuestion(
                 "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
             )
-    if "time" not in channels.found and "interval" not in columns.settings:
-        yield OpenQuestion("interval", "", "the interval between rows: no column is a time", ("10 ms", "20 ms", "1 s"))
+
+
+def of_a_sensor(columns: FileColumns) -> OpenQuestion:
+    """Return the question for the gyro's columns; three that differ by the axis alone are the guess."""
+    known = columns.values
+    triads = [triad for path in known if len(triad := {path.translate(axis): 0 for axis in AXES}.keys() & known) == 3]
+    triads.sort(key=lambda triad: of_accel(np.column_stack([known[path] for path in sorted(triad)])).unit is not None)
+    choices = (*[",".join(sorted(triad)) for triad in triads[:1]], *known)
+    text = "the columns of the gyro's axes: no name says which they are"
+    return OpenQuestion("columns", "gyro", text, choices, needed=not triads)
 
 
 def _noises(channels: Channels) -> Iterator[str]:

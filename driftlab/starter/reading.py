@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -19,13 +21,22 @@ from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
 from fusion_core.host.registry import registry
+from fusion_core.units import to_si
 
 ROWS = 200_000  # that are looked at
 WIDEST = 1024  # values of an array that is a channel
 GZIP = b"\x1f\x8b"
 HEAD = 4096  # bytes by which a format is recognised
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
+ORDERS = {"month": "%m/%d", "day": "%d/%m"}  # of dates between strokes
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
+
+
+class Doubt(NamedTuple):
+    """The reason why a setting is a guess, and the ways in which it can be said, the guess first."""
+
+    why: str
+    ways: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,7 @@ class FileColumns:
     values: dict[str, Array]  # the first rows, (N,) or (N, d), of those that are numbers
     units: dict[str, str]  # as the file gives them
     more: bool  # whether the file has more rows than were looked at
+    doubts: dict[str, Doubt] = field(default_factory=dict)  # by settings
 
 
 @dataclass(frozen=True)
@@ -49,6 +61,7 @@ class FoundFraming:
     product: str | None
     framing: Framing
     count: int
+    interval: str | None = None  # between frames without a clock
 
 
 def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
@@ -81,18 +94,64 @@ def beginning(path: Path, most: int) -> bytes:
         return first
 
 
-def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any]) -> FileColumns:
-    """Read the first rows of every column; `known` are settings of the user. Raises DataError where it cannot."""
+def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any], first: str | None = None) -> FileColumns:
+    """Read the first rows of every column; `known` are settings of the user, `first` is what stands first in dates.
+
+    Dates as 03/04/2026 are read with the day or the month first, as all of these rows can be. Raises DataError where
+    the file cannot be read.
+    """
     settings = dict(cls.settings_for(path, known))
+    dates, doubts = settings.get("dates", {}), dict[str, Doubt]()
+    if "decimal" in (settings if "decimal" not in known else ()) and _may_be_thousands(path):
+        why = "all commas have three digits behind them; if they part thousands, take them out of the file"
+        doubts["decimal"] = Doubt(why, ("comma",))
+    usual = next((order for order, form in ORDERS.items() if any(form in text for text in dates.values())), None)
+    if usual is not None:
+        orders = sorted(ORDERS, key=usual.__ne__) if first is None else [first]
+        ways = {order: _dated(settings, order) for order in orders}
+        good = [order for order in orders if _reads(path, cls, ways[order])] or orders
+        settings = ways[good[0]]
+        if len(good) > 1:
+            doubts["dates"] = Doubt("whichever of day and month stands first, all dates can be read", tuple(good))
+    return _columns(path, cls, settings, doubts)
+
+
+def _dated(settings: Mapping[str, Any], order: str) -> dict[str, Any]:
+    """Return settings with the day or the month first in all dates."""
+    forms = settings["dates"].items()
+    return {**settings, "dates": {name: re.sub("|".join(ORDERS.values()), ORDERS[order], text) for name, text in forms}}
+
+
+def _reads(path: Path, cls: type[FileSource], settings: Mapping[str, Any]) -> bool:
+    """Return True if the dates of the first rows can be read."""
+    try:
+        _rows(_source(path, cls, settings), path, list(settings["dates"]))
+    except DataError:
+        return False
+    return True
+
+
+def _source(path: Path, cls: type[FileSource], settings: Mapping[str, Any]) -> FileSource:
     # a log's rows are those of the first channel; which column is a time, the names will tell
-    source = cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
+    return cls.model_validate({"interval": 1.0, **settings, "path": str(path), "channels": {"rows": {"path": "?"}}})
+
+
+def _may_be_thousands(path: Path) -> bool:
+    """Return True where each number with a comma has three digits behind it, and no zero before it."""
+    text = beginning(path, TRIED).decode("latin-1")
+    groups = re.findall(r"(?<![\d.,])(\d+),(\d+)(?=\D)", text)
+    return all(len(last) == 3 and len(head) <= 3 and head[0] != "0" for head, last in groups)
+
+
+def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts: dict[str, Doubt]) -> FileColumns:
+    source = _source(path, cls, settings)
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
-    return FileColumns(source.kind, noun, settings, names, values, units, more)
+    return FileColumns(source.kind, noun, settings, names, values, units, more, doubts)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
@@ -144,14 +203,24 @@ def framing_of(path: Path) -> FoundFraming | None:
     return best if kind and best is not None and best.count >= FRAMES else None
 
 
-def samples_of(path: Path, frames: FoundFraming) -> Chunk | None:
-    """Return the first samples in SI; None where the frames have no clock."""
-    settings = {"kind": frames.source, "path": str(path), "framing": frames.framing}
-    try:
-        source = _file_sources()[frames.source].model_validate(settings)
-    except ValidationError:
-        return None
-    return next(source.chunks(ROWS, Faults()), None)
+def samples_of(path: Path, frames: FoundFraming, interval: str | None) -> tuple[FoundFraming, Chunk | None]:
+    """Return the framing with its interval, and the first samples in SI; None without clock and interval.
+
+    A framing whose values are those of an interval, as angles are, has that of the clock, or the one that is said.
+    """
+    timed, framing = {} if interval is None else {"interval": interval}, frames.framing
+    for known in ({}, timed):
+        settings = {"kind": frames.source, "path": str(path), "framing": framing, **known}
+        with suppress(ValidationError):
+            source = _file_sources()[frames.source].model_validate(settings)
+            samples = next(source.chunks(ROWS, Faults()), None)
+            if getattr(framing, "interval", None) is not None and samples is not None:
+                step = float(np.median(np.diff(samples.t))) if interval is None else to_si(interval, "s")
+                framing = framing.model_validate({**framing.model_dump(), "interval": f"{step:.9g} s"})
+                source = source.model_validate({**settings, "framing": framing})
+                samples = next(source.chunks(ROWS, Faults()), None)
+            return replace(frames, framing=framing, interval=interval if known else None), samples
+    return frames, None
 
 
 def _count(framing: Framing, data: bytes) -> int:

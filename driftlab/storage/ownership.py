@@ -1,8 +1,8 @@
 """Ownership of files: each that driftlab wrote is known by its SHA-256, which one that was edited since has not.
 
 A file that stands alone (a map, its page, a simulated recording) says which command wrote it, and its SHA-256, made
-with zeros in that place. The first file of a folder has under `written` the SHA-256 of each that was written with it,
-and its own, made likewise.
+with zeros in that place; of one without a place for it, the bytes of a device, a file of JSON beside it does. The first
+file of a folder has under `written` the SHA-256 of each that was written with it, and its own, made likewise.
 """
 
 from __future__ import annotations
@@ -58,12 +58,21 @@ def why_not_own(path: Path, command: str) -> str:
         return ""
     regular = path.is_file() and not path.is_symlink()
     _, by, said, found = _seal(path) if regular else (None, "", b"", b"")
+    note = beside(path)
+    if by != command and regular and document(note) and not why_not_own(note, command):
+        by, ours = command, [is_as(path, digest) for digest in written(note).values()]
+        said, found = (b"", b"") if any(ours) else (b"", b"another")
     if by != command:
         return (
             f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote, as an earlier version may "
             "have kept none"
         )
     return "" if said == found else f"was changed since `driftlab {command}` wrote it"
+
+
+def beside(path: Path) -> Path:
+    """Return the file with the SHA-256 of one that has no place for it."""
+    return path.with_name(f"{path.name}.json")
 
 
 def put(new: Path, path: Path, command: str, subject: str) -> None:

@@ -10,6 +10,7 @@ name only when it is whole.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import time
@@ -25,16 +26,18 @@ from zipfile import ZipFile
 import numpy as np
 
 from driftlab import __version__
+from driftlab.storage import ownership
 from driftlab.storage.folders import Lock, check_writable, refusals
 from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading
-from driftlab.storage.ownership import check_own, put, seal, seal_of
+from driftlab.storage.map_file import write_text
+from driftlab.storage.ownership import check_own, digest, put, seal, seal_of
 from driftlab.storage.system import sync
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Framing, Source, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile
-from fusion_core.escaping import comment, yaml_text
+from fusion_core.escaping import comment, json_text, yaml_text
 from fusion_core.host.registry import registry
 
 if TYPE_CHECKING:
@@ -246,12 +249,18 @@ def recording_file(out: Path, settings: str, framing: Framing | None = None) -> 
         If the disk is full, or the like.
     """
     begin = _format_of(out) if framing is None else partial(FramingWriter, framing=framing)
-    check_own(out, "simulate", f"--out {out}", "name another file")
-    with _locked_partial(Path(os.path.realpath(out)), out) as unfinished:
+    place = Path(os.path.realpath(out))
+    for path in (out, *([] if framing is None else [ownership.beside(place)])):
+        check_own(path, "simulate", f"--out {path}", "name another file")
+    with _locked_partial(place, out) as unfinished:
         writer = begin(unfinished, settings)
         with closing(writer):  # also of a program that stops: rows that were written are whole
             yield writer
         seal(unfinished)
+        if framing is not None:  # and before the file has its place: whenever this ends, what is there is known
+            known = {place.name: digest(unfinished), "before": digest(place)}
+            note = json_text({"settings": json.loads(settings), "written": known}, 2)
+            write_text(ownership.beside(place), f"{note}\n", "simulate")
         put(unfinished, out, "simulate", f"--out {out}")
 
 

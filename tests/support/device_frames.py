@@ -1,4 +1,4 @@
-"""Frames of VectorNav and Xsens units, packed byte by byte: nothing of the decoders is used."""
+"""Frames of VectorNav, Xsens and KVH units, packed byte by byte: nothing of the decoders is used."""
 
 import struct
 
@@ -37,6 +37,19 @@ def one(k, temperature=None, number=">3f", more=0, gyro=None):
         (0x4020 | wide, struct.pack(number, 0, 0, 9.8)),
         (0x8020 | wide, struct.pack(number, *(gyro if gyro is not None else (k, 0, -k)))),
     )
+
+
+def kvh(k, message, temperature=31, angle=(1e-5, -2e-5, 3e-5), accel=(0.0, 0.0, 1.0), us=10_000):
+    head = bytes.fromhex("FE81FF55" if message == "A" else "FE81FF56")
+    body = head + struct.pack(">6f", *angle, *accel)
+    body += struct.pack(">I", k * us % 2**32) if message == "B" else b""
+    body += struct.pack(">BBh", 0x77 if k != 3 else 0x76, k % 128, temperature)
+    crc = 0xFFFFFFFF
+    for byte in body:
+        crc ^= byte << 24
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x04C11DB7 if crc & 1 << 31 else 0)) & 0xFFFFFFFF
+    return body + struct.pack(">I", crc)
 
 
 def source_of(name, source):

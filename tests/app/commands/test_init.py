@@ -2,7 +2,9 @@
 
 import io
 import re
+import struct
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -13,9 +15,10 @@ from bags import FIELDS, unit
 from bags import write as bag
 from bench import FRAMING, frame
 from dataflash_writer import write_log
-from device_frames import one, vectornav
+from device_frames import kvh, one, vectornav, xsens
 from scipy.io import savemat
 from typer.testing import CliRunner
+from typists import at_a_terminal
 from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
@@ -226,6 +229,37 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
         init(tmp_path / "unknown.bin", out=tmp_path / "unknown.yaml")
 
 
+def without_a_clock(k, gyro, g):
+    """Message of Xsens, with the packet counter alone."""
+    three = [(0x4020, struct.pack(">3f", *9.8 * g)), (0x8020, struct.pack(">3f", *gyro))]
+    return xsens((0x1020, struct.pack(">H", k)), (0x0810, struct.pack(">f", 20 + k / 100)), *three)
+
+
+@pytest.mark.parametrize("unit", ["kvh A", "kvh B", "xsens"])
+def test_bytes_without_a_clock_need_an_interval_which_is_then_in_the_config(tmp_path, monkeypatch, unit):
+    """Angles become rates by it: those of KVH with a clock are 5 ms apart by themselves."""
+    monkeypatch.chdir(tmp_path)
+    rates = 0.01 + 1e-4 * np.random.default_rng(3).standard_normal((15_000, 3))
+    g = [0, 0, 1] + 1e-3 * np.random.default_rng(4).standard_normal((15_000, 3))
+    frames = enumerate(zip(rates, g, strict=True))
+    if unit == "xsens":
+        data = b"".join(without_a_clock(k, *values) for k, values in frames)
+    else:
+        data = b"".join(kvh(k, unit[-1], 20 + k // 200, 0.005 * rate, f, us=5000) for k, (rate, f) in frames)
+    Path("unit.bin").write_bytes(data)
+    if unit != "kvh B":
+        done = driftlab("init", "unit.bin")
+        assert done.exit_code == 1
+        assert "fill in: the interval between samples: the frames have no clock" in done.output
+    done = driftlab("init", "unit.bin", *(() if unit == "kvh B" else ("--interval", "5 ms")))
+    assert done.exit_code == 0, done.output
+    got = samples(tmp_path / "unit.yaml")
+    np.testing.assert_allclose(got["gyro"], rates, rtol=1e-5)
+    np.testing.assert_allclose(np.diff(got.t), 0.005)
+    for command in (("check",), ("run", "--out", "out")):
+        assert driftlab(command[0], "unit.yaml", *command[1:]).exit_code == 0
+
+
 def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
     with pytest.raises(
         MissingChannel, match=r"no column is called like a gyro; it has one, b, c; name those of its axes, as in --col"
@@ -319,26 +353,57 @@ def test_what_is_no_recording_writes_nothing(tmp_path, content, message):
     assert not (tmp_path / "rec.yaml").exists()
 
 
-class Terminal(io.StringIO):
+ENTER, DOWN, STOP = "\r", "\x1b[B", "\x03"
+
+
+def answered(tmp_path, *keys, **environment):
+    """Status of `init` of a file that says too little, and what it showed to a person who answers with these keys."""
+    content = table(("when", "q?", "b?", "temperature"), "deg/s", "g")
+    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
+    asked = [("]:" if environment.get("TERM") == "dumb" else "text:", key) for key in keys]
+    return at_a_terminal("init", "rec.csv", cwd=tmp_path, answers=asked, **environment)
+
+
+def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path):
+    """Arrow keys lead to the answers, the guess first; a number, or text, is an answer too."""
+    _, shown = answered(tmp_path, ENTER, "5" + ENTER, "50 ms" + ENTER, DOWN + ENTER, ENTER)
+    assert "the columns of the gyro's axes: no name says which they are" in shown
+    assert "> 1) qx,qy,qz   (the guess)" in shown
+    assert re.search(r"the unit of gyro \(mean .*: rad/s or deg/s\?\)", shown)
+    assert re.search(r"the unit of temperature \(15.2 to 34.8\).*> 1\) degC   \(the guess\)", shown, re.DOTALL)
+    assert "'5' has no unit" in shown  # and is asked again
+    source = load_config(tmp_path / "rec.yaml").source
+    assert source.channels["gyro"].paths == ("qx", "qy", "qz")
+    assert source.channels["gyro"].unit == "deg/s"  # the first, below the last one
+    assert source.interval == 0.05
+
+
+class Lines(io.StringIO):
     def isatty(self):
         return True
 
 
-def test_in_a_terminal_it_asks_what_it_cannot_know(tmp_path, monkeypatch):
+def test_in_a_dumb_terminal_answers_are_lines(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    content = table(("when", "?", "q?", "case"), "deg/s", "g")
-    pl.DataFrame(content).write_csv(tmp_path / "rec.csv")
-    screen = Terminal()
-    monkeypatch.setattr(sys, "stdout", screen)
-    monkeypatch.setattr(sys, "stdin", Terminal("2,3,4\n1\n50 ms\n1\n"))
-    arguments = init_command.arguments_of({"file": tmp_path / "rec.csv"}, {"json": False})
-    asked = screen.getvalue()
-    assert "the columns of the gyro's axes" in asked
-    assert "2) x" in asked
-    assert arguments["columns"] == {"gyro": "x,y,z"}
+    monkeypatch.setenv("TERM", "dumb")
+    pl.DataFrame(table(("when", "q?", "b?", "case"), "deg/s", "g")).write_csv("rec.csv")
+    monkeypatch.setattr(sys, "stdout", screen := Lines())
+    monkeypatch.setattr(sys, "stdin", Lines("3,4,5\n50 ms\n1\n"))
+    arguments = init_command.arguments_of({"file": Path("rec.csv")}, {"json": False})
+    assert "1) qx,qy,qz   (the guess)" in screen.getvalue()
+    assert arguments["columns"] == {"gyro": "qx,qy,qz"}
     assert arguments["interval"] == "50 ms"
-    assert arguments["units"]["gyro"] in ("deg/s", "rad/s")
+    assert arguments["units"]["gyro"] == "deg/s"
     assert arguments["out"] == Path("rec.yaml")
+
+
+@pytest.mark.parametrize("kind", ["xterm", "dumb"])
+def test_an_interview_that_is_stopped_ends_in_one_line(tmp_path, kind):
+    status, shown = answered(tmp_path, STOP, TERM=kind)
+    assert status == 130
+    assert shown.rstrip().endswith("driftlab: interrupted; nothing was written")
+    assert "Traceback" not in shown
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.csv"]
 
 
 def test_go_fits_the_map_at_once(tmp_path, monkeypatch):
@@ -375,3 +440,37 @@ def test_a_recording_over_midnight_whose_clock_has_no_day(tmp_path):
     text = written(tmp_path, content | {"Time": moments}).text
     assert "%H:%M:%S" in text
     np.testing.assert_allclose(np.diff(samples(tmp_path / "rec.yaml").t), 0.05, atol=1e-6)
+
+
+def day_of(day, month, **given):
+    """The line of `dates` that is written of a recording which begins on a day, and the day of its first time."""
+    content = table(("Time", "g? (rad/s)", "a? (m/s^2)", "T (degC)"))
+    moments = [f"{day(k)}/{month}/2026 {k // 3600:02}:{k // 60 % 60:02}:{k % 60:02}" for k in range(900)]
+    pl.DataFrame({k: v[:900] for k, v in content.items()} | {"Time": moments}).write_csv("rec.csv")
+    text = init("rec.csv", out="rec.yaml", **given).text
+    first = datetime.fromtimestamp(samples(Path("rec.yaml")).t[0], UTC)
+    return next(line for line in text.splitlines() if "dates:" in line), (first.day, first.month)
+
+
+def test_a_day_that_may_be_a_month_is_a_guess_until_it_is_said_or_a_later_row_tells(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line, _ = day_of(lambda k: "03", "04")
+    assert "# guess: whichever of day and month stands first" in line
+    for first, expected in (("day", (3, 4)), ("month", (4, 3))):
+        line, date = day_of(lambda k: "03", "04", dates=first)
+        assert "guess" not in line
+        assert date == expected
+    line, date = day_of(lambda k: "12" if k < 800 else "13", "04")
+    assert "guess" not in line
+    assert date == (12, 4)
+    with pytest.raises(ConfigError, match="--dates year: is no part of a date that stands first; write day or month"):
+        init("rec.csv", dates="year")
+
+
+@pytest.mark.parametrize(("number", "guessed"), [("{},{:03}", True), ("0,{}{:03}", False), ("{},{:03}5", False)])
+def test_a_comma_before_three_digits_may_part_thousands(tmp_path, number, guessed):
+    rng = np.random.default_rng(5)
+    rows = [";".join(number.format(*rng.integers([1, 0], [9, 1000])) for _ in range(3)) for _ in range(500)]
+    (tmp_path / "rec.csv").write_text("t;gx;gy;gz\n" + "".join(f"{k};{row}\n" for k, row in enumerate(rows)))
+    assert ("# guess: all commas have three digits behind" in init(tmp_path / "rec.csv").text) == guessed
+    assert "# guess: all commas" not in init(tmp_path / "rec.csv", decimal="comma").text

@@ -116,6 +116,35 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     assert out.read_text() == "time,gx\n0,1\n"
 
 
+def test_bytes_of_a_device_are_replaced_and_those_of_others_are_not(config, tmp_path, monkeypatch):
+    """They have no place for a SHA-256: it is in a file beside them, and right whenever the command is stopped."""
+    out, put = tmp_path / "unit.dat", recorder.put
+    simulate(config, out=out, framing="xsens_mtdata2")
+    first = out.read_bytes()
+    assert first[:3] == bytes.fromhex("FA FF 36")
+    simulate(config, out=out, framing="xsens_mtdata2", seed=9)
+    second = out.read_bytes()
+    assert second != first
+
+    def stopped(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recorder, "put", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(config, out=out, framing="xsens_mtdata2")
+    monkeypatch.setattr(recorder, "put", put)
+    assert out.read_bytes() == second
+    (tmp_path / "unit.dat.partial").unlink()
+    simulate(config, out=out, framing="xsens_mtdata2")
+    assert out.read_bytes() == first
+    out.write_bytes(first[:-1])
+    with pytest.raises(ConfigError, match=r"unit\.dat: was changed since `driftlab simulate` wrote it; move it away"):
+        simulate(config, out=out, framing="xsens_mtdata2")
+    (tmp_path / "unit.dat.json").write_text("{}")
+    with pytest.raises(ConfigError, match=r"unit\.dat.*has no SHA-256 by which `driftlab simulate` knows what"):
+        simulate(config, out=out, framing="xsens_mtdata2")
+
+
 def test_a_simulated_file_of_hdf5_that_was_edited_stays(config, tmp_path):
     simulate(config, out=tmp_path / "edited.h5")
     with h5py.File(tmp_path / "edited.h5", "r+") as file:

@@ -122,6 +122,40 @@ def test_what_others_call_as_a_folder_of_pages_stays(tmp_path):
     assert left == {"page.before-1": "mine", "explained-page/mine.txt": "mine"}
 
 
+@pytest.mark.parametrize("step", range(5))
+def test_a_certificate_that_a_kill_stops_is_replaced_by_the_next(tmp_path, monkeypatch, step):
+    def sheet(issue):
+        return {"identification": issue}, {"certificate.html": issue.encode(), "certificate.json": b'{"%d": 1}' % step}
+
+    class Killed(BaseException):
+        pass
+
+    left = [step]
+
+    def killed(call):
+        def counted(*args):
+            if not left[0]:
+                raise Killed
+            left[0] -= 1
+            return call(*args)
+
+        return counted
+
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
+        folder.put_certificate("6", *sheet("a"))
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "replace", killed(os.replace))
+            patched.setattr(store, "remove", killed(remove))
+            with pytest.raises(Killed):
+                folder.put_certificate("6", *sheet("b"))
+    with fleet_folder(tmp_path / "fleet") as folder:
+        folder.put_certificate("6", *sheet("c"))
+        names = {path.name: path for path in folder.unit("6").iterdir()}
+        assert names.keys() == {"unit.json", "certificate.html", "certificate.json"}
+        assert names["certificate.html"].read_text() == "c"
+
+
 def test_a_report_that_was_edited_while_its_fleet_was_not_complete_is_put_aside(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         complete(folder, b"a")

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pytest
 from bench import FRAMING, SIZE, SYNC, frame
+from device_frames import kvh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -186,19 +187,6 @@ def test_types_scales_and_constants():
     np.testing.assert_allclose(channels["gyro"], np.deg2rad([[0.5, -1.0, 0.0]] * 2))
     np.testing.assert_allclose(channels["temperature"], [30.65, 30.65])
     np.testing.assert_allclose(channels["voltage"], [5.0, 5.0])
-
-
-def kvh(k, message, temperature=31):
-    head = bytes.fromhex("FE81FF55" if message == "A" else "FE81FF56")
-    body = head + struct.pack(">6f", 1e-5, -2e-5, 3e-5, 0.0, 0.0, 1.0)
-    body += struct.pack(">I", k * 10_000 % 2**32) if message == "B" else b""
-    body += struct.pack(">BBh", 0x77 if k != 3 else 0x76, k % 128, temperature)
-    crc = 0xFFFFFFFF
-    for byte in body:
-        crc ^= byte << 24
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x04C11DB7 if crc & 1 << 31 else 0)) & 0xFFFFFFFF
-    return body + struct.pack(">I", crc)
 
 
 @pytest.mark.parametrize("message", ["A", "B"])

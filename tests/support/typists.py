@@ -1,0 +1,54 @@
+"""A person at a terminal, who reads what a program writes there and types."""
+
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+
+SECONDS = 20
+
+
+def at_a_terminal(*args, cwd, answers=(), **environment):
+    """Run a command on a terminal; once it shows a text of `answers`, type the keys; return status and what it wrote.
+
+    A command that waits for more is stopped, and an error.
+    """
+    ours, theirs = pty.openpty()
+    known = {"TERM": "xterm", "COLUMNS": "100", "LINES": "40", "PROMPT_TOOLKIT_NO_CPR": "1"}
+    env = {**os.environ, **known, **environment}
+    running = subprocess.Popen(
+        [sys.executable, "-m", "driftlab", *map(str, args)],
+        stdout=theirs, stderr=theirs, stdin=theirs, env=env, cwd=cwd, start_new_session=True,
+        preexec_fn=_take_the_terminal,
+    )  # fmt: skip
+    os.close(theirs)
+    shown, passed, left, until = b"", 0, list(answers), time.monotonic() + SECONDS
+    while time.monotonic() < until:
+        if not select.select([ours], [], [], 1.0)[0]:
+            continue
+        try:
+            shown += os.read(ours, 4096)
+        except OSError:  # the other end is closed
+            break
+        while left and (at := shown.find(left[0][0].encode(), passed)) >= 0:
+            passed = at + len(left[0][0].encode())
+            os.write(ours, left.pop(0)[1].encode())
+    os.close(ours)
+    text = shown.decode(errors="replace")
+    try:
+        return running.wait(timeout=5), text
+    except subprocess.TimeoutExpired:
+        running.kill()
+        running.wait()
+        raise AssertionError(f"waits for more; shown is {text}") from None
+
+
+def _take_the_terminal():
+    import fcntl
+    import termios
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a shell has its background jobs ignore
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
