@@ -21,7 +21,7 @@ Measured with 12 states in six groups, 6 components (`benchmarks/methods.py`). `
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial, update_wrapper
+from functools import cache, cached_property, partial, update_wrapper
 from threading import RLock
 from typing import Any
 
@@ -42,7 +42,10 @@ class Compiled:
 
         # nobody asks for the address of a function: without it a sixth less is compiled
         options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
-        return njit(self.py_func, **options)
+        function = njit(self.py_func, **options)
+        if hasattr(function, "_cache"):  # not where NUMBA_DISABLE_JIT is set
+            function._cache = _kept()(self.py_func)
+        return function
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Call the function; it is compiled first where it has not been for such arguments."""
@@ -52,6 +55,24 @@ class Compiled:
                 own = [(name, value) for name, value in names.items() if isinstance(value, Compiled)]
                 names.update({name: value.dispatcher for name, value in own if value.py_func.__globals__ is names})
         return self.dispatcher(*given, **named)
+
+
+@cache
+def _kept() -> Any:
+    """Return numba's cache of a function, by which what was compiled is loaded without all that can be compiled.
+
+    Where something is compiled, numba loads that itself; where all is kept, half of numba's time is not spent.
+    """
+    from numba.core.caching import FunctionCache
+    from numba.core.runtime import rtsys
+
+    class Kept(FunctionCache):
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            rtsys.initialize(target_context)  # memory of arrays
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+
+    return Kept
 
 
 compiled = Compiled
