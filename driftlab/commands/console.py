@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
@@ -232,6 +233,18 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         delayed.join()
         if bar.live.is_started:
             bar.stop()
+
+
+def load_at_first_use(*names: str) -> None:
+    """Let modules be loaded when something of them is asked for first."""
+    for name in set(names) - sys.modules.keys():
+        spec = find_spec(name)
+        assert spec is not None and spec.loader is not None
+        spec.loader = LazyLoader(spec.loader)
+        sys.modules[name] = module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        parent, _, child = name.rpartition(".")
+        setattr(sys.modules[parent], child, module)
 
 
 def keep_freed_memory() -> None:
