@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import LazyLoader, find_spec, module_from_spec
@@ -202,15 +202,24 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
     What is given is called with the seconds from the first row and the number of samples so far, or with a text.
     """
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    text = stage = what
+    begun, bar = time.monotonic(), None
+    since = begun
 
-    console = terminal(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True)
-    task = bar.add_task(what, total=None)
-    stage, since = what, time.monotonic()
+    def begin() -> None:
+        nonlocal bar
+        if (console := terminal(stderr=True)).is_terminal:
+            from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+            columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+            drawn = Progress(*columns, console=console, transient=True)
+            drawn.add_task(text, total=None)
+            drawn.tasks[0].start_time = begun
+            drawn.start()
+            bar = drawn
+
     # by a clock of its own: what takes long need not say so
-    delayed = Timer(1.0, bar.start if console.is_terminal else bool)
+    delayed = Timer(1.0, copy_context().run, [begin])
     delayed.daemon = True
     delayed.start()
 
@@ -218,12 +227,13 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         session().stages.append((stage, time.monotonic() - since))
 
     def report(state: float | str, count: int = 0) -> None:
-        nonlocal stage, since
+        nonlocal stage, since, text
         if isinstance(state, str):
             done()
             stage, since = f"{what}: {state}", time.monotonic()
-        text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
-        bar.update(task, description=f"{what}: {text}")
+        text = f"{what}: {state if isinstance(state, str) else f'{state:,.0f} s, {count:,} samples'}"
+        if bar is not None:
+            bar.update(bar.task_ids[0], description=text)
 
     try:
         yield report
@@ -231,7 +241,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         done()
         delayed.cancel()
         delayed.join()
-        if bar.live.is_started:
+        if bar is not None:
             bar.stop()
 
 
@@ -239,10 +249,10 @@ def load_at_first_use(*names: str) -> None:
     """Let modules be loaded when something of them is asked for first."""
     for name in set(names) - sys.modules.keys():
         spec = find_spec(name)
-        assert spec is not None and spec.loader is not None
-        spec.loader = LazyLoader(spec.loader)
+        assert spec is not None
+        spec.loader = loader = LazyLoader(spec.loader)  # type: ignore[arg-type]
         sys.modules[name] = module = module_from_spec(spec)
-        spec.loader.exec_module(module)
+        loader.exec_module(module)
         parent, _, child = name.rpartition(".")
         setattr(sys.modules[parent], child, module)
 

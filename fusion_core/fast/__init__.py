@@ -66,7 +66,7 @@ def _kept() -> Any:
     from numba.core.caching import FunctionCache
     from numba.core.runtime import rtsys
 
-    class Kept(FunctionCache):
+    class Kept(FunctionCache):  # type: ignore[misc]
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             rtsys.initialize(target_context)  # memory of arrays
             with self._guard_against_spurious_io_errors():

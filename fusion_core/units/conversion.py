@@ -1,4 +1,4 @@
-"""Conversion of units by pint, with the definitions of `units.txt`; what pint says of ordinary ones is in `ordinary.txt`.
+"""Conversion of units by pint, with the definitions of `units.txt`; `ordinary.txt` has what it says of ordinary ones.
 
 An angle is a dimension of its own (so 5 Hz is not 5 rad/s), `g` is standard gravity and not a gram. Inside the program
 everything is SI, except that temperatures are in degC.
