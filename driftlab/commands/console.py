@@ -212,14 +212,12 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
             from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
             columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-            drawn = Progress(*columns, console=console, transient=True)
-            drawn.add_task(text, total=None)
-            drawn.tasks[0].start_time = begun
-            drawn.start()
-            bar = drawn
+            bar = Progress(*columns, console=console, transient=True)
+            bar.add_task(text, total=None)
+            bar.tasks[0].start_time = begun
+            bar.start()
 
-    # by a clock of its own: what takes long need not say so
-    delayed = Timer(1.0, copy_context().run, [begin])
+    delayed = Timer(1.0, copy_context().run, [begin])  # by a clock of its own: what takes long need not say so
     delayed.daemon = True
     delayed.start()
 
@@ -232,7 +230,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
             done()
             stage, since = f"{what}: {state}", time.monotonic()
         text = f"{what}: {state if isinstance(state, str) else f'{state:,.0f} s, {count:,} samples'}"
-        if bar is not None:
+        if bar is not None and bar.task_ids:
             bar.update(bar.task_ids[0], description=text)
 
     try:

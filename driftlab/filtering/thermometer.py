@@ -153,9 +153,8 @@ def _look(
         if which[k] != at or crossed != period:
             at, period, passed, whole = which[k], crossed, 0.0, 0.0
             for h in range(HARMONICS):
-                whole += table[at, h]
                 x = (np.pi * (h + 1) * window / period) ** 2
-                passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
+                passed, whole = passed + table[at, h] * (1 + 4 * x) / (1 + x) ** 2, whole + table[at, h]
         if moved != known or late != standing:
             known, standing, rest, aside = moved, late, np.exp(-LATE * moved), 0.0
             if not late:

@@ -21,7 +21,7 @@ Measured with 12 states in six groups, 6 components (`benchmarks/methods.py`). `
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, cached_property, partial, update_wrapper
+from functools import cached_property, partial, update_wrapper
 from threading import RLock
 from typing import Any
 
@@ -43,8 +43,8 @@ class Compiled:
         # nobody asks for the address of a function: without it a sixth less is compiled
         options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
         function = njit(self.py_func, **options)
-        if hasattr(function, "_cache"):  # not where NUMBA_DISABLE_JIT is set
-            function._cache = _kept()(self.py_func)
+        if kept := getattr(function, "_cache", None):  # not where NUMBA_DISABLE_JIT is set
+            kept.load_overload = partial(_load, kept)
         return function
 
     def __call__(self, *given: Any, **named: Any) -> Any:
@@ -57,22 +57,16 @@ class Compiled:
         return self.dispatcher(*given, **named)
 
 
-@cache
-def _kept() -> Any:
-    """Return numba's cache of a function, by which what was compiled is loaded without all that can be compiled.
+def _load(kept: Any, sig: Any, context: Any) -> Any:
+    """Return what numba's cache of a function has kept of a signature, without loading all that can be compiled.
 
-    Where something is compiled, numba loads that itself; where all is kept, half of numba's time is not spent.
+    That takes half of numba's start; numba does it by itself where it compiles.
     """
-    from numba.core.caching import FunctionCache
     from numba.core.runtime import rtsys
 
-    class Kept(FunctionCache):  # type: ignore[misc]
-        def load_overload(self, sig: Any, target_context: Any) -> Any:
-            rtsys.initialize(target_context)  # memory of arrays
-            with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)
-
-    return Kept
+    rtsys.initialize(context)  # memory of arrays
+    with kept._guard_against_spurious_io_errors():
+        return kept._load_overload(sig, context)
 
 
 compiled = Compiled

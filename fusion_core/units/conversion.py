@@ -55,7 +55,7 @@ def to_si(text: str, unit: str) -> float:
         If the text is not `number unit`, or the unit is unknown or of another dimension.
     """
     number, names = read_quantity(text)
-    if (factor := _ordinary().get((_key(names), unit))) is not None:
+    if (factor := _ordinary(names)[1].get(unit)) is not None:
         return _checked(number * factor, number, text)
     target = _known(unit)
     if not names and not target.dimensionless:
@@ -91,7 +91,7 @@ def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray
 def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     """Return factor and offset from `unit` to `si_unit`."""
     number, names = read_scaled_unit(unit)
-    if (factor := _ordinary().get((_key(names), si_unit or ""))) is not None:
+    if (factor := _ordinary(names)[1].get(si_unit or "")) is not None:
         return _checked(factor * number, number, unit), 0.0
     source, target = of_pint(names, unit), _known(si_unit or si_unit_of(unit))
     if source.dimensionality != target.dimensionality:
@@ -114,7 +114,7 @@ def dimension_of(unit: str) -> str:
 def si_unit_of(unit: str) -> str:
     """Return the unit in which a quantity written in `unit` is kept inside the program."""
     names = read_scaled_unit(unit)[1]
-    return _ordinary_si().get(_key(names)) or si_unit(of_pint(names, unit))
+    return _ordinary(names)[0] or si_unit(of_pint(names, unit))
 
 
 def si_unit(unit: pint.Unit) -> str:
@@ -165,24 +165,18 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 @cache
-def _rows() -> list[list[str]]:
-    """Return the rows of `ordinary.txt`: the unit, one that it is converted to, the factor, the unit in SI."""
-    lines = files(__package__).joinpath("ordinary.txt").read_text(encoding="utf-8").splitlines()
-    return [[cell.strip() for cell in line.split("|")] for line in lines if not line.startswith("#")]
+def ordinary_units() -> dict[str, tuple[str, dict[str, float]]]:
+    """Return the units of `ordinary.txt`: by each the unit in SI, and pint's factors by what it is converted to."""
+    known: dict[str, tuple[str, dict[str, float]]] = {}
+    for row in files(__package__).joinpath("ordinary.txt").read_text(encoding="utf-8").splitlines()[2:]:
+        unit, target, factor, si = map(str.strip, row.split("|"))
+        known.setdefault(unit, (si, {}))[1][target] = float(factor)
+    return known
 
 
-@cache
-def _ordinary() -> dict[tuple[str, str], float]:
-    return {(unit, target): float(factor) for unit, target, factor, _ in _rows()}
-
-
-@cache
-def _ordinary_si() -> dict[str, str]:
-    return {unit: si for unit, _, _, si in _rows()}
-
-
-def _key(names: Mapping[str, Fraction]) -> str:
-    return " ".join(name if power == 1 else f"{name}^{power}" for name, power in names.items())
+def _ordinary(names: Mapping[str, Fraction]) -> tuple[str, dict[str, float]]:
+    key = " ".join(name if power == 1 else f"{name}^{power}" for name, power in names.items())
+    return ordinary_units().get(key, ("", {}))
 
 
 def _known(unit: str) -> pint.Unit:
