@@ -58,9 +58,9 @@ class Compiled:
 
 
 def _load(kept: Any, sig: Any, context: Any) -> Any:
-    """Return what numba's cache of a function has kept of a signature, without loading all that can be compiled.
+    """Load a function for a signature from numba's cache of it, without all that can be compiled; None if not there.
 
-    That takes half of numba's start; numba does it by itself where it compiles.
+    All that takes half of numba's start, and numba loads it by itself where it compiles.
     """
     from numba.core.runtime import rtsys
 
