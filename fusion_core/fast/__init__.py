@@ -41,11 +41,10 @@ class Compiled:
         from numba import njit
 
         # nobody asks for the address of a function: without it a sixth less is compiled
-        options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
-        function = njit(self.py_func, **options)
-        if kept := getattr(function, "_cache", None):  # not where NUMBA_DISABLE_JIT is set
+        made = njit(self.py_func, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, **self.options)
+        if kept := getattr(made, "_cache", None):  # not where NUMBA_DISABLE_JIT is set
             kept.load_overload = partial(_load, kept)
-        return function
+        return made
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Call the function; it is compiled first where it has not been for such arguments."""
