@@ -12,13 +12,10 @@ from driftlab.commands.console import print_json, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
 from driftlab.config import Config, maps_of
 from driftlab.filtering.setup import check_channels, loaded_map, prior
-from driftlab.maps.fit import map_lines
 from driftlab.recordings.screening import head
-from driftlab.reports.tables import TextTable
 from fusion_core.host.config import quantities
 from fusion_core.host.registry import Entry, registry
 from fusion_core.host.schema import config_schema
-from fusion_core.testing import laws
 from fusion_core.units import Quantity
 
 
@@ -61,6 +58,8 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
 
 
 def _map_remarks(config: Config) -> list[str]:
+    from driftlab.maps.fit import map_lines
+
     remarks = []
     for sensor in () if config.filter is None else reversed(config.filter.sensors):
         for settings in maps_of(sensor):
@@ -101,6 +100,8 @@ def plugins(*, json: bool = False, check: bool = False) -> None:
     check : bool
         Hold each to the laws of its family.
     """
+    from driftlab.reports.tables import TextTable
+
     if check:
         _print_laws(json)
         return
@@ -124,6 +125,8 @@ def schema() -> None:
 
 def law_checks(entry: Entry) -> list[tuple[str, str | None]]:
     """Return every law of a plugin that gives examples, and why it does not hold, None where it does."""
+    from fusion_core.testing import laws
+
     if entry.plugin is None:  # broken, or no class: a product is a file
         return [] if entry.error is None else [("loads", entry.error)]
     try:
@@ -136,6 +139,8 @@ def law_checks(entry: Entry) -> list[tuple[str, str | None]]:
 
 def _print_laws(json: bool) -> None:
     """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
+    from driftlab.reports.tables import TextTable
+
     entries = sorted(registry().entries, key=lambda e: (e.family, e.kind))
     checks = [(entry, law_checks(entry)) for entry in entries]
     broken = [(entry.kind, law, error) for entry, results in checks for law, error in results if error is not None]

@@ -11,9 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
@@ -201,15 +202,22 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
     What is given is called with the seconds from the first row and the number of samples so far, or with a text.
     """
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    text = stage = what
+    begun, bar = time.monotonic(), None
+    since = begun
 
-    console = terminal(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True)
-    task = bar.add_task(what, total=None)
-    stage, since = what, time.monotonic()
-    # by a clock of its own: what takes long need not say so
-    delayed = Timer(1.0, bar.start if console.is_terminal else bool)
+    def begin() -> None:
+        nonlocal bar
+        if (console := terminal(stderr=True)).is_terminal:
+            from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+            columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+            bar = Progress(*columns, console=console, transient=True)
+            bar.add_task(text, total=None)
+            bar.tasks[0].start_time = begun
+            bar.start()
+
+    delayed = Timer(1.0, copy_context().run, [begin])  # by a clock of its own: what takes long need not say so
     delayed.daemon = True
     delayed.start()
 
@@ -217,12 +225,13 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         session().stages.append((stage, time.monotonic() - since))
 
     def report(state: float | str, count: int = 0) -> None:
-        nonlocal stage, since
+        nonlocal stage, since, text
         if isinstance(state, str):
             done()
             stage, since = f"{what}: {state}", time.monotonic()
-        text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
-        bar.update(task, description=f"{what}: {text}")
+        text = f"{what}: {state if isinstance(state, str) else f'{state:,.0f} s, {count:,} samples'}"
+        if bar is not None and bar.task_ids:
+            bar.update(bar.task_ids[0], description=text)
 
     try:
         yield report
@@ -230,8 +239,20 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         done()
         delayed.cancel()
         delayed.join()
-        if bar.live.is_started:
+        if bar is not None:
             bar.stop()
+
+
+def load_at_first_use(*names: str) -> None:
+    """Let modules be loaded when something of them is asked for first."""
+    for name in set(names) - sys.modules.keys():
+        spec = find_spec(name)
+        assert spec is not None
+        spec.loader = loader = LazyLoader(spec.loader)  # type: ignore[arg-type]
+        sys.modules[name] = module = module_from_spec(spec)
+        loader.exec_module(module)
+        parent, _, child = name.rpartition(".")
+        setattr(sys.modules[parent], child, module)
 
 
 def keep_freed_memory() -> None:

@@ -21,7 +21,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand
 
-from driftlab.commands.console import check_limits, in_session, load, pairs, print_json, progress
+from driftlab.commands.console import check_limits, in_session, load, load_at_first_use, pairs, print_json, progress
 
 TYPES: dict[str, Any] = {  # by the first word of an annotation; of what is not here there is no option
     "bool": bool, "int": int, "float": float, "str": str, "Place": Path, "ConfigLike": Path,
@@ -149,6 +149,7 @@ class Command:
         parameters += [option.parameter(name) for name, option in options.items()]
 
         def call(*, quiet: bool, verbose: bool, set_: list[str] | None = None, **given: Any) -> None:
+            load_at_first_use("numpy.f2py", "numpy.testing")  # scipy takes all names of numpy: half of its own start
             with in_session(quiet, verbose, set_):
                 self._call(import_module(self.module), given)
 

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation import limits
-from driftlab.evaluation.limits import LimitResult
-from driftlab.evaluation.overview import Overview, OverviewAccumulator, averages_of, check_run_limits
+from driftlab.evaluation.limits import LimitResult, check_limits
+from driftlab.evaluation.overview import Overview, OverviewAccumulator, averages_of, run_measurements
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, over_axes, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
@@ -172,7 +172,8 @@ def _compared(name: str, config: Config, initial: InitialError | None, progress:
     averages = averages_of(config, first)
     gathered = OverviewAccumulator(run.model, first, averages).read(nominal.estimates)
     overview = gathered.overview(journal.faults.first_row)
-    results = tuple(check_run_limits(config, overview, first, averages))
+    measured = run_measurements(config, overview, first, averages)
+    results = () if config.limits is None else tuple(check_limits(config.limits, measured))
     return Comparison(residual, nominal, offset, overview, run.model, journal, results, initial)
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.evaluation.limits import LimitResult, Measured, check_limits
+from driftlab.evaluation.limits import Measured
 from driftlab.evaluation.measurements import Averages, of_coast, of_map
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.recordings.prefetch import prefetch
@@ -326,12 +326,3 @@ def run_measurements(
     if fitted is not None:
         measured |= of_map(fitted, tracked_unit(config.filter))
     return measured
-
-
-def check_run_limits(
-    config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
-) -> list[LimitResult]:
-    """Judge a run by the limits of its config; the arguments are those of `run_measurements`."""
-    if config.limits is None:
-        return []
-    return check_limits(config.limits, run_measurements(config, overview, alignment, averages))

@@ -151,10 +151,10 @@ def _look(
         # a temperature that has not crossed a step yet may stand still: nothing is averaged away
         crossed = max(since, took) if took > 0 else np.inf
         if which[k] != at or crossed != period:
-            at, period, passed, whole = which[k], crossed, 0.0, np.sum(table[which[k]])
+            at, period, passed, whole = which[k], crossed, 0.0, 0.0
             for h in range(HARMONICS):
                 x = (np.pi * (h + 1) * window / period) ** 2
-                passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
+                passed, whole = passed + table[at, h] * (1 + 4 * x) / (1 + x) ** 2, whole + table[at, h]
         if moved != known or late != standing:
             known, standing, rest, aside = moved, late, np.exp(-LATE * moved), 0.0
             if not late:

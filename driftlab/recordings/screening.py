@@ -21,14 +21,19 @@ LONG = 600.0  # s between samples that are noted
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
 
-def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None) -> Iterator[Chunk]:
-    """Yield the samples of the config's source (or of `stream`, in its place) that can be used."""
+def read(
+    config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None, *, few: bool = False
+) -> Iterator[Chunk]:
+    """Yield the samples of the config's source (or of `stream`, in its place) that can be used.
+
+    Of a `few` that are all that is wanted, nothing is compiled: loading the compiler would take longer.
+    """
     if config.source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
-    gaps = Gaps(faults)
+    gaps, look = Gaps(faults), _suspect.py_func if few else _suspect
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
@@ -43,7 +48,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
             sensor = (sensors or {}).get(name)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             before = runs.get(name, np.zeros(chunk[name].shape[1]))
-            suspect, runs[name] = _suspect(chunk[name], _value_before(chunk, name), before, limit)
+            suspect, runs[name] = look(chunk[name], _value_before(chunk, name), before, limit)
             if not suspect:
                 continue
             repeats = _repeats(chunk, name, before)
@@ -164,7 +169,7 @@ def head(config: Config) -> Head | None:
     if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
         return None
     faults = Faults()
-    first = next(read(config, faults, rows=1000))
+    first = next(read(config, faults, rows=1000, few=True))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():

@@ -15,6 +15,7 @@ import numpy as np
 from driftlab.units import rounded
 from fusion_core.chunk import Array
 
+POWERS = np.array([float(10**k) for k in range(23)])  # each is exact
 LineStyle = Literal["line", "dashed", "dotted", "points"]
 
 
@@ -193,7 +194,23 @@ def _line_content(line: Line, x: int) -> dict[str, Any]:
 
 
 def _numbers(values: Array, digits: int = 6) -> list[float | None]:
-    return [rounded(value, digits) for value in np.asarray(values, dtype=np.float64).tolist()]
+    """Return values with so many digits, as `rounded` does one by one; None for one that is not finite.
+
+    A whole number of at most 15 digits by a power of ten up to 22 is what the text of both is read as; what lies near
+    the middle of two such numbers is left to the text.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        places = digits - 1 - np.floor(np.log10(np.abs(values)))
+        sure = np.abs(places) < len(POWERS)
+        power = POWERS[np.where(sure, np.abs(places), 0).astype(np.int64)]
+        scaled = np.where(places < 0, values / power, values * power)
+        whole = np.rint(scaled)
+        numbers: list[float | None] = np.where(places < 0, whole * power, whole / power).tolist()
+        unsure = np.flatnonzero(~sure | (np.abs(np.abs(scaled - whole) - 0.5) < 1e-3))
+    for k in unsure.tolist():
+        numbers[k] = rounded(float(values[k]), digits)
+    return numbers
 
 
 def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate", style: LineStyle = "line") -> Line:

@@ -179,10 +179,10 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
 
 def _sums(file: BufferedReader) -> str:
     """Return the SHA-256 of the CRC-32 of each block of a file, and of the length of the file."""
-    whole, length = hashlib.sha256(), 0
-    while block := file.read(BLOCK):
-        whole.update(zlib.crc32(block).to_bytes(4, "little"))
-        length += len(block)
+    whole, length, block = hashlib.sha256(), 0, memoryview(bytearray(BLOCK))
+    while count := file.readinto(block):
+        whole.update(zlib.crc32(block[:count]).to_bytes(4, "little"))
+        length += count
     whole.update(length.to_bytes(8, "little"))
     return whole.hexdigest()
 

@@ -41,8 +41,10 @@ class Compiled:
         from numba import njit
 
         # nobody asks for the address of a function: without it a sixth less is compiled
-        options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
-        return njit(self.py_func, **options)
+        made = njit(self.py_func, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, **self.options)
+        if kept := getattr(made, "_cache", None):  # not where NUMBA_DISABLE_JIT is set
+            kept.load_overload = partial(_load, kept)
+        return made
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Call the function; it is compiled first where it has not been for such arguments."""
@@ -52,6 +54,18 @@ class Compiled:
                 own = [(name, value) for name, value in names.items() if isinstance(value, Compiled)]
                 names.update({name: value.dispatcher for name, value in own if value.py_func.__globals__ is names})
         return self.dispatcher(*given, **named)
+
+
+def _load(kept: Any, sig: Any, context: Any) -> Any:
+    """Load a function for a signature from numba's cache of it, without all that can be compiled; None if not there.
+
+    All that takes half of numba's start, and numba loads it by itself where it compiles.
+    """
+    from numba.core.runtime import rtsys
+
+    rtsys.initialize(context)  # memory of arrays
+    with kept._guard_against_spurious_io_errors():
+        return kept._load_overload(sig, context)
 
 
 compiled = Compiled

@@ -1,4 +1,4 @@
-"""Conversion of units by pint, with the definitions of `units.txt`.
+"""Conversion of units by pint, with the definitions of `units.txt`; `ordinary.txt` has what it says of ordinary ones.
 
 An angle is a dimension of its own (so 5 Hz is not 5 rad/s), `g` is standard gravity and not a gram. Inside the program
 everything is SI, except that temperatures are in degC.
@@ -55,6 +55,8 @@ def to_si(text: str, unit: str) -> float:
         If the text is not `number unit`, or the unit is unknown or of another dimension.
     """
     number, names = read_quantity(text)
+    if (factor := _ordinary(names)[1].get(unit)) is not None:
+        return _checked(number * factor, number, text)
     target = _known(unit)
     if not names and not target.dimensionless:
         raise UnitError(f"'{quote(text)}' has no unit")
@@ -88,8 +90,10 @@ def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray
 @lru_cache(maxsize=256)  # a recording is converted block by block
 def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     """Return factor and offset from `unit` to `si_unit`."""
-    number, source = _scaled(unit)
-    target = _known(si_unit or si_unit_of(unit))
+    number, names = read_scaled_unit(unit)
+    if (factor := _ordinary(names)[1].get(si_unit or "")) is not None:
+        return _checked(factor * number, number, unit), 0.0
+    source, target = of_pint(names, unit), _known(si_unit or si_unit_of(unit))
     if source.dimensionality != target.dimensionality:
         raise UnitError(f"unit '{quote(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
     try:
@@ -109,7 +113,8 @@ def dimension_of(unit: str) -> str:
 
 def si_unit_of(unit: str) -> str:
     """Return the unit in which a quantity written in `unit` is kept inside the program."""
-    return si_unit(_scaled(unit)[1])
+    names = read_scaled_unit(unit)[1]
+    return _ordinary(names)[0] or si_unit(of_pint(names, unit))
 
 
 def si_unit(unit: pint.Unit) -> str:
@@ -159,13 +164,23 @@ def same_dimension(unit: str, other: str) -> bool:
         return False
 
 
-def _scaled(unit: str) -> tuple[float, pint.Unit]:
-    number, names = read_scaled_unit(unit)
-    return number, of_pint(names, unit)
+@cache
+def ordinary_units() -> dict[str, tuple[str, dict[str, float]]]:
+    """Return the units of `ordinary.txt`: by each the unit in SI, and pint's factors by what it is converted to."""
+    known: dict[str, tuple[str, dict[str, float]]] = {}
+    for row in files(__package__).joinpath("ordinary.txt").read_text(encoding="utf-8").splitlines()[2:]:
+        unit, target, factor, si = map(str.strip, row.split("|"))
+        known.setdefault(unit, (si, {}))[1][target] = float(factor)
+    return known
+
+
+def _ordinary(names: Mapping[str, Fraction]) -> tuple[str, dict[str, float]]:
+    key = " ".join(name if power == 1 else f"{name}^{power}" for name, power in names.items())
+    return ordinary_units().get(key, ("", {}))
 
 
 def _known(unit: str) -> pint.Unit:
-    return _scaled(unit)[1]
+    return of_pint(read_scaled_unit(unit)[1], unit)
 
 
 def of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:

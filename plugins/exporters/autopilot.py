@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.polynomial import Polynomial, chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_core import contracts
@@ -247,6 +246,8 @@ def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
 
 def polynomial(fitted: contracts.FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
     """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
+    from numpy.polynomial import Polynomial, chebyshev
+
     low, high = fitted.domain
     T = np.linspace(low, high, TEMPERATURES)
     bias = fitted.bias(T)

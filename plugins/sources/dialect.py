@@ -13,11 +13,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
-
-import polars as pl
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fusion_core.chunk import Array
+
+if TYPE_CHECKING:
+    import polars as pl
 
 SEPARATORS = ("\t", ";", ",", " ")
 SAMPLE = 400  # lines that are looked at, behind a preamble of at most as many
@@ -149,6 +150,8 @@ def _dates(texts: dict[str, list[str]]) -> dict[str, str]:
 
 
 def _format(cells: list[str]) -> str | None:
+    import polars as pl
+
     forms = [*(f"{day}{sep}{hour}" for hour in HOURS for day in DAYS for sep in (" ", "T")), *HOURS, *DAYS]
     filled = [cell for cell in cells if cell]
     if all(re.fullmatch(r"[\d.eE+-]+ sec", cell) for cell in filled):
@@ -175,6 +178,8 @@ def seconds_of(texts: pl.Series, form: str) -> pl.Series:
 
     Fractions of a second may stand behind a point or a comma, 3 or 6 digits behind a colon; a zone is left out.
     """
+    import polars as pl
+
     if "%" not in form:
         return texts.str.strip_suffix(form).str.strip_chars().cast(pl.Float64, strict=False)
     plain = texts.str.strip_chars().str.replace(ZONE, "${1}").str.replace(FRACTION, "${1}.${2}${3}${4}")
@@ -191,4 +196,6 @@ def has_day(form: str) -> bool:
 
 def numbers_of(cells: Sequence[str], form: str) -> Array:
     """Return the dates of cells (N,) in s; NaN where one is none."""
+    import polars as pl
+
     return seconds_of(pl.Series(cells, dtype=pl.String), form).to_numpy().astype(float)

@@ -62,6 +62,19 @@ def bench(tmp_path_factory):
     return folder
 
 
+def test_a_check_loads_no_library_that_it_does_not_need(bench):
+    heavy = ["numba", "scipy", "polars", "pint", "onnx", "onnxruntime", "numpy.ma", "rich.progress", "jinja2"]
+    command = ["check", "unit.yaml", "--input", "ramp.h5"]
+    code = f"""
+import sys
+from driftlab.cli import app
+app({command}, standalone_mode=False)
+print([name for name in {heavy} if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=bench, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_run_writes_whole_outputs(bench):
     done = process("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert done.returncode == 0, done.stderr

@@ -53,3 +53,16 @@ def test_threads_that_compile_at_once_get_the_same(tmp_path):
     (tmp_path / "threads.py").write_text("\n".join(lines))
     done = subprocess.run([sys.executable, "threads.py"], cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout.split() == 4 * ["8.0"], done.stderr
+
+
+def test_what_is_kept_is_loaded_without_what_can_be_compiled():
+    code = """
+import sys
+import numpy as np
+from fusion_core.consistency import Whiteness
+Whiteness(2).add(np.ones((50, 2)))
+print("numba.core.caching" in sys.modules, "numba.np.arraymath" in sys.modules)
+"""
+    command = [sys.executable, "-c", code]
+    subprocess.run(command, check=True, capture_output=True)  # compiles it where nothing is kept yet
+    assert subprocess.run(command, check=True, capture_output=True, text=True).stdout.split() == ["True", "False"]

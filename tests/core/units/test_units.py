@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from fractions import Fraction
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +17,9 @@ from fusion_core.errors import ConfigError, UnitError
 from fusion_core.host.registry import registry
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit, along_axes, convert, si_unit_of, to_si
+from fusion_core.units import registry as pint_registry
+from fusion_core.units.conversion import of_pint, ordinary_units, si_unit
+from fusion_core.units.grammar import read_scaled_unit
 
 
 @pytest.mark.parametrize(
@@ -124,3 +128,22 @@ def test_a_difference_of_temperatures_is_written_in_kelvin():
     spline = registry().classes(ThermalMap)["spline"](interval=0.5)
     assert spline.model_dump()["interval"] == "0.5 K"
     assert type(spline).model_validate(spline.model_dump()) == spline
+
+
+@pytest.mark.parametrize("unit", ordinary_units())
+def test_ordinary_units_are_what_pint_says(unit):
+    si, factors = ordinary_units()[unit]
+    names = {name: Fraction(power or 1) for name, _, power in (part.partition("^") for part in unit.split())}
+    source = of_pint(names, unit)
+    assert si_unit(source) == si
+    for target, factor in factors.items():
+        wanted = of_pint(read_scaled_unit(target)[1], target)
+        for value in (1.0, 0.0, -3.18, 1.5e-4, 9.80665e8, np.pi):  # to the last bit
+            assert pint_registry().Quantity(value, source).to(wanted).magnitude == value * factor
+
+
+def test_ordinary_units_are_known_without_pint(monkeypatch):
+    monkeypatch.setattr("fusion_core.units.conversion.registry", None)
+    assert to_si("3.18 deg/h/√Hz", "rad/s/sqrt(Hz)") == 3.18 * np.radians(1) / 3600
+    assert convert(2.0, "0.5 mg", "m/s^2") == pytest.approx(0.00980665)
+    assert si_unit_of("0.5 deg/s") == "radian/second"

@@ -139,6 +139,16 @@ def test_numbers_that_are_none_are_gaps_and_equal_times_are_there_once():
     assert found["panels"][0]["lines"][0]["y"] == [1, None, None]
 
 
+@pytest.mark.parametrize("scale", [1e-25, 1e-9, 1.0, 1e15, 1e25])
+def test_numbers_of_a_chart_are_those_that_their_texts_are_read_as(scale):
+    # halves are the middle of two numbers, powers of ten the end of one number of digits
+    drawn, halves = np.random.default_rng(1).standard_normal(2000), np.arange(-2e6, 2e6, 12345.5)
+    values = np.concatenate([drawn, halves, 10.0 ** np.arange(-9, 9), np.nextafter(1e-5, [0, 1]), [0.0, -0.0]]) * scale
+    found = content(Chart((Panel((Line(values, values, "a"),), "y"),), "x"))
+    for digits, numbers in ((9, found["x"][0]), (6, found["panels"][0]["lines"][0]["y"])):
+        assert list(map(repr, numbers)) == [repr(float(f"{value:.{digits}g}")) for value in values]
+
+
 def test_text_in_json_cannot_end_its_script():
     assert "<" not in embedded({"name": NASTY})
     assert "<script>document.title" not in interactive(bias_chart(NASTY))
