@@ -263,12 +263,11 @@ def pages_of(
     sheet = replace(sheet_of(unit.config, soaks, plugins=participants(unit.settings)), maps=[facts])
     pages = {"map.report.html": map.page_of(unit.verdict, unit.bias_unit, notes, sheet)}
     if run.result is not None:
-        result, config = run.result, run.result.config
-        sheet = replace(sheet_of(config, judged=result.judged, plugins=result.summary["plugins"]), maps=[facts])
+        result = run.result
+        sheet = replace(sheet_of(result.config, judged=result.judged, plugins=result.summary["plugins"]), maps=[facts])
         pages["report.html"] = run_report.page_of(
-            result.overview, result.summary, title=result.name, config=config.as_yaml(), model=result.model,
-            journal=result.journal, sheet=sheet, fitted=unit.fitted,
-        )  # fmt: skip
+            result.run, result.summary, title=result.name, sheet=sheet, fitted=unit.fitted
+        )
     return {f"page/{name}": page.encode() for name, page in pages.items()}
 
 
