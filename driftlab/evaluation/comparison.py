@@ -147,13 +147,8 @@ def _compared(name: str, config: Config, initial: InitialError | None, progress:
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    return Comparison(
-        **vars(scored(run, nominal.estimates)),
-        reference_residual=residual,
-        nominal=nominal,
-        offset=offset,
-        initial=initial,
-    )
+    of_run = vars(scored(run, nominal.estimates))
+    return Comparison(**of_run, reference_residual=residual, nominal=nominal, offset=offset, initial=initial)
 
 
 def _condition(run: Run, recording: Chunk, initial_error: float, threshold: float) -> Condition:
@@ -227,9 +222,8 @@ def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
 
 def verdict(runs: Mapping[str, Comparison]) -> str:
     """Return the config that predicts best, and whether that is more than chance."""
-    unit = next(iter(runs.values())).unit
-    scores = {name: run.yardsticks for name, run in runs.items()}
-    return coast_verdict(scores, unit, min(run.span for run in runs.values()))
+    first, scores = next(iter(runs.values())), {name: run.yardsticks for name, run in runs.items()}
+    return coast_verdict(scores, first.unit, min(run.span for run in runs.values()))
 
 
 def limit_lines(runs: Mapping[str, Comparison]) -> list[str]:

@@ -352,12 +352,11 @@ class ScoredRun:
         The coast is that of the run; noise and bias instability are of the averages, where a limit asks for them;
         residual, swing and hysteresis are of the map.
         """
-        fitted, limits, averages = map_of(self.config), self.config.limits, self.averages
+        fitted, limits = map_of(self.config), self.config.limits
         measured = {"coast": of_coast(self.yardsticks, self.span, self.model.align)}
-        if averages is not None and limits is not None and limits.noise is not None:
-            measured["noise"] = averages.noise()
-        if averages is not None and limits is not None and limits.bias_instability is not None:
-            measured["bias_instability"] = averages.measured()
+        if self.averages is not None and limits is not None:
+            measured |= {} if limits.noise is None else {"noise": self.averages.noise()}
+            measured |= {} if limits.bias_instability is None else {"bias_instability": self.averages.measured()}
         return measured if fitted is None else measured | of_map(fitted, self.unit)
 
     @cached_property

@@ -177,21 +177,21 @@ def _scored(run: ScoredRun) -> list[str]:
 def error_rows(runs: Sequence[Scores]) -> Rows:
     """Return the rows of the table of errors, what decides first: a label, and for each run the errors (d,) in SI."""
     rows = []
-    for name in LONGEST_FIRST:
-        rows.append((f"prediction, {name}", [run.coast[name] for run in runs]))
-        rows.append(("  its sigma", [run.coast_sigma[name] for run in runs]))
-    return [
-        *rows,
-        ("bias, all", [run.filter_whole for run in runs]),
-        ("bias, first 30 s", [run.filter_first for run in runs]),
-    ]
+    for label, columns in error_pairs(runs):
+        rows.append((label, [errors for errors, _ in columns]))
+        if sigmas := [sigma for _, sigma in columns if sigma is not None]:
+            rows.append(("  its sigma", sigmas))
+    return rows
 
 
 def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, Sequence[tuple[Array, Array | None]]]]:
     """Return the rows of `error_rows` with the sigma of a prediction beside its error, None where there is none."""
     predicted = [(name, [(run.coast[name], run.coast_sigma[name]) for run in runs]) for name in LONGEST_FIRST]
-    filters = [(label, [(values, None) for values in columns]) for label, columns in error_rows(runs)[-2:]]
-    return [*((f"prediction, {name}", columns) for name, columns in predicted), *filters]
+    return [
+        *((f"prediction, {name}", columns) for name, columns in predicted),
+        ("bias, all", [(run.filter_whole, None) for run in runs]),
+        ("bias, first 30 s", [(run.filter_first, None) for run in runs]),
+    ]
 
 
 def coasts_over_axes(rows: Rows) -> Rows:

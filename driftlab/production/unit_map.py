@@ -35,7 +35,7 @@ from driftlab.family.record import Figure
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict
-from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, usual_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain
@@ -104,10 +104,7 @@ class UnitMap:
 
 def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMap:
     """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
-    named = bool(config.tracked_maps())
-    if not named:
-        faults.note(f"kind of map: {USUAL}, since the config names none; --compare tells which kind predicts best")
-    settings = map_settings(config, None if named else USUAL)
+    settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, soak)
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
