@@ -39,7 +39,10 @@ REAL = "done.pickle"  # results of real units, for the light ones
 def one_core(folder: Path, count: int) -> tuple[Row, float]:
     """Do real units in one worker; return the seconds of its processor that one takes, once all is loaded."""
     config, found = config_text(), []
-    tasks = [Task(path.parent.name, {"calibration": (str(path),)}, config) for path in write_units(folder, count)]
+    tasks = [
+        Task(path.parent.name, recordings={"calibration": (str(path),)}, config=config)
+        for path in write_units(folder, count)
+    ]
     with Pool(1) as pool:
         for task, done in pool.map(work, tasks):
             assert not isinstance(done, WorkerLost), done

@@ -19,7 +19,7 @@ from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
 from driftlab.evaluation.limits import LimitResult, check_limits, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import Overview, OverviewAccumulator, map_of
+from driftlab.evaluation.overview import ScoredRun, map_of, scored
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import remarks
 from driftlab.filtering.run import Run
@@ -189,12 +189,12 @@ def _closed(
     both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
     outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
     identities = {role: list(map(identity, names)) for role, names in recordings.items()}
-    whole = closed(explanation, [outcome for outcome, _ in outcomes], identities)
+    whole = closed(explanation, outcomes, identities)
     if whole.refuted:
         _refute(folder, config, new, whole)
     chosen = 0 if whole.refuted else 1
     whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-    limits = _limit_results(both[chosen], [(outcome.overviews[chosen], runs[chosen]) for outcome, runs in outcomes])
+    limits = _limit_results(both[chosen], [outcome.runs[chosen] for outcome in outcomes])
     rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
     whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
     write_prediction(folder / "prediction.h5", whole.outcomes)
@@ -259,15 +259,14 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
     path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
-def _limit_results(config: Config, runs: Sequence[tuple[Overview, Run]]) -> list[LimitResult]:
+def _limit_results(config: Config, runs: Sequence[ScoredRun]) -> list[LimitResult]:
     """Hold the worst test recording, and the map, against the limits of the config."""
     if config.limits is None:
         return []
     measured = []
-    for overview, run in runs:
-        model, alignment = run.model, run.journal.alignments[0]
-        noise = of_alignment(model.tracked, alignment, model.align)
-        coast = of_coast(overview.yardsticks, overview.end - alignment.t, model.align)
+    for run in runs:
+        noise = of_alignment(run.sensor, run.alignment, run.model.align)
+        coast = of_coast(run.yardsticks, run.span, run.model.align)
         measured.append({"noise": noise, "coast": coast})
     worst, fitted = max(measured, key=lambda one: float(np.max(one["coast"].values))), map_of(config)
     return check_limits(
@@ -284,18 +283,16 @@ def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult])
     return replace(sheet, recordings=recordings, maps=maps)
 
 
-def outcome_of(
-    declared: Config, explained: Config, recording: str, progress: Progress
-) -> tuple[Outcome, tuple[Run, Run]]:
-    """Run one test recording, which is read once, through both configs; return what they predict, and the runs."""
+def outcome_of(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
+    """Run one test recording, which is read once, through both configs, and return their predictions."""
     config, faults = with_recording(declared, recording), Faults()
     stream = list(epochs(read(config, faults), config.filter.update_interval if config.filter else 1.0))
     progress(f"running {recording} through the declared config")
-    first, before, run_before = _run(config, stream, deepcopy(faults))
+    first, before = _run(config, stream, deepcopy(faults))
     progress(f"running {recording} through the explained config")
-    second, after, run = _run(with_recording(explained, recording), stream, faults)
+    second, after = _run(with_recording(explained, recording), stream, faults)
     coasting = np.isfinite(first["coast"][:, 0])
-    outcome = Outcome(
+    return Outcome(
         name=recording,
         unit=tracked_unit(declared.filter),
         t=first["t"][coasting],
@@ -305,19 +302,16 @@ def outcome_of(
         after=second["coast"][coasting],
         before_sigma=first["coast_sigma"][coasting],
         after_sigma=second["coast_sigma"][coasting],
-        overviews=(before, after),
-        journal=run.journal,
-        remarks=tuple(remarks(after, run.model, run.journal)),
+        runs=(before, after),
+        remarks=tuple(remarks(after)),
     )
-    return outcome, (run_before, run)
 
 
-def _run(config: Config, stream: Sequence[Chunk], faults: Faults) -> tuple[dict[str, Any], Overview, Run]:
-    """Return the columns of a run over epochs, its overview, and itself."""
+def _run(config: Config, stream: Sequence[Chunk], faults: Faults) -> tuple[dict[str, Any], ScoredRun]:
+    """Return the columns of a run over epochs, and itself."""
     run = Run(config, RunLog(faults))
     columns = joined(run.over(stream))
-    overview = OverviewAccumulator(run.model, run.journal.alignments[0]).read(columns).overview(faults.first_row)
-    return columns, overview, run
+    return columns, scored(run, columns)
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -335,7 +329,7 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             group = file.create_group(name)
             group.attrs["recording"] = Path(outcome.name).name
             group.create_dataset("t", data=outcome.t).attrs["unit"] = "s"
-            group["t"].attrs["first_row"] = outcome.overviews[0].first_row
+            group["t"].attrs["first_row"] = outcome.runs[0].overview.first_row
             for column in PREDICTED:
                 group.create_dataset(column, data=getattr(outcome, column)).attrs["unit"] = outcome.unit.si
     path.write_bytes(whole.getbuffer())

@@ -21,7 +21,7 @@ from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
 from driftlab.maps.assessment import MapVerdict
-from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings, usual_settings
 from driftlab.maps.kind_selection import KindComparison, candidates, divide
 from driftlab.maps.kind_selection import compare as compare_kinds
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
@@ -248,10 +248,7 @@ def _fitted(
 ) -> FitMapResult:
     faults, selection, comparison, more = Faults(), None, None, {}
     if not compare:
-        if kind is None and not config.tracked_maps():
-            kind = USUAL
-            faults.note(f"kind of map: {kind}, since the config names none; --compare tells which kind predicts best")
-        settings = map_settings(config, kind)
+        settings = usual_settings(config, faults) if kind is None else map_settings(config, kind)
     if neurons is not None:
         check_selection(settings, neurons)
     soak = gather(config, recordings, faults, progress)

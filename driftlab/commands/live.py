@@ -156,7 +156,7 @@ class Live:
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
         self.status.faults, self.status.noted = journal.faults, Faults()  # each is said once
-        return finish(estimates, run.model, out, self.record)
+        return finish(estimates, run, out, self.record)
 
     @contextmanager
     def _ticking(self) -> Iterator[None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,9 @@ from driftlab.commands.estimates import (
 )
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_with
 from driftlab.commands.result import Result
-from driftlab.config import Config
-from driftlab.evaluation.limits import Measured, check_limits, verdict
+from driftlab.evaluation.limits import Measured, verdict
 from driftlab.evaluation.measurements import normal
-from driftlab.evaluation.overview import OverviewAccumulator, averages_of, map_of, run_measurements
+from driftlab.evaluation.overview import ScoredRun, accumulator_of, map_of, scored
 from driftlab.evaluation.summary import is_trusted, remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
@@ -43,8 +41,7 @@ from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import reading
 from driftlab.storage.json import write_json
-from driftlab.units import unit_of
-from fusion_core.contracts import FittedMap, MeasurementModel
+from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError
 from fusion_core.host.provenance import participants
 
@@ -56,20 +53,11 @@ class RunResult(Result):
     `estimates.h5`. Of a run that was written to a folder, an array is read when it is asked for.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        model: MeasurementModel,
-        journal: RunLog,
-        gathered: OverviewAccumulator,
-        columns: Columns,
-        recorded: Path | None = None,
-    ) -> None:
-        self.config, self.model, self.journal = config, model, journal
+    def __init__(self, run: ScoredRun, columns: Columns, recorded: Path | None = None) -> None:
+        config, model = run.config, run.model
+        self.run, self.config, self.model, self.journal, self.overview = run, config, model, run.journal, run.overview
         self.recorded = recorded  # the file in which a live run has kept what came
-        self.overview = overview = gathered.overview(journal.faults.first_row)
-        self._averages = gathered.averages
-        self.judged = [] if config.limits is None else check_limits(config.limits, self.measured)
+        self.judged = run.judged
         self.limits_verdict = self.verdict = verdict(self.judged)
         self.name = f"{config.file.stem}: {config.recording}" if config.file else config.recording
         self.units, self._columns = units_of(model), columns
@@ -82,18 +70,13 @@ class RunResult(Result):
             "recording": config.recording,
             "plugins": participants(config),
             "serial": config.serial,
-            "limits": [row.as_json(unit_of(model.tracked)) for row in self.judged],
-            **summarise(overview, model, journal),
+            "limits": [row.as_json(run.unit) for row in self.judged],
+            **summarise(run),
         }
-
-    @cached_property
-    def measured(self) -> dict[str, Measured]:
-        """Measurements of the quantities that a config may limit, by their names."""
-        return run_measurements(self.config, self.overview, self.journal.alignments[0], self._averages)
 
     def lines(self) -> list[str]:
         """Return the notes on the run, a sentence each."""
-        return remarks(self.overview, self.model, self.journal)
+        return remarks(self.run)
 
     @property
     def smoothed(self) -> Mapping[str, NDArray[Any]]:
@@ -102,7 +85,7 @@ class RunResult(Result):
 
     def _chart(self) -> Chart:
         """Return the bias, its prediction and the temperature over time, and the errors below."""
-        return bias_chart(self.overview, self.model, self.journal, errors=True)
+        return bias_chart(self.run, errors=True)
 
     def save(self, out: str | os.PathLike[str], *, force: bool = False, certificate: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does.
@@ -120,16 +103,7 @@ class RunResult(Result):
         write_json(folder / "summary.json", self.summary)
         recording = None if self.recorded is None else [str(self.recorded)]
         sheet = sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"])
-        page = page_of(
-            self.overview,
-            self.summary,
-            title=self.name,
-            config=self.config.as_yaml(),
-            model=self.model,
-            journal=self.journal,
-            sheet=sheet,
-            fitted=map_of(self.config),
-        )
+        page = page_of(self.run, self.summary, title=self.name, sheet=sheet, fitted=map_of(self.config))
         (folder / "report.html").write_text(page, encoding="utf-8")
         if certificate:
             signed = self._certificate(sheet)
@@ -143,8 +117,8 @@ class RunResult(Result):
             bias = normal(bias, overview.sigma, np.nan)
         measured = None if T is None else (float(np.min(T)), float(np.max(T)))
         return Certificate(
-            "run", self.config, sheet, self.judged, {"bias": bias, **self.measured}, fitted,
-            seconds=overview.count * self.journal.alignments[0].dt * (1 - overview.yardsticks.moved),
+            "run", self.config, sheet, self.judged, {"bias": bias, **self.run.measured}, fitted,
+            seconds=overview.count * self.run.alignment.dt * (1 - overview.yardsticks.moved),
             domain=measured, remarks=self._remarks(fitted, measured, sheet),
         )  # fmt: skip
 
@@ -152,7 +126,7 @@ class RunResult(Result):
         """Return the remarks of a certificate: what of it this run has not measured."""
         if fitted is None or measured is None:
             return []
-        record, unit = fitted.record, unit_of(self.model.tracked)
+        record, unit = fitted.record, self.run.unit
         fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
         names = [Path(str(one["name"])).name for one in sheet.recordings]
         both = [name for name in names if name.partition("::")[0] in fitted_on]
@@ -236,8 +210,7 @@ def run(
         _check_in_memory(smooth, certificate)
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
-        gathered = accumulator(understood, running.model, journal).read(columns)
-        return RunResult(understood, running.model, journal, gathered, columns)
+        return RunResult(scored(running, columns), columns)
     with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
         estimates = EstimatesWriter(folder, understood, journal, smooth=smooth)
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
@@ -249,13 +222,13 @@ def run(
                 hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                 kept = estimates.append(segment)
                 if before is None and not smooth:  # else what the file has by its end is looked at
-                    estimates.observed = estimates.observed or accumulator(understood, running.model, journal)
+                    estimates.observed = estimates.observed or accumulator_of(running)
                     do(estimates.observed.add, kept)
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
         if hashed is not None:
             hashed()
-        return finish(estimates, running.model, Path(out), certificate=certificate)
+        return finish(estimates, running, Path(out), certificate=certificate)
 
 
 def _check_in_memory(smooth: bool, certificate: bool) -> None:
@@ -277,15 +250,9 @@ def _segments(running: Run, journal: RunLog, progress: Progress | None) -> Gener
                 progress(journal.faults.since(float(segment.epochs.t[-1])), count)
 
 
-def accumulator(config: Config, model: MeasurementModel, journal: RunLog) -> OverviewAccumulator:
-    """Return the accumulator of a run's overview, and of the averages that the config's limits need."""
-    first = journal.alignments[0]
-    return OverviewAccumulator(model, first, averages_of(config, first))
-
-
 def finish(
     estimates: EstimatesWriter,
-    model: MeasurementModel,
+    run: Run,
     out: Path,
     recorded: Path | None = None,
     *,
@@ -296,12 +263,12 @@ def finish(
     `recorded` is the file in which a live run has kept what came. The estimates are read back where they were not
     observed while they were made.
     """
-    folder, config, journal, observed = estimates.folder, estimates.config, estimates.journal, estimates.observed
-    note_first_row(folder / "estimates.h5", journal.faults.first_row)
-    if observed is None:
-        with reading(folder / "estimates.h5") as file:
-            observed = accumulator(config, model, journal).read(file)
-    result = RunResult(config, model, journal, observed, Stored(out / "estimates.h5"), recorded)
+    folder, path = estimates.folder, estimates.folder / "estimates.h5"
+    note_first_row(path, run.journal.faults.first_row)
+    if estimates.observed is None:
+        with reading(path) as file:
+            estimates.observed = accumulator_of(run).read(file)
+    result = RunResult(scored(run, estimates.observed), Stored(out / "estimates.h5"), recorded)
     result._write(folder, certificate=certificate)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result
@@ -316,11 +283,11 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 def show(result: RunResult, given: Mapping[str, Any]) -> None:
     """Print the verdict on the limits, the table of errors and the notes."""
-    config, sensor = result.config, result.model.tracked
+    config, run = result.config, result.run
     print_verdict(result.verdict)
-    say_lines((row.line(unit_of(sensor)) for row in result.judged if row.verdict != "pass"), "  ")
+    say_lines((row.line(run.unit) for row in result.judged if row.verdict != "pass"), "  ")
     name = config.file.stem if config.file else config.name
-    terminal().print(yardstick_table({name: result.overview.yardsticks}, config.recording, sensor))
+    terminal().print(yardstick_table({name: run.yardsticks}, config.recording, run.sensor))
     say_lines(result.lines(), "note: ")
     signed = ", certificate.html, certificate.json" * given.get("certificate", False)
     say(f"written to {given['out']}/: estimates.h5, summary.json, report.html{signed}\n")

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation import limits
-from driftlab.evaluation.limits import LimitResult, check_limits
-from driftlab.evaluation.overview import Overview, OverviewAccumulator, averages_of, run_measurements
+from driftlab.evaluation.overview import ScoredRun, scored
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, over_axes, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
@@ -38,7 +37,7 @@ from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.units import BiasUnit, duration, listed, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import MeasurementModel, Sensor
+from fusion_core.contracts import Sensor
 from fusion_core.errors import ConfigError, NotAtRest
 
 OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7, 10 and 12
@@ -92,41 +91,21 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, and the nominal run.
+class Comparison(ScoredRun):
+    """One config: its nominal run, and its errors in both conditions.
 
-    `overview`, `model` and `journal` are of the nominal run, `judged` the limits of the config, if it has any;
-    `initial` is the error of the other condition.
+    `reference_residual` (d,) is the accuracy of its reference (table 5), `initial` the error of the other condition.
     """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
-    overview: Overview
-    model: MeasurementModel
-    journal: RunLog
-    judged: tuple[LimitResult, ...]
     initial: InitialError
-
-    @property
-    def yardsticks(self) -> Scores:
-        """The scores of the filter and of its coast."""
-        return self.overview.yardsticks
-
-    @property
-    def sensor(self) -> Sensor:
-        """The sensor whose bias is estimated."""
-        return self.model.tracked
-
-    @property
-    def span(self) -> float:
-        """Time from the end of the alignment to the end, s."""
-        return self.overview.end - self.journal.alignments[0].t
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the nominal run, a sentence each."""
-        return tuple(remarks(self.overview, self.model, self.journal))
+        return tuple(remarks(self))
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -156,51 +135,46 @@ def _check_alike(configs: dict[str, Config]) -> None:
 
 
 def _compared(name: str, config: Config, initial: InitialError | None, progress: Callable[[str], None]) -> Comparison:
-    journal = RunLog()
-    run = Run(config, journal)
-    recording = concatenate(list(epochs(read(config, journal.faults), run.model.update_interval)))
+    run = Run(config, RunLog())
+    recording = concatenate(list(epochs(read(config, run.journal.faults), run.model.update_interval)))
     progress(f"{name}: nominal")
     initial = initial_error(run.model.tracked) if initial is None else initial
-    nominal = _condition(config, recording, 0.0, initial.threshold, journal)
+    nominal = _condition(run, recording, 0.0, initial.threshold)
     progress(f"{name}: with an initial error")
-    offset = _condition(config, recording, initial.size, initial.threshold, RunLog())
+    off = Run(config, RunLog(), initial_error=initial.size)
+    offset = _condition(off, recording, initial.size, initial.threshold)
     rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    first = journal.alignments[0]
-    averages = averages_of(config, first)
-    gathered = OverviewAccumulator(run.model, first, averages).read(nominal.estimates)
-    overview = gathered.overview(journal.faults.first_row)
-    measured = run_measurements(config, overview, first, averages)
-    results = () if config.limits is None else tuple(check_limits(config.limits, measured))
-    return Comparison(residual, nominal, offset, overview, run.model, journal, results, initial)
+    of_run = vars(scored(run, nominal.estimates))
+    return Comparison(**of_run, reference_residual=residual, nominal=nominal, offset=offset, initial=initial)
 
 
-def _condition(config: Config, recording: Chunk, initial_error: float, threshold: float, journal: RunLog) -> Condition:
-    estimates, error = _estimated(config, recording, initial_error, journal)
-    t, start = estimates["t"], journal.alignments[0].t
+def _condition(run: Run, recording: Chunk, initial_error: float, threshold: float) -> Condition:
+    estimates, error = _estimated(run, recording)
+    t, start = estimates["t"], run.journal.alignments[0].t
     below = np.abs(error) < threshold
     first = np.array([t[np.argmax(column)] - start if np.any(column) else np.nan for column in below.T])
     cuts = np.linspace(0, len(recording), SEGMENTS + 1).astype(int)
     parts = [recording.part(int(a), int(b)) for a, b in pairwise(cuts)]
-    segments = np.array([_segment(config, part, initial_error, error.shape[1]) for part in parts])
+    segments = np.array([_segment(run.config, part, initial_error, error.shape[1]) for part in parts])
     whole = [rms_over_time(estimates, error, start, length) for length in (30.0, np.inf)]
     return Condition(whole[0], whole[1], segments, first, estimates)
 
 
 def _segment(config: Config, part: Chunk, initial_error: float, d: int) -> Array:
-    journal = RunLog()
+    run = Run(config, RunLog(), initial_error=initial_error)
     try:
-        estimates, error = _estimated(config, part, initial_error, journal)
+        estimates, error = _estimated(run, part)
     except NotAtRest:
         return np.full(d, np.nan)
-    return rms_over_time(estimates, error, journal.alignments[0].t)
+    return rms_over_time(estimates, error, run.journal.alignments[0].t)
 
 
-def _estimated(config: Config, samples: Chunk, initial_error: float, journal: RunLog) -> tuple[Columns, Array]:
+def _estimated(run: Run, samples: Chunk) -> tuple[Columns, Array]:
     """Return the estimates of a run, and their error."""
-    estimates = joined(Run(config, journal, initial_error=initial_error).over([samples]))
+    estimates = joined(run.over([samples]))
     return estimates, filter_error(estimates)
 
 
@@ -248,9 +222,8 @@ def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
 
 def verdict(runs: Mapping[str, Comparison]) -> str:
     """Return the config that predicts best, and whether that is more than chance."""
-    unit = next(iter(runs.values())).initial.unit
-    scores = {name: run.yardsticks for name, run in runs.items()}
-    return coast_verdict(scores, unit, min(run.span for run in runs.values()))
+    first, scores = next(iter(runs.values())), {name: run.yardsticks for name, run in runs.items()}
+    return coast_verdict(scores, first.unit, min(run.span for run in runs.values()))
 
 
 def limit_lines(runs: Mapping[str, Comparison]) -> list[str]:

@@ -13,18 +13,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.evaluation.limits import Measured
+from driftlab.evaluation.limits import LimitResult, Measured, check_limits
 from driftlab.evaluation.measurements import Averages, of_coast, of_map
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
+from driftlab.filtering.run import Run
+from driftlab.filtering.segment import RunLog
 from driftlab.recordings.prefetch import prefetch
-from driftlab.units import tracked_unit
+from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
-from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, ThermalBias
+from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor, ThermalBias
 from fusion_core.fast import compiled
 from fusion_core.model import Flags
 
@@ -307,22 +310,69 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     return Averages(alignment.dt, sensor.axes, lambda block: clamped.bias(block["temperature"]))
 
 
-def run_measurements(
-    config: Config, overview: Overview, alignment: Alignment, averages: Averages | None
-) -> dict[str, Measured]:
-    """Return the measurements by a run of the quantities that a config may limit.
+@dataclass(frozen=True)
+class ScoredRun:
+    """One recording through one config, at a glance: the figures and files of each command are made of it."""
 
-    The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
-    survey has filled; residual, swing and hysteresis are of the map.
-    """
-    if config.filter is None:
-        return {}
-    fitted, limits = map_of(config), config.limits
-    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, config.filter.align)}
-    if averages is not None and limits is not None and limits.noise is not None:
-        measured["noise"] = averages.noise()
-    if averages is not None and limits is not None and limits.bias_instability is not None:
-        measured["bias_instability"] = averages.measured()
-    if fitted is not None:
-        measured |= of_map(fitted, tracked_unit(config.filter))
-    return measured
+    config: Config
+    model: MeasurementModel
+    journal: RunLog
+    overview: Overview
+    averages: Averages | None  # those of `averages_of`
+
+    @property
+    def yardsticks(self) -> Scores:
+        """The scores of the filter and of its coast."""
+        return self.overview.yardsticks
+
+    @property
+    def alignment(self) -> Alignment:
+        """The first alignment."""
+        return self.journal.alignments[0]
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor whose bias is estimated."""
+        return self.model.tracked
+
+    @property
+    def unit(self) -> BiasUnit:
+        """The unit of its bias."""
+        return unit_of(self.sensor)
+
+    @property
+    def span(self) -> float:
+        """Time from the end of the alignment to the end, s."""
+        return self.overview.end - self.alignment.t
+
+    @cached_property
+    def measured(self) -> dict[str, Measured]:
+        """Measurements of the quantities that a config may limit, by their names.
+
+        The coast is that of the run; noise and bias instability are of the averages, where a limit asks for them;
+        residual, swing and hysteresis are of the map.
+        """
+        fitted, limits = map_of(self.config), self.config.limits
+        measured = {"coast": of_coast(self.yardsticks, self.span, self.model.align)}
+        if self.averages is not None and limits is not None:
+            measured |= {} if limits.noise is None else {"noise": self.averages.noise()}
+            measured |= {} if limits.bias_instability is None else {"bias_instability": self.averages.measured()}
+        return measured if fitted is None else measured | of_map(fitted, self.unit)
+
+    @cached_property
+    def judged(self) -> list[LimitResult]:
+        """The limits of the config, each held against its measurement."""
+        return [] if self.config.limits is None else check_limits(self.config.limits, self.measured)
+
+
+def accumulator_of(run: Run) -> OverviewAccumulator:
+    """Return the accumulator of a run's overview, and of the averages that the config's limits need."""
+    first = run.journal.alignments[0]
+    return OverviewAccumulator(run.model, first, averages_of(run.config, first))
+
+
+def scored(run: Run, rows: OverviewAccumulator | Mapping[str, Array]) -> ScoredRun:
+    """Return a run with its overview, from its columns or from the accumulator that has seen them all."""
+    gathered = rows if isinstance(rows, OverviewAccumulator) else accumulator_of(run).read(rows)
+    overview = gathered.overview(run.journal.faults.first_row)
+    return ScoredRun(run.config, run.model, run.journal, overview, gathered.averages)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.evaluation.overview import Overview
+from driftlab.evaluation.overview import ScoredRun
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
-from driftlab.units import axis_name, unit_of
+from driftlab.units import axis_name
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest
-from fusion_core.contracts import MeasurementModel, Sensor
+from fusion_core.contracts import Sensor
 from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
@@ -22,10 +22,10 @@ NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only be
 Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
 
-def summarise(overview: Overview, model: MeasurementModel, journal: RunLog) -> dict[str, Any]:
+def summarise(run: ScoredRun) -> dict[str, Any]:
     """Return the content of `summary.json`."""
-    first = journal.alignments[0]
-    scores, nis, unit = overview.yardsticks, overview.nis, unit_of(model.tracked)
+    overview, model, journal, first = run.overview, run.model, run.journal, run.alignment
+    scores, nis, unit = run.yardsticks, overview.nis, run.unit
     heading = {"coast_heading_error_rad": scores.heading} if model.tracked.integral else {}
     return {
         "t": {
@@ -57,16 +57,17 @@ def summarise(overview: Overview, model: MeasurementModel, journal: RunLog) -> d
     }
 
 
-def remarks(overview: Overview, model: MeasurementModel, journal: RunLog) -> list[str]:
+def remarks(run: ScoredRun) -> list[str]:
     """Return the remarks on a run for its user, one sentence each."""
-    lines = [*journal.faults.lines(), *_rejected(overview, model, journal), *_scored(overview, journal)]
+    overview, model, journal = run.overview, run.model, run.journal
+    lines = [*journal.faults.lines(), *_rejected(run), *_scored(run)]
     first, *again = journal.alignments
     if again:
         when = f"at {moment(again[0].t, journal.faults.first_row)}"
         times = when if len(again) == 1 else f"{len(again)} times, first {when}"
         other = "attitude or bias" if model.tracked.integral else "bias"
         lines.append(f"aligned again {times}: still, but at another {other} than before")
-    lasted, nis = overview.end - first.t, overview.nis
+    lasted, nis = run.span, overview.nis
     if overview.used == 0:
         lines.append("no update was used: nothing is known of the bias; check the channels' units and paths, and noise")
     elif lasted < SHORT:
@@ -107,9 +108,9 @@ def _noise(sensor: Sensor, ratio: dict[str, Array]) -> list[str]:
     ]
 
 
-def _rejected(overview: Overview, model: MeasurementModel, journal: RunLog) -> list[str]:
+def _rejected(run: ScoredRun) -> list[str]:
     """Return the motion of the unit, and the refusals without one."""
-    lines = []
+    journal, swing, lines = run.journal, run.overview.swing, []
     if journal.moving.spans:
         lines.append(
             f"motion, not used: {_extent(journal.moving.spans, journal)}, seen by {', '.join(journal.moving.worst())}"
@@ -119,12 +120,12 @@ def _rejected(overview: Overview, model: MeasurementModel, journal: RunLog) -> l
         return lines
     advice = "the model does not fit there: its map, walk or noise is wrong"
     if all(axis.startswith("accel") for axis in axes):
-        warmed = f", while the temperature moved by {overview.swing:.1f} K" if overview.swing >= 1 else ""
+        warmed = f", while the temperature moved by {swing:.1f} K" if swing >= 1 else ""
         advice = (
             f"that looks like an accelerometer whose bias drifts{warmed}, and not like motion; "
             "raise filter.accel.bias.walk, or write `accel: null` under filter"
         )
-    still = "the unit stood still" if model.tracked.integral else "nothing moved"
+    still = "the unit stood still" if run.sensor.integral else "nothing moved"
     return [
         *lines,
         f"refused although {still}: {_extent(refused, journal)}, because of {', '.join(axes)}; "
@@ -149,9 +150,9 @@ def _extent(spans: Sequence[tuple[float, float]], journal: RunLog) -> str:
     return f"{total:.1f} s in {count} (first at {moment(spans[0][0], journal.faults.first_row)})"
 
 
-def _scored(overview: Overview, journal: RunLog) -> list[str]:
+def _scored(run: ScoredRun) -> list[str]:
     """Return the scores that have no value although the recording is long enough, and the time that others stand on."""
-    scores, lasted = overview.yardsticks, overview.end - journal.alignments[0].t
+    scores, lasted = run.yardsticks, run.span
     lengths = {FIRST: 30.0, WHOLE: SHORT, **HORIZONS, "to the end": SHORT}
     missing = [
         f"{name} ({100 * scores.share[name]:.0f} %)"
@@ -176,21 +177,21 @@ def _scored(overview: Overview, journal: RunLog) -> list[str]:
 def error_rows(runs: Sequence[Scores]) -> Rows:
     """Return the rows of the table of errors, what decides first: a label, and for each run the errors (d,) in SI."""
     rows = []
-    for name in LONGEST_FIRST:
-        rows.append((f"prediction, {name}", [run.coast[name] for run in runs]))
-        rows.append(("  its sigma", [run.coast_sigma[name] for run in runs]))
-    return [
-        *rows,
-        ("bias, all", [run.filter_whole for run in runs]),
-        ("bias, first 30 s", [run.filter_first for run in runs]),
-    ]
+    for label, columns in error_pairs(runs):
+        rows.append((label, [errors for errors, _ in columns]))
+        if sigmas := [sigma for _, sigma in columns if sigma is not None]:
+            rows.append(("  its sigma", sigmas))
+    return rows
 
 
 def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, Sequence[tuple[Array, Array | None]]]]:
     """Return the rows of `error_rows` with the sigma of a prediction beside its error, None where there is none."""
     predicted = [(name, [(run.coast[name], run.coast_sigma[name]) for run in runs]) for name in LONGEST_FIRST]
-    filters = [(label, [(values, None) for values in columns]) for label, columns in error_rows(runs)[-2:]]
-    return [*((f"prediction, {name}", columns) for name, columns in predicted), *filters]
+    return [
+        *((f"prediction, {name}", columns) for name, columns in predicted),
+        ("bias, all", [(run.filter_whole, None) for run in runs]),
+        ("bias, first 30 s", [(run.filter_first, None) for run in runs]),
+    ]
 
 
 def coasts_over_axes(rows: Rows) -> Rows:

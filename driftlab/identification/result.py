@@ -30,8 +30,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, ThermalMap
 
 if TYPE_CHECKING:
-    from driftlab.evaluation.overview import Overview
-    from driftlab.filtering.segment import RunLog
+    from driftlab.evaluation.overview import ScoredRun
 
 
 @dataclass(frozen=True)
@@ -110,10 +109,7 @@ SURE = 1.645  # deviations: one-sided, 95 %
 
 @dataclass(frozen=True)
 class Outcome:
-    """One test recording through both configs: N times, d axes, SI.
-
-    `overviews` are of the two runs; log and remarks are of the second.
-    """
+    """One test recording through both configs, before and after: N times, d axes, SI."""
 
     name: str
     unit: BiasUnit
@@ -124,9 +120,8 @@ class Outcome:
     after: Array
     before_sigma: Array
     after_sigma: Array
-    overviews: tuple[Overview, Overview]
-    journal: RunLog
-    remarks: tuple[str, ...] = ()
+    runs: tuple[ScoredRun, ScoredRun]
+    remarks: tuple[str, ...] = ()  # on the second
 
 
 @dataclass(frozen=True)
@@ -223,7 +218,7 @@ def as_json(whole: Identification, recordings: Mapping[str, Sequence[Mapping[str
         "candidates_tried": state.tried,
         "left_out": {"before": before, "after": after},
         **{
-            name: _errors([outcome.overviews[k] for outcome in whole.outcomes], unit)
+            name: _errors([outcome.runs[k] for outcome in whole.outcomes], unit)
             for k, name in enumerate(("before", "after"))
         },
     }  # fmt: skip
@@ -285,12 +280,12 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _errors(overviews: Sequence[Overview], unit: BiasUnit) -> dict[str, Any]:
+def _errors(runs: Sequence[ScoredRun], unit: BiasUnit) -> dict[str, Any]:
     """Return the errors over all test recordings: rms of the rms, mean of the nis, least of the p values.
 
     Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
     """
-    scores = [overview.yardsticks for overview in overviews]
+    scores = [run.yardsticks for run in runs]
     rms = {
         "coast_rmse": [one.coast["to the end"] for one in scores],
         "coast_sigma": [one.coast_sigma["to the end"] for one in scores],
@@ -298,8 +293,8 @@ def _errors(overviews: Sequence[Overview], unit: BiasUnit) -> dict[str, Any]:
     }
     return {
         **{unit.key(name): np.sqrt(np.mean(np.square(values), axis=0)) for name, values in rms.items()},
-        "nis": float(np.mean([overview.nis.mean for overview in overviews])),
-        "whiteness_p": float(min(np.min(one.whiteness_p[-len(one.bias) :]) for one in overviews)),
+        "nis": float(np.mean([run.overview.nis.mean for run in runs])),
+        "whiteness_p": float(min(np.min(run.overview.whiteness_p[-len(run.sensor.axes) :]) for run in runs)),
     }
 
 

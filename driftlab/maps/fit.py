@@ -39,6 +39,14 @@ LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them a
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
+def usual_settings(config: Config, faults: Faults) -> ThermalMap:
+    """Return the map that the config names, or the usual one, which is then noted."""
+    if config.tracked_maps():
+        return map_settings(config, None)
+    faults.note(f"kind of map: {USUAL}, since the config names none; --compare tells which kind predicts best")
+    return map_settings(config, USUAL)
+
+
 def map_settings(config: Config, kind: str | None) -> ThermalMap:
     """Return the map that the config names, or one of `kind` with its default settings.
 
@@ -62,23 +70,15 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
     return classes[kind].model_validate({"kind": kind})  # type: ignore[return-value]
 
 
-def fit_map(
-    config: Config,
-    recordings: Sequence[str],
-    kind: str | None,
-    faults: Faults,
-    progress: Progress | None = None,
-) -> FittedMap:
+def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults: Faults) -> FittedMap:
     """Fit a thermal map on one or more recordings (`PATH` or `PATH::START:STOP`) at rest, Earth rate removed.
-
-    `progress`, where given, is called with the recording's time in s and the number of samples so far.
 
     Raises
     ------
     DataError
         If a recording cannot be used, or its temperature moves too little.
     """
-    return fit_gathered(config, map_settings(config, kind), gather(config, recordings, faults, progress))
+    return fit_gathered(config, map_settings(config, kind), gather(config, recordings, faults))
 
 
 def fit_gathered(

@@ -14,7 +14,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from driftlab.evaluation.limits import LimitResult, Measured
 from driftlab.evaluation.measurements import normal, of_map
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_noise import Densities, soaked_of
+from driftlab.production.manifest import ManifestEntry
 from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
@@ -53,19 +54,13 @@ Recordings = Mapping[str, Sequence[str]]  # by role
 
 
 @dataclass(frozen=True)
-class Task:
-    """The work on one unit.
+class Task(ManifestEntry):
+    """The work on one unit of a manifest.
 
-    `recordings` has by role (`calibration`, `train`, `holdout`) `PATH` or `PATH::START:STOP`, or a URL in place of the
-    path; lot, date and `more`, the other columns, are as the manifest has them.
+    A recording is `PATH` or `PATH::START:STOP`, or a URL in place of the path.
     """
 
-    unit: str
-    recordings: Mapping[str, tuple[str, ...]]
-    config: str  # the whole, as YAML
-    lot: str = ""
-    date: str = ""
-    more: Mapping[str, str] = field(default_factory=dict)
+    config: str = ""  # the whole, as YAML
     folder: str = "."  # that relative paths are relative to
     explain: bool = False  # whether the loop is closed, where there are recordings for it
     page: bool = False  # whether the pages of run and map are written
@@ -263,12 +258,11 @@ def pages_of(
     sheet = replace(sheet_of(unit.config, soaks, plugins=participants(unit.settings)), maps=[facts])
     pages = {"map.report.html": map.page_of(unit.verdict, unit.bias_unit, notes, sheet)}
     if run.result is not None:
-        result, config = run.result, run.result.config
-        sheet = replace(sheet_of(config, judged=result.judged, plugins=result.summary["plugins"]), maps=[facts])
+        result = run.result
+        sheet = replace(sheet_of(result.config, judged=result.judged, plugins=result.summary["plugins"]), maps=[facts])
         pages["report.html"] = run_report.page_of(
-            result.overview, result.summary, title=result.name, config=config.as_yaml(), model=result.model,
-            journal=result.journal, sheet=sheet, fitted=unit.fitted,
-        )  # fmt: skip
+            result.run, result.summary, title=result.name, sheet=sheet, fitted=unit.fitted
+        )
     return {f"page/{name}": page.encode() for name, page in pages.items()}
 
 

@@ -35,7 +35,7 @@ from driftlab.family.record import Figure
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict
-from driftlab.maps.fit import USUAL, GatheredSoak, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, usual_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain
@@ -104,10 +104,7 @@ class UnitMap:
 
 def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMap:
     """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
-    named = bool(config.tracked_maps())
-    if not named:
-        faults.note(f"kind of map: {USUAL}, since the config names none; --compare tells which kind predicts best")
-    settings = map_settings(config, None if named else USUAL)
+    settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, soak)
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
@@ -157,17 +154,16 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
         )
     config = unit.lenient if tests else unit.config
     name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
-    alignment = result.journal.alignments[0]
-    noise = of_alignment(result.model.tracked, alignment, result.model.align)
-    overview = result.overview
-    coasts = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
+    of_run = result.run
+    noise = of_alignment(of_run.sensor, of_run.alignment, of_run.model.align)
+    coasts = coasts_of(of_run.yardsticks, of_run.span, noise.values, walk)
     limits = plain([row.as_json(unit.bias_unit) for row in result.judged])
     return CoastResult(name, not tests, coasts, limits, result.lines(), result)
 
 
 def _badness(one: tuple[str, RunResult]) -> float:
     """Return the largest coast over ten minutes, or over a shorter time where there is none."""
-    scores = (one[1].overview.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
+    scores = (one[1].run.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
     known = next((values for values in scores if np.any(np.isfinite(values))), np.zeros(1))
     return float(np.nanmax(known))
 

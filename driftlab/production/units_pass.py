@@ -136,10 +136,8 @@ class UnitJobs:
             yield task
 
     def _task(self, entry: ManifestEntry, *, page: bool = False) -> Task:
-        return Task(
-            entry.unit, entry.recordings, self.config, lot=entry.lot, date=entry.date, more=entry.more,
-            folder=os.getcwd(), explain=self.options.explain, page=page,
-        )  # fmt: skip
+        here, explain = os.getcwd(), self.options.explain
+        return Task(**vars(entry), config=self.config, folder=here, explain=explain, page=page)
 
     def _stays(self, record: UnitRecord, task: Task) -> bool:
         """Return True if a unit of another stamp is the same as before, or could not be done again."""

@@ -67,7 +67,7 @@ def tables(closed: Identification) -> list[Table]:
 
 def _rows(outcome: Outcome, sides: int = 2) -> Rows:
     """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
-    return error_rows([overview.yardsticks for overview in outcome.overviews[:sides]])
+    return error_rows([run.yardsticks for run in outcome.runs[:sides]])
 
 
 def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:
@@ -166,8 +166,9 @@ STRETCHES = 600  # of an error, whose smallest and largest value are drawn
 def prediction_chart(outcome: Outcome, axes: Sequence[str], changed: bool = True) -> Chart:
     """Return the measured and the predicted bias of each axis, before and after, the errors below, and temperature."""
     rows, factor, unit = thin(len(outcome.t)), outcome.unit.factor, outcome.unit.shown
-    clock = Clock(outcome.overviews[0].first_row, float(outcome.t[-1]))
-    t, shades = clock(outcome.t), event_shades(outcome.journal, clock, "refused, after" if changed else "refused")
+    before, after = outcome.runs
+    clock = Clock(before.overview.first_row, float(outcome.t[-1]))
+    t, shades = clock(outcome.t), event_shades(after.journal, clock, "refused, after" if changed else "refused")
     sides = _sides(outcome, changed)
 
     def biases(k: int) -> Iterator[Line]:

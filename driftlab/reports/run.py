@@ -14,38 +14,30 @@ from typing import Any
 import numpy as np
 
 from driftlab.evaluation.comparison import REFUTED
-from driftlab.evaluation.overview import SMOOTHED, Overview
-from driftlab.evaluation.scores import Scores, moving_average
+from driftlab.evaluation.overview import SMOOTHED, Overview, ScoredRun
+from driftlab.evaluation.scores import Scores
 from driftlab.evaluation.summary import error_pairs, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
 from driftlab.reports.charts import Chart, Clock, Line, Panel, Rule, Shade
 from driftlab.reports.pages import drawing, page
 from driftlab.reports.provenance import Sheet
-from driftlab.units import BiasUnit, duration, formatted, unit_of
+from driftlab.units import BiasUnit, duration, formatted
 from fusion_core.chunk import Array, read_only
 from fusion_core.consistency import NisTest
-from fusion_core.contracts import FittedMap, MeasurementModel, ReportSection, Section
+from fusion_core.contracts import FittedMap, ReportSection, Section
 from fusion_core.errors import FusionError, moment
 from fusion_core.host.guard import guarded
 from fusion_core.host.registry import registry
 
 
 def page_of(
-    overview: Overview,
-    summary: dict[str, Any],
-    *,
-    title: str,
-    config: str,
-    model: MeasurementModel,
-    journal: RunLog,
-    sheet: Sheet,
-    fitted: FittedMap | None = None,
+    run: ScoredRun, summary: dict[str, Any], *, title: str, sheet: Sheet, fitted: FittedMap | None = None
 ) -> str:
     """Return the page of one run; `fitted` is the map that it used, where it used one, `summary` is for plugins."""
-    scores, sensor, unit = overview.yardsticks, model.tracked, unit_of(model.tracked)
+    overview, model, scores, sensor, unit = run.overview, run.model, run.yardsticks, run.sensor, run.unit
     domain = None if fitted is None else fitted.domain
-    aligned = moment(journal.alignments[0].t, journal.faults.first_row)
+    aligned = moment(run.alignment.t, run.journal.faults.first_row)
     headings = scores.heading.items() if sensor.integral is not None else ()
     return page(
         "report",
@@ -53,11 +45,11 @@ def page_of(
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
         results=result_sentences(scores, unit, heading=sensor.integral is not None),
-        remarks=remarks(overview, model, journal),
+        remarks=remarks(run),
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
-        bias=bias_chart(overview, model, journal, domain=domain),
-        error=error_chart(overview, model, journal),
+        bias=bias_chart(run, domain=domain),
+        error=error_chart(run),
         domain=domain,
         axes=sensor.axes,
         unit=unit.shown,
@@ -69,7 +61,7 @@ def page_of(
             f"{name} {formatted(p, '.2g')}" for name, p in zip(model.space.labels, overview.whiteness_p, strict=False)
         ),
         map_chart=fitted and map_chart(fitted, overview, unit, sensor.axes),
-        config=config,
+        config=run.config.as_yaml(),
         sections=sections(summary, overview.curves),
     )
 
@@ -120,24 +112,14 @@ NEAR = 1.0  # swings of the temperature from it, within which an end of the map'
 Z95 = 1.96
 
 
-def bias_chart(
-    overview: Overview,
-    model: MeasurementModel,
-    journal: RunLog,
-    *,
-    errors: bool = False,
-    domain: tuple[float, float] | None = None,
-) -> Chart:
+def bias_chart(run: ScoredRun, *, errors: bool = False, domain: tuple[float, float] | None = None) -> Chart:
     """Return reference, estimate and coast of each axis over time, and temperature.
 
     With `errors` the panels of `error_chart` stand below those of the bias; `domain` is of the map, degC.
     """
-    curves, sensor = overview.curves, model.tracked
-    clock = Clock(overview.first_row, overview.end)
-    t, shades = clock(curves["t"]), event_shades(journal, clock)
-    reference = curves.get("reference")
-    if reference is None:
-        reference = moving_average(curves["t"], curves["rate"], curves["tau"], curves["still"].astype(bool))
+    curves, sensor = run.overview.curves, run.sensor
+    clock = Clock(run.overview.first_row, run.overview.end)
+    t, shades = clock(curves["t"]), event_shades(run.journal, clock)
     coasting = np.isfinite(curves["coast"][:, 0])
 
     def lines(k: int) -> Iterator[Line]:
@@ -147,7 +129,7 @@ def bias_chart(
         yield Line(
             t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread
         )  # wide: below all
-        yield Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
+        yield Line(t, curves["reference"][:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
         yield Line(t, coast, "prediction", "coast", style="dashed")
         if SMOOTHED in curves:
@@ -155,7 +137,7 @@ def bias_chart(
 
     panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
     if errors:
-        panels += error_chart(overview, model, journal).panels
+        panels += error_chart(run).panels
     if "temperature" in curves:
         T = curves["temperature"]
         panels += (charts.temperature_panel(t, T, shades, rules=_domain_rules(T, domain)),)
@@ -171,10 +153,10 @@ def event_shades(journal: RunLog, clock: Clock, refused: str = "refused") -> tup
     )
 
 
-def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) -> Chart:
+def error_chart(run: ScoredRun) -> Chart:
     """Return the errors of estimate and coast against the reference, with two deviations of what the filter says."""
-    curves, errors, sensor = overview.curves, overview.errors, model.tracked
-    clock = Clock(overview.first_row, overview.end)
+    curves, errors, sensor = run.overview.curves, run.overview.errors, run.sensor
+    clock = Clock(run.overview.first_row, run.overview.end)
     t, when = clock(curves["t"]), clock(errors["t"])
 
     def lines(k: int) -> Iterator[Line]:
@@ -185,7 +167,7 @@ def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) ->
         yield Line(when, error, "estimate less reference", "error")
         yield Line(when, errors["coast"][:, k] * sensor.factor, "prediction less reference", "coast", style="dashed")
 
-    shades = event_shades(journal, clock)
+    shades = event_shades(run.journal, clock)
     panels = charts.axis_panels(sensor.axes, lines, "error", sensor.shown, legibly=True, shades=shades)
     return Chart(panels, clock.label, "Error")
 

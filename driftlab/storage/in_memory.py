@@ -19,10 +19,11 @@ from pydantic import PrivateAttr, computed_field
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL, Source, Usual
+from fusion_core.contracts.table import si_of_channel
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, quote
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
-from fusion_core.units import convert, si_unit_of
+from fusion_core.units import convert
 
 _COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\])?")
 
@@ -242,20 +243,7 @@ def _si(name: str, unit: str | None, usual: Usual | None, title: str) -> str | N
                 f'units={{"{name}": "{usual.example}"}}'
             )
         return None
-    example = (usual.example if usual else None) or "0.1 V"
     try:
-        si = si_unit_of(unit)
-    except UnitError:
-        raise UnitError(
-            f"{title}: channel {name}: unit '{quote(unit)}' is not known; write it like '{example}'"
-        ) from None
-    if usual is None:
-        return si
-    try:
-        convert([0.0, 1.0], unit, usual.si)
-    except UnitError:
-        advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
-        raise UnitError(
-            f"{title}: channel {name}: unit '{quote(unit)}' cannot be converted to {usual.si}; {advice}"
-        ) from None
-    return usual.si
+        return si_of_channel(name, unit)
+    except UnitError as error:
+        raise UnitError(f"{title}: {error}") from None

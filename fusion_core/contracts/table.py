@@ -167,19 +167,8 @@ class Channel(Settings):
 
     def check(self, name: str) -> None:
         """Raise UnitError where the unit is unknown or of the wrong dimension for channel `name`."""
-        if self.unit is None:
-            return
-        usual = USUAL.get(name)
-        example = (usual and usual.example) or "0.1 V"
-        try:
-            si_unit_of(self.unit)
-        except UnitError:
-            raise UnitError(
-                f"channel {name}: unit '{quote(self.unit)}' is not known; write it like '{example}'"
-            ) from None
-        if usual and _scale(self.unit, usual.si) is None:
-            advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
-            raise UnitError(f"channel {name}: unit '{quote(self.unit)}' cannot be converted to {usual.si}; {advice}")
+        if self.unit is not None:
+            si_of_channel(name, self.unit)
 
     def conversion(self, file: Path, name: str, path: str, in_file: str | None) -> tuple[str, str] | None:
         """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
@@ -213,6 +202,20 @@ class Channel(Settings):
         return None if theirs is None or in_file is None or si is None else (in_file, si)
 
 
+def si_of_channel(name: str, unit: str) -> str:
+    """Return the SI unit of channel `name` given in `unit`; raises UnitError as `Channel.check`."""
+    usual = USUAL.get(name)
+    example = (usual and usual.example) or "0.1 V"
+    try:
+        si = si_unit_of(unit)
+    except UnitError:
+        raise UnitError(f"channel {name}: unit '{quote(unit)}' is not known; write it like '{example}'") from None
+    if usual and _scale(unit, usual.si) is None:
+        advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
+        raise UnitError(f"channel {name}: unit '{quote(unit)}' cannot be converted to {usual.si}; {advice}")
+    return usual.si if usual else si
+
+
 def _si(unit: str | None) -> str | None:
     try:
         return None if unit is None else si_unit_of(unit)
@@ -223,7 +226,6 @@ def _si(unit: str | None) -> str | None:
 def _scale(unit: str, si: str) -> list[float] | None:
     """Return 0 and 1 `unit` in `si`, or None where the unit is unknown or of another dimension."""
     try:
-        zero, one = convert([0.0, 1.0], unit, si)
-        return [float(zero), float(one)]
+        return [float(value) for value in convert([0.0, 1.0], unit, si)]
     except UnitError:
         return None

@@ -4,7 +4,7 @@ import numpy as np
 from epochs_at_rest import DEG_H, epochs_at_rest
 
 from driftlab.config import Config
-from driftlab.evaluation.overview import OverviewAccumulator
+from driftlab.evaluation.overview import scored
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from fusion_core.chunk import Chunk
@@ -56,12 +56,10 @@ def config(noise="3.18 deg/h/sqrt(Hz)", walk="0.05 deg/h/sqrt(s)", of_map=None, 
 
 
 def run_over(settings, chunk):
-    """Return the journal, the joined columns, and the overview."""
-    journal = RunLog()
-    run = Run(settings, journal)
+    """Return the scored run, and its joined columns."""
+    run = Run(settings, RunLog())
     columns = joined(run.over([chunk]))
-    overview = OverviewAccumulator(run.model, journal.alignments[0]).read(columns).overview()
-    return journal, columns, overview, run.model
+    return scored(run, columns), columns
 
 
 def true_rms(columns, name, truth):

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from driftlab.evaluation.overview import Overview
+from driftlab.config import Config
+from driftlab.evaluation.overview import Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
 from driftlab.evaluation.summary import remarks
 from driftlab.filtering.segment import RunLog
@@ -40,12 +41,16 @@ def nis(mean):
     return NisTest(mean, 0.99, 1.01)
 
 
+def said(overview, log):
+    return remarks(ScoredRun(Config(), MODEL, log, overview, None))
+
+
 def test_bounds_that_only_a_long_run_can_miss_are_no_news():
-    assert remarks(replace(QUIET, nis=nis(1.03)), MODEL, journal()) == []
+    assert said(replace(QUIET, nis=nis(1.03)), journal()) == []
 
 
 def test_a_quiet_run_has_nothing_to_say():
-    assert remarks(QUIET, MODEL, journal()) == []
+    assert said(QUIET, journal()) == []
 
 
 @pytest.mark.parametrize(
@@ -62,7 +67,7 @@ def test_a_quiet_run_has_nothing_to_say():
     ],
 )
 def test_each_thing_is_said_once(changes, log, expected):
-    (line,) = remarks(replace(QUIET, **changes), MODEL, log)
+    (line,) = said(replace(QUIET, **changes), log)
     assert expected in line
 
 
@@ -80,5 +85,5 @@ def test_no_reference_no_heading_error():
 
 def test_a_score_without_a_value_says_why():
     scores = replace(SCORES, filter_first=np.full(3, np.nan), share={**SCORES.share, "first 30 s": 0.1})
-    (line,) = remarks(replace(QUIET, yardsticks=scores), MODEL, journal())
+    (line,) = said(replace(QUIET, yardsticks=scores), journal())
     assert line.startswith("no score for first 30 s (10 %)")

@@ -145,8 +145,8 @@ def maps(tmp_path_factory):
 @pytest.mark.parametrize("kind", [None, "polynomial", "spline"])
 def test_the_sigma_of_a_run_is_finite_and_never_below_the_departures(kind, maps):
     chunk, _ = day(0)
-    journal, columns, overview, _ = run_over(config(of_map=maps.get(kind)), chunk)
-    aligned = columns["t"] > journal.alignments[0].t
+    run, columns = run_over(config(of_map=maps.get(kind)), chunk)
+    aligned = columns["t"] > run.journal.alignments[0].t
     coast, running = columns["coast_sigma"], columns["bias_sigma"]
     assert np.all(np.isfinite(coast[aligned]))
     assert np.all(np.isnan(coast[~aligned]))
@@ -155,13 +155,13 @@ def test_the_sigma_of_a_run_is_finite_and_never_below_the_departures(kind, maps)
     assert np.all(coast[aligned] >= 0.99 * running[k - 1])
     t = columns["t"][aligned] - columns["t"][k - 1]
     walk = 0.05 * DEG_H
-    tilt = journal.alignments[0].unsure
+    tilt = run.journal.alignments[0].unsure
     assert np.all(coast[aligned] ** 2 >= 0.999 * (walk**2 * t[:, None] + tilt**2))
     if kind is None:  # nothing else is known of: departure, walk and vertical are all of it
         P = running[k - 1] ** 2 - tilt**2
         np.testing.assert_allclose(coast[aligned] ** 2, P + walk**2 * t[:, None] + tilt**2, rtol=1e-6)
     rms = np.sqrt(np.mean(coast[aligned] ** 2, axis=0))
-    np.testing.assert_allclose(overview.yardsticks.coast_sigma["to the end"], rms, rtol=1e-6)
+    np.testing.assert_allclose(run.yardsticks.coast_sigma["to the end"], rms, rtol=1e-6)
 
 
 def test_any_split_of_a_run_gives_the_same_sigma(maps):

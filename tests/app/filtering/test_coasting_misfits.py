@@ -35,13 +35,13 @@ def judged(misfit, maps, seed=0):
 
 @pytest.mark.parametrize("misfit", MISFITS)
 def test_a_misfit_is_scored_against_the_truth_over_all_epochs(misfit, maps):
-    truth, (journal, columns, overview, _) = judged(misfit, maps)
-    found = overview.yardsticks
+    truth, (run, columns) = judged(misfit, maps)
+    found = run.yardsticks
     np.testing.assert_allclose(found.filter_whole, true_rms(columns, "bias", truth), rtol=0.1)
     np.testing.assert_allclose(found.coast["to the end"], true_rms(columns, "coast", truth), rtol=0.1)
     assert found.share["whole"] == pytest.approx(1.0)
     assert found.moved == 0.0
-    assert journal.moving.spans == []
+    assert run.journal.moving.spans == []
     # what the filter refused is where it is worst: scored by what it used, it would look twice as good
     used = np.isfinite(columns["coast"][:, 0]) & columns["used"]
     agreed = np.sqrt(np.mean((columns["bias"] - truth)[used] ** 2, axis=0))
@@ -60,18 +60,18 @@ def test_the_worse_model_has_the_worse_score(maps):
         {**FOG, "of_map": maps["polynomial"]},
         FOG,
     ):
-        _, _, overview, _ = run_over(config(**settings), chunk)
-        scores.append(overview.yardsticks.filter_whole[0])
+        run, _ = run_over(config(**settings), chunk)
+        scores.append(run.yardsticks.filter_whole[0])
     assert 10 * scores[0] < scores[1] < min(scores[2:])
 
 
 def test_what_was_refused_at_rest_is_said_to_be_no_motion(maps):
-    _, (journal, _, overview, model) = judged("a FOG's config", maps)
-    summary = summarise(overview, model, journal)
+    _, (run, _) = judged("a FOG's config", maps)
+    summary = summarise(run)
     assert summary["motion_s"] == []
     assert summary["refused_s"]
     assert summary["refused_axes"][0] == "gyro x"
-    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("refused")]
+    (line,) = [line for line in remarks(run) if line.startswith("refused")]
     assert line.startswith("refused although the unit stood still: ")
     assert "because of gyro x" in line
     assert "its map, walk or noise is wrong. The scores count it all the same" in line
@@ -83,12 +83,12 @@ def test_an_accelerometer_that_drifts_with_temperature_is_said_to_look_like_that
     drift = 1e-3 * G * (temperature(chunk.t) - 15.0)
     chunk = chunk.having(accel=chunk["accel"] + drift[:, None] * [1, 0, 0])
     accel = {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "5e-7 m/s^2/sqrt(s)"}}
-    journal, _, overview, model = run_over(config(of_map=maps["spline"], accel=accel), chunk)
-    summary = summarise(overview, model, journal)
+    run, _ = run_over(config(of_map=maps["spline"], accel=accel), chunk)
+    summary = summarise(run)
     assert summary["motion_s"] == []
     assert summary["refused_axes"] == ["accel x"]
     assert summary["temperature_swing_K"] == pytest.approx(25.0, abs=0.5)
-    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("refused")]
+    (line,) = [line for line in remarks(run) if line.startswith("refused")]
     assert "because of accel x; that looks like an accelerometer whose bias drifts" in line
     assert "while the temperature moved by 25" in line
     assert "raise filter.accel.bias.walk, or write `accel: null` under filter" in line
@@ -100,10 +100,10 @@ def test_motion_names_its_sensor_and_axis(axis, channel, size, maps):
     moved = (chunk.t > 700) & (chunk.t <= 720)
     values = chunk[channel].copy()
     values[moved, "xyz".index(axis)] += size * np.where(np.arange(np.sum(moved)) % 2, 1, -1)
-    journal, columns, overview, model = run_over(config(of_map=maps["spline"]), chunk.having(**{channel: values}))
-    summary = summarise(overview, model, journal)
+    run, columns = run_over(config(of_map=maps["spline"]), chunk.having(**{channel: values}))
+    summary = summarise(run)
     assert summary["motion_axes"] == [f"{channel} {axis}"]
-    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("motion")]
+    (line,) = [line for line in remarks(run) if line.startswith("motion")]
     assert line.endswith(f"(first at t = 701.0 s), seen by {channel} {axis}")
     ((start, stop),) = summary["motion_s"]
     assert start == 701.0
@@ -119,12 +119,12 @@ def test_a_unit_that_was_turned_was_turned_and_has_no_drifting_accelerometer(map
     moved = (chunk.t > 300) & (chunk.t <= 320)
     values[moved] += 0.02 * np.sin(3 * chunk.t[moved])[:, None]
     force = np.where((chunk.t > 320)[:, None], chunk["accel"][:, [0, 2, 1]], chunk["accel"])
-    journal, _, overview, model = run_over(config(of_map=maps["spline"]), chunk.having(gyro=values, accel=force))
-    summary = summarise(overview, model, journal)
+    run, _ = run_over(config(of_map=maps["spline"]), chunk.having(gyro=values, accel=force))
+    summary = summarise(run)
     ((start, stop),) = summary["motion_s"]
     assert start == 301.0
     assert stop == pytest.approx(380, abs=2)
-    assert [line.split(":")[0].split(" at t")[0] for line in remarks(overview, model, journal)] == [
+    assert [line.split(":")[0].split(" at t")[0] for line in remarks(run)] == [
         "motion, not used",
         "aligned again",
     ]
@@ -139,8 +139,8 @@ def test_a_score_that_stands_on_little_says_why(gaps, moving, maps):
     sign = np.where(np.arange(len(chunk)) % 2, 1.0, -1.0)
     chunk = chunk.having(gyro=chunk["gyro"] + (shaken * sign)[:, None] * [0.02, 0, 0])
     chunk = chunk.where((chunk.t <= 61) | (phase <= 1 - gaps))
-    journal, _, overview, model = run_over(config(of_map=maps["spline"]), chunk)
-    lines = [line for line in remarks(overview, model, journal) if line.startswith("the scores")]
+    run, _ = run_over(config(of_map=maps["spline"]), chunk)
+    lines = [line for line in remarks(run) if line.startswith("the scores")]
     if gaps + moving < 0.1:
         assert lines == []
         return

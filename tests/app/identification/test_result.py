@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from driftlab.filtering.segment import RunLog
 from driftlab.identification.result import Outcome, change_of, sentence
 from driftlab.units import BiasUnit
 
@@ -11,7 +10,7 @@ def outcome(e, s, name="holdout.h5"):
     """Return what is predicted with errors e (n, d) before, changed by s (n, d)."""
     t, reference = 10.0 * np.arange(len(e)), np.zeros_like(e)
     sigma = np.ones_like(e)
-    return Outcome(name, BiasUnit("rad/s", "deg/h"), t, None, reference, e, e + s, sigma, sigma, (), RunLog())
+    return Outcome(name, BiasUnit("rad/s", "deg/h"), t, None, reference, e, e + s, sigma, sigma, ())
 
 
 def drawn(seed, slow):

@@ -146,7 +146,7 @@ def test_a_unit_in_a_bucket_is_done_as_one_here(bucket, tmp_path):
     family.write(tmp_path / "soak.h5", family.soak(family.deal(1)[0], hours=1.0))
     bucket.pipe("/line/0003/soak.h5", (tmp_path / "soak.h5").read_bytes())
     config = (Path(family.__file__).parent / "family.yaml").read_text()
-    here = Task("0003", {"calibration": ("soak.h5",)}, config, folder=str(tmp_path), page=True)
+    here = Task("0003", recordings={"calibration": ("soak.h5",)}, config=config, folder=str(tmp_path), page=True)
     there = replace(here, recordings={"calibration": ("memory://line/0003/soak.h5",)})
     assert key_of(here) == key_of(there)
     ours, theirs = (work(task) for task in (here, there))
@@ -164,7 +164,7 @@ def test_a_unit_in_a_bucket_is_done_as_one_here(bucket, tmp_path):
 
 def test_a_unit_that_is_not_in_the_bucket_is_a_record_that_says_so(bucket):
     config = (Path(family.__file__).parent / "family.yaml").read_text()
-    done = work(Task("0004", {"calibration": ("memory://line/0004/soak.h5",)}, config))
+    done = work(Task("0004", recordings={"calibration": ("memory://line/0004/soak.h5",)}, config=config))
     assert done.record.state == "failed"
     assert done.record.error.startswith("memory://line/0004/soak.h5: is not there")
     assert done.record.recordings == {"calibration": [{"name": "memory://line/0004/soak.h5"}]}

@@ -38,7 +38,7 @@ def folder(tmp_path_factory) -> Path:
 
 def task(folder, config=TEXT, **roles):
     given = {role: (names,) if isinstance(names, str) else names for role, names in roles.items()}
-    return Task("u", given or {"calibration": ("soak.h5",)}, config, folder=str(folder))
+    return Task("u", recordings=given or {"calibration": ("soak.h5",)}, config=config, folder=str(folder))
 
 
 def done(folder, config=TEXT, **roles):
@@ -214,7 +214,7 @@ def test_the_key_is_that_of_contents_config_and_versions(folder, tmp_path) -> No
     family.write(tmp_path / "other.h5", family.soak(UNIT, 1.0))
     key = key_of(task(folder))
     assert key == key_of(
-        Task("another", {"calibration": ("other.h5",)}, TEXT, "lot", "2026-01-01", folder=str(tmp_path))
+        Task("another", "lot", "2026-01-01", {"calibration": ("other.h5",)}, config=TEXT, folder=str(tmp_path))
     )
     assert key != key_of(task(folder, calibration="again.h5"))
     assert key != key_of(task(folder, calibration="soak.h5::0:1800"))
@@ -286,13 +286,15 @@ def test_several_recordings_with_gaps_and_another_thermometer(tmp_path) -> None:
 
 
 def test_pages_and_the_loop_are_there_where_they_are_asked_for(folder) -> None:
-    asked = Task("u", {"calibration": ("soak.h5",)}, TEXT, folder=str(folder), explain=True, page=True)
+    asked = Task(
+        "u", recordings={"calibration": ("soak.h5",)}, config=TEXT, folder=str(folder), explain=True, page=True
+    )
     found = work(asked)
     assert "train and holdout" in found.record.loop["why_not"]
     pages = [found.files[f"page/{name}"].decode() for name in ("report.html", "map.report.html")]
     assert all("map.json" in page and "driftlab-" not in page for page in pages)
     roles = {"calibration": ("soak.h5",), "train": ("again.h5",), "holdout": ("third.h5",)}
-    found = work(Task("u", roles, TEXT, folder=str(folder), explain=True))
+    found = work(Task("u", recordings=roles, config=TEXT, folder=str(folder), explain=True))
     assert found.record.loop["verdict"] in ("nothing_missing", "unexplained", "explained", "ambiguous")
     assert found.record.loop["effects"] == json.loads(found.files["explained/loop.json"])["effects"]
     assert found.record.coast_of == "third.h5"

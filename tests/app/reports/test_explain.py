@@ -17,9 +17,9 @@ def outcome(unit, value):
     t = np.arange(200.0)
     curve = np.full((200, 1), value)
     errors = [np.array([size]) for size in (value, value / 2)]
-    overviews = tuple(SimpleNamespace(first_row=0.0, yardsticks=scores(one)) for one in errors)
-    journal = RunLog(alignments=[SimpleNamespace(dt=1.0)])
-    return Outcome("day.h5", unit, t, None, curve, curve, curve, curve, curve, overviews, journal)
+    journal, overview = RunLog(alignments=[SimpleNamespace(dt=1.0)]), SimpleNamespace(first_row=0.0)
+    runs = tuple(SimpleNamespace(overview=overview, yardsticks=scores(one), journal=journal) for one in errors)
+    return Outcome("day.h5", unit, t, None, curve, curve, curve, curve, curve, runs)
 
 
 def scores(error):

@@ -58,8 +58,8 @@ def outcome(d=3, n=500, temperature=True):
     curves = [rng.normal(size=(n, d)) * 1e-5 for _ in range(3)]
     sigma = np.full((n, d), 1e-6)
     T = 20 + np.sin(t / 500) if temperature else None
-    journal = RunLog(alignments=[SimpleNamespace(dt=10.0)])
-    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), journal)
+    run = SimpleNamespace(overview=FIRST, journal=RunLog(alignments=[SimpleNamespace(dt=10.0)]))
+    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (run, run))
 
 
 def test_bias_and_error_of_each_axis_are_drawn_with_two_deviations():
@@ -87,8 +87,8 @@ def test_no_spike_of_an_error_is_left_out():
 
 def test_what_was_refused_and_what_moved_are_shaded():
     shown = outcome()
-    shown.journal.refused.spans.append((600.0, 700.0))
-    shown.journal.moving.spans.append((1200.0, 1300.0))
+    shown.runs[1].journal.refused.spans.append((600.0, 700.0))
+    shown.runs[1].journal.moving.spans.append((1200.0, 1300.0))
     chart = prediction_chart(shown, AXES)
     assert chart.label.endswith("[min]")
     for panel in chart.panels:

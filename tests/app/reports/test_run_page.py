@@ -127,7 +127,7 @@ def test_a_phone_shows_it_in_its_width(page, opened, dark):
 
 def test_motion_is_shaded_where_it_was(run):
     found, _ = run
-    (shade, *_) = bias_chart(found.overview, found.model, found.journal).panels[0].shades
+    (shade, *_) = bias_chart(found.run).panels[0].shades
     assert (shade.text, shade.role) == ("moved", "moving")
     ((start, stop),) = found.summary["motion_s"]
     assert shade.start == pytest.approx((start - 0.1) / 60, abs=1e-6)  # the update that ends at start began before it
@@ -136,7 +136,7 @@ def test_motion_is_shaded_where_it_was(run):
 
 def test_the_reference_is_broad_and_below_estimate_and_coast(run):
     found, _ = run
-    lines = bias_chart(found.overview, found.model, found.journal).panels[0].lines
+    lines = bias_chart(found.run).panels[0].lines
     roles = [line.role for line in lines if line.y is not None]
     assert roles == ["reference", "estimate", "coast"]
     assert [line.style for line in lines if line.y is not None] == ["line", "line", "dashed"]
@@ -145,7 +145,7 @@ def test_the_reference_is_broad_and_below_estimate_and_coast(run):
 
 def test_errors_are_those_of_every_row_in_a_scale_of_their_own(run):
     found, _ = run
-    chart = error_chart(found.overview, found.model, found.journal)
+    chart = error_chart(found.run)
     drawn = {line.name: line for line in chart.panels[2].lines}
     still = found.still.astype(bool) & np.isfinite(found.coast[:, 0])
     windows = [np.mean(found.rate[(abs(found.t - t) < 15 + 1e-9) & found.still.astype(bool), 2])
@@ -163,7 +163,7 @@ def test_errors_are_those_of_every_row_in_a_scale_of_their_own(run):
 def test_a_page_stays_small(run):
     found, out = run
     for chart in (bias_chart, error_chart):
-        for x in content(chart(found.overview, found.model, found.journal))["x"]:
+        for x in content(chart(found.run))["x"]:
             assert len(x) <= POINTS
     assert len(nis_chart(found.overview, found.model.m).panels[0].lines[1].x) <= 2 * STRETCHES
     assert (out / "report.html").stat().st_size < 1.5e6
