@@ -112,8 +112,9 @@ class FleetFolder:
         self.stamp(record.unit, record.key, stamp)
 
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
-        """Put the pages among the files of a unit into its folder, whole or not at all."""
-        pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items() if name.startswith(f"{PAGE}/")}
+        """Put the pages among the files of a unit into its folder, whole or not at all; its other files stay."""
+        files = {name: text for name, text in files.items() if name.startswith(f"{PAGE}/")}
+        pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items()}
         record, place = self.record(unit), self.unit(unit) / PAGE
         if pages and record is not None:
             self.note(record.model_copy(update={"written": record.written | _digests(files)}))

@@ -328,6 +328,17 @@ def test_each_unit_that_is_done_has_a_certificate_and_none_is_done_again_for_it(
         assert "A <b>" not in page
 
 
+def test_a_unit_whose_page_was_made_later_has_the_map_that_its_record_knows(fleet):
+    maps = sorted(Path("made/units").glob("*/map.json"))
+    before = [path.read_bytes() for path in maps]
+    fleet(pages=["0001"])
+    result, _ = fleet(certificate=True, settings=CERTIFICATE)
+    assert [path.read_bytes() for path in maps] == before
+    assert not [line for line in result.lines() if "has no certificate" in line]
+    page = Path("made/units/0001/page/report.html").read_text()
+    assert result.record("0001").written["map.json"] in page
+
+
 def test_a_certificate_stays_until_its_results_change_and_one_that_was_filled_in_is_put_aside(fleet):
     fleet(certificate=True, settings=CERTIFICATE)
     before = fleets.contents(Path("made"))
