@@ -216,7 +216,7 @@ def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
 
 
 class Envelope:
-    """Smallest and largest error of estimate and coast, and the nis, of STRETCHES to twice as many stretches of rows.
+    """Smallest and largest error of estimate and prediction, and nis, of STRETCHES to twice as many stretches of rows.
 
     All are as long; with one more than that, two and two become one.
     """
@@ -312,7 +312,7 @@ def run_measurements(
 ) -> dict[str, Measured]:
     """Return the measurements by a run of the quantities that a config may limit.
 
-    The coast is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
+    The prediction is that of the run; noise and bias instability are of `averages`, those of `averages_of`, which the
     survey has filled; residual, swing and hysteresis are of the map.
     """
     if config.filter is None:

@@ -128,7 +128,7 @@ def bias_chart(
     errors: bool = False,
     domain: tuple[float, float] | None = None,
 ) -> Chart:
-    """Return reference, estimate and coast of each axis over time, and temperature.
+    """Return reference, estimate and prediction of each axis over time, and temperature.
 
     With `errors` the panels of `error_chart` stand below those of the bias; `domain` is of the map, degC.
     """
@@ -172,7 +172,7 @@ def event_shades(journal: RunLog, clock: Clock, refused: str = "refused") -> tup
 
 
 def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) -> Chart:
-    """Return the errors of estimate and coast against the reference, with two deviations of what the filter says."""
+    """Return the errors of estimate and prediction against the reference, with two of the filter's deviations."""
     curves, errors, sensor = overview.curves, overview.errors, model.tracked
     clock = Clock(overview.first_row, overview.end)
     t, when = clock(curves["t"]), clock(errors["t"])
