@@ -215,7 +215,7 @@ def filter_error(estimates: Columns) -> Array:
 
 
 def tables(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
-    """Return tables of predictions, then the paper's: a title, and rows of a label and the values (d,) of each config."""
+    """Return tables of predictions, then the paper's: a title, and rows of a label and values (d,) of each config."""
     scores = [run.yardsticks for run in runs.values()]
     coast: list[tuple[str, list[Array]]] = []
     for name in LONGEST_FIRST:
