@@ -1,4 +1,4 @@
-"""Do the bands of coasting hold what they say: the share of true biases within them, over many simulated units.
+"""Bands of predictions: the share of true biases within them, over many simulated units.
 
 Each unit is made by the simulator in this file, which shares no code with driftlab: a bend in its thermal curve, white
 noise, a random walk, accelerometers with a bias, a coarse thermometer. A map is fitted on its soak, its filter departs

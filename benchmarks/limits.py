@@ -109,7 +109,7 @@ def of_soak(rng: Rng, law: str, program: str, kind: str) -> dict[str, Unit]:
 
 
 def of_run(rng: Rng, law: str, hours: float) -> dict[str, Unit]:
-    """Return the coast of a run of a unit whose map is right."""
+    """Return the error of prediction of a run of a unit whose map is right."""
     N = int(hours * 3600 / DT)
     t = DT * np.arange(1, N + 1)
     rate = LAWS[law](rng, N) + rng.normal(size=(N, 3)) * WHITE / np.sqrt(DT)

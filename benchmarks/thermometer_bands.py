@@ -1,4 +1,4 @@
-"""Bands of running bias and coast under thermometers of all kinds, over many more units than `coast_bands.py` can run.
+"""Bands of running bias and prediction under thermometers of all kinds, over many more units than `coast_bands.py`.
 
 The temperature, its readings (`foreign_thermometers.py`) and the errors of a filter of one state are drawn here; the
 smooth temperature and sigma are driftlab's. The map is known: what its curve is off by is left to `coast_bands.py`.
@@ -60,7 +60,7 @@ def filtered(e, walk, noise, Q, R, at, now):
 
 
 def errors(case: Coarse, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return error over sigma of coast and running bias once a minute, (n,) each, of one axis."""
+    """Return error over sigma of prediction and running bias once a minute, (n,) each, of one axis."""
     from driftlab.filtering.coasting import _of_coast, _of_estimate
 
     rng, law = np.random.default_rng([seed, 77]), KINDS[case.kind]

@@ -1,16 +1,16 @@
-"""The comparison of several configs on one recording: by the paper's scores and by coasting.
+"""The comparison of several configs on one recording: by the paper's scores and by prediction.
 
 Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an estimate is the centred 30 s average
 of the sensor that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
 added to every axis of the bias at the end of the alignment, and the filter is not told of it: the paper's 15 deg/h of a
 gyro, of another sensor about five deviations of what it reads on average over one second.
 
-Ranking: the bias wanders from one recording to the next by about the sigma that a coast says it has, and all configs
+Ranking: the bias wanders from one recording to the next by about the sigma that a prediction states, and all configs
 meet the same wandering: another recording may move any error by that much. So two configs differ where ::
 
     |e_a - e_b| > max(sigma_a, sigma_b)
 
-with e the rms error and sigma the rms deviation of their coasts over the same horizon: over all axes, and axis by axis.
+with e the rms error and sigma the rms deviation of predictions over the same horizon: over all axes, and axis by axis.
 Judged is the longest horizon that is known of all configs.
 """
 
@@ -190,13 +190,13 @@ def filter_error(estimates: Columns) -> Array:
 
 
 def tables(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
-    """Return the coast and then the paper's tables: a title, and rows of a label and the values (d,) of each config."""
+    """Return tables of predictions, then the paper's: a title, and rows of a label and values (d,) of each config."""
     scores = [run.yardsticks for run in runs.values()]
     coast: list[tuple[str, list[Array]]] = []
     for name in LONGEST_FIRST:
         coast += [(f"coast, {name}", [y.coast[name] for y in scores])]
         coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in scores])]
-    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(runs)]
+    return [("Error of the prediction, and the deviation that it states (not in the paper)", coast), *paper(runs)]
 
 
 def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
@@ -289,7 +289,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The configs by what their coasts are off by over one horizon."""
+    """The configs by the error of their predictions over one horizon."""
 
     horizon: str  # its name
     errors: dict[str, float]  # of each config, the smallest first: rms over the axes, SI

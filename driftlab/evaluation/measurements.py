@@ -133,16 +133,16 @@ def of_allan(
 
 
 def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
-    """Return the coast of a run: the rms of its error over 10 minutes after an alignment, in the mean over the run.
+    """Return the error of prediction of a run: its rms over 10 minutes after an alignment, in the mean over the run.
 
-    `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into coasts of 10
+    `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into parts of 10
     minutes, each as if aligned right before it (`yardsticks.coasts`). The mean of so many is computed by
     `fusion_core.wandering`, of the error e of the prediction over the whole run: white noise w in each cell of it,
     and what wanders by the law W::
 
         E = w (CELL / 30 s + CELL / align) + w rho mean over 10 min of var(e(t) - mean of e over the alignment)
 
-    The run's own coast is measured, and no limit that it is beyond can be passed.
+    The error of the run's own prediction is measured, and no limit that it is beyond can be passed.
     """
     axes, (text, at_rest) = yardsticks.axes, _coasted(COAST, yardsticks, length)
     if text:
@@ -169,7 +169,7 @@ def _drifted(covariance: Array, m: int) -> float:
 
 
 def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]:
-    """Return the reason not to judge a coast over a horizon, empty where there is none, and its share at rest."""
+    """Return the reason not to judge a prediction over a horizon, empty where there is none, and its share at rest."""
     ends, share = HORIZONS[horizon], yardsticks.share[horizon]
     first = f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
     at_rest = f"{100 * share:.0f} % at rest"

@@ -219,7 +219,7 @@ def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
 
 
 class Envelope:
-    """Smallest and largest error of estimate and coast, and the nis, of STRETCHES to twice as many stretches of rows.
+    """Smallest and largest error of estimate and prediction, and nis, of STRETCHES to twice as many stretches of rows.
 
     All are as long; with one more than that, two and two become one.
     """
@@ -322,7 +322,7 @@ class ScoredRun:
 
     @property
     def yardsticks(self) -> Scores:
-        """The scores of the filter and of its coast."""
+        """The scores of the filter and of its prediction."""
         return self.overview.yardsticks
 
     @property
@@ -349,7 +349,7 @@ class ScoredRun:
     def measured(self) -> dict[str, Measured]:
         """Measurements of the quantities that a config may limit, by their names.
 
-        The coast is that of the run; noise and bias instability are of the averages, where a limit asks for them;
+        The prediction is that of the run; noise and bias instability are of the averages, where a limit asks for them;
         residual, swing and hysteresis are of the map.
         """
         fitted, limits = map_of(self.config), self.config.limits

@@ -1,7 +1,7 @@
 """Scores of a run: its errors where the true bias is not known.
 
 The reference is the centred moving average of the gyro, Earth rate removed, over 30 s (Fontanella et al. 2018,
-sec. 6). Two scores on it: the *filter error* of the running estimate (tables 6 to 11), and the *coast error* of
+sec. 6). Two scores on it: the *filter error* of the running estimate (tables 6 to 11), and the *prediction error* of
 what is predicted from the end of the alignment with no further measurement, which is what a user feels when the
 vehicle drives off.
 
@@ -148,7 +148,7 @@ class ScoreAccumulator:
 
 
 class Cells:
-    """Errors of a prediction in cells of CELL s, of which the error of a coast that begins anywhere is made.
+    """Errors of a prediction in cells of CELL s, of which the error of a prediction that begins anywhere is made.
 
     The open-loop prediction c(t) less what is measured b(t) is off by e(t). Aligned at s over `align` it begins with
     what was measured there, so that its error is e(t) less the mean of e over the alignment.
@@ -181,7 +181,7 @@ class Cells:
         return np.column_stack([(cells[:, 0] + 0.5) * CELL, cells[:, 2 + 2 * self.d :] / cells[:, 1:2]])
 
     def coasts(self, length: float, align: float, first: Array) -> Array:
-        """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
+        """Return the rms (J, d) of predictions of `length` s one after the other, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
         coasts = [first] if np.all(np.isfinite(first)) else []
         cells = np.concatenate(self._cells)
@@ -267,7 +267,7 @@ def _integrate(
 
 @compiled
 def errors_of(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
-    """Return the errors (N, 3 d) of bias and coast, and the coast's deviation: rows of three take NumPy too long."""
+    """Return errors (N, 3 d) of bias and prediction, and the latter's deviation: rows of three take NumPy too long."""
     N, d = bias.shape
     errors = np.empty((N, 3 * d))
     for k in range(N):

@@ -195,5 +195,5 @@ def error_pairs(runs: Sequence[Scores]) -> list[tuple[str, Sequence[tuple[Array,
 
 
 def coasts_over_axes(rows: Rows) -> Rows:
-    """Return the rows of the coasts of `error_rows`, with the rms (1,) over the axes in place of the errors (d,)."""
+    """Return the rows of `error_rows` on predictions, with the rms (1,) over the axes in place of the errors (d,)."""
     return [(label, [np.array([over_axes(v)]) for v in columns]) for label, columns in rows[: 2 * len(LONGEST_FIRST)]]

@@ -2,7 +2,7 @@
 
 The curve is the posterior's mean, its error the posterior's covariance in a few modes, as wide as was measured on units
 that were left out (`driftlab.family.bands`). The level is part of it: the family says where levels lie, the soak where
-this one does; a coast takes differences of the modes, in which a level cancels. d axes, q coefficients.
+this one does; a prediction takes differences of the modes, in which a level cancels. d axes, q coefficients.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ class UnitRecord(BaseModel):
     figures : dict of str to Figure
         FIGURES by name; `coast_1min`, `coast_5min`, `coast_end` too.
     coast_of : str
-        Which recording was coasted.
+        Which recording was predicted.
     coast_in_sample : bool
         Whether that is one that the map was fitted on.
     map_sigma : (d,) floats

@@ -1,1 +1,1 @@
-"""One recording through one config: alignment, filter, coasting, checkpoints."""
+"""One recording through one config: alignment, filter, prediction, checkpoints."""

@@ -1,4 +1,4 @@
-"""Coasting: the bias predicted from the end of the alignment on, with no further measurement, and its deviation.
+"""Prediction without updates: the bias from the end of the alignment on, no further measurement, and its deviation.
 
 From the departure at t_0 the blocks of the bias model go on alone::
 
@@ -138,12 +138,12 @@ class Uncertainty:
         self.following, self.departing, self.learnt = copied(snapshot, self.snapshot())
 
     def depart(self, coast: Coast) -> None:
-        """Begin a coast with the filter's estimate of the errors so far."""
+        """Begin a prediction with the filter's estimate of the errors so far."""
         self.departing = self.following.copy()
         self.resume(coast)
 
     def resume(self, coast: Coast) -> None:
-        """Go on with a coast that departed earlier."""
+        """Go on with a prediction that departed earlier."""
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
 
@@ -276,7 +276,7 @@ def _of_coast(
 
 
 class BiasOutput(NamedTuple):
-    """Bias and deviation, by the filter and by coasting, (N, d) each; of the latter NaN before the departure."""
+    """Bias and deviation, by the filter and by prediction, (N, d) each; of the latter NaN before the departure."""
 
     bias: Array
     sigma: Array
@@ -285,13 +285,13 @@ class BiasOutput(NamedTuple):
 
 
 class Prediction:
-    """The bias of the tracked sensor, estimated and coasting, with all parts of its deviation.
+    """The bias of the tracked sensor, estimated and predicted, with all parts of its deviation.
 
     Parameters
     ----------
     plan : RunSetup
     first : Alignment
-        From which on it coasts.
+        From which on it is predicted.
     """
 
     def __init__(self, plan: RunSetup, first: Alignment) -> None:

@@ -20,7 +20,7 @@ out what lasts: y - l with l = l + g (y - l). So its part of the estimate's vari
     h = Var(l):                 h = (1 - g)^2 h + 2 g (1 - g) rho c b' sqrt(v) + g^2 b'^2 v
     Var(y - l) = b'^2 v - 2 b' sqrt(v) c + h
 
-A coast is the same with g = 0 from its departure on. N epochs, d axes.
+A prediction is the same with g = 0 from its departure on. N epochs, d axes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Cross-validation: predictions of recordings that were left out, open loop, as a user coasts.
+"""Cross-validation: predictions of recordings that were left out, open loop, as a user meets them.
 
 Each recording, and each half of each, is left out in turn. Coefficients and hyper-parameters are those of the rest
 (transfer); given these, map and levels are fitted to all (refitting the map without the part would measure its

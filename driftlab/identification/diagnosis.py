@@ -3,7 +3,7 @@
 The errors of predicting each row from those before (`driftlab.noise.local_level`) are white with unit variance, once
 divided by their deviation, where the fast part of the residual says all of it. Over windows of W rows their sums, over
 the square root of W, are then independent with unit variance again, at every time scale; and none stands out. What is
-significant is reported only where it matters to one who coasts: where the residual is slow.
+significant is reported only where it matters to one who drives off: where the residual is slow.
 
 A further recording that would tell two explanations apart is designed from the ranges of the channels so far: one model
 predicts the unit's readings on it, and the other is fitted to the old recordings and the new one together, all whitened

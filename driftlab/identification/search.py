@@ -109,7 +109,7 @@ def without_term(model: Model, k: int) -> Model:
 def _best(passing: Sequence[Trial]) -> Trial:
     """Return the trial that predicts left-out parts best; of those within its uncertainty the likeliest, or a simpler.
 
-    Likelihood alone ranks badly for coasting, but it tells shapes apart that coast alike.
+    Likelihood alone ranks badly for prediction, but it tells shapes apart that predict alike.
     """
     first = min(passing, key=lambda trial: trial.evidence.ratio)
     near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]

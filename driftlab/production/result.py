@@ -112,7 +112,7 @@ class FleetResult(Result):
         return list(self.summary["lines"])
 
     def plot(self) -> Figure:
-        """Draw noise, walk, swing, residual and coast of every unit, in the order of the manifest."""
+        """Draw noise, walk, swing, residual and error of prediction of every unit, in the order of the manifest."""
         from matplotlib.figure import Figure
 
         drawn = [name for name in FIGURES if name in self]

@@ -1,4 +1,4 @@
-"""The work on one unit: its map, its soaks' information in the family's basis, a coast, figures and verdicts.
+"""The work on one unit: its map, its soaks' information in the family's basis, a prediction, figures and verdicts.
 
 A unit that cannot be used is a record that says why; nothing is raised for it. Where they are asked for, the loop and
 the pages of run and map are part of the work.

@@ -1,12 +1,12 @@
-"""The map of a unit, a coast with it, and the figures that a line watches, each with its deviation.
+"""The map of a unit, a prediction with it, and the figures that a line watches, each with its deviation.
 
-The map is that of `fit-map` on the unit's soaks, held in memory by the config that the filter runs. A coast is a
-prediction without a measurement. The figures are those of `driftlab.family.record.FIGURES`.
+The map is that of `fit-map` on the unit's soaks, held in memory by the config that the filter runs. A prediction is one
+without a measurement. The figures are those of `driftlab.family.record.FIGURES`.
 
 The residual is the rms of 30 s averages of the soak about the map. Its deviation is that from soak to soak: with
 n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
 2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
-the curve's change between its ends. A coast over T is as sure as its reference (`driftlab.evaluation.measurements`),
+the curve's change between its ends. One over T is as sure as its reference (`driftlab.evaluation.measurements`),
 and the walk w of the density k that it happened to take has a mean square of which::
 
     E = k^2 T / 2,    Var = k^4 T^2 / 3
@@ -127,7 +127,7 @@ def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config
 
 @dataclass(frozen=True, eq=False)
 class CoastResult:
-    """A run, and its coast."""
+    """A run, and its prediction."""
 
     name: str  # of the recording
     in_sample: bool  # whether the map was fitted on it
@@ -162,7 +162,7 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
 
 
 def _badness(one: tuple[str, RunResult]) -> float:
-    """Return the largest coast over ten minutes, or over a shorter time where there is none."""
+    """Return the largest error of prediction over ten minutes, or over a shorter time where there is none."""
     scores = (one[1].run.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
     known = next((values for values in scores if np.any(np.isfinite(values))), np.zeros(1))
     return float(np.nanmax(known))
@@ -186,7 +186,7 @@ def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities)
 
 
 def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
-    """Return the coasts of a run.
+    """Return the errors of prediction of a run.
 
     `length` is that after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
     """

@@ -112,7 +112,7 @@ EARLY = 600.0  # s after the first update, in which an initial error is shown
 
 
 def bias_chart(runs: Runs) -> Chart:
-    """Return reference, and every config's estimate and coast, of each axis over time, and temperature."""
+    """Return reference, and every config's estimate and prediction, of each axis over time, and temperature."""
     sensor, clock = _sensor(runs), _clock(runs)
     reference = next(iter(runs.values())).overview.curves
 
@@ -138,7 +138,7 @@ def bias_chart(runs: Runs) -> Chart:
 
 
 def error_chart(runs: Runs) -> Chart:
-    """Return every config's coast less the reference, with two deviations of what it says, of each axis over time."""
+    """Return every config's prediction less the reference, with two deviations, of each axis over time."""
     sensor, clock = _sensor(runs), _clock(runs)
 
     def lines(k: int) -> Iterator[Line]:

@@ -56,7 +56,7 @@ USE = {
 
 
 def tables(closed: Identification) -> list[Table]:
-    """Return the table of each holdout recording: the coast's error before and after."""
+    """Return the table of each holdout recording: the prediction's error before and after."""
     evidence = closed.search.columns.evidence
     sides = ["before", "after"] if closed.anything else ["declared"]  # where nothing was added both are the same
     return [

@@ -113,7 +113,7 @@ Z95 = 1.96
 
 
 def bias_chart(run: ScoredRun, *, errors: bool = False, domain: tuple[float, float] | None = None) -> Chart:
-    """Return reference, estimate and coast of each axis over time, and temperature.
+    """Return reference, estimate and prediction of each axis over time, and temperature.
 
     With `errors` the panels of `error_chart` stand below those of the bias; `domain` is of the map, degC.
     """
@@ -154,7 +154,7 @@ def event_shades(journal: RunLog, clock: Clock, refused: str = "refused") -> tup
 
 
 def error_chart(run: ScoredRun) -> Chart:
-    """Return the errors of estimate and coast against the reference, with two deviations of what the filter says."""
+    """Return the errors of estimate and prediction against the reference, with two of the filter's deviations."""
     curves, errors, sensor = run.overview.curves, run.overview.errors, run.sensor
     clock = Clock(run.overview.first_row, run.overview.end)
     t, when = clock(curves["t"]), clock(errors["t"])

@@ -126,7 +126,7 @@ def folded(name: str, width: int) -> list[str]:
 
 
 def yardstick_table(runs: dict[str, Scores], title: str, sensor: Sensor) -> Table:
-    """Return the table of several runs of a sensor side by side, the longest coast first.
+    """Return the table of several runs of a sensor side by side, the longest prediction first.
 
     Of several runs and axes the rms over the axes comes before all, of a gyro the heading errors last.
     """

@@ -57,7 +57,7 @@ def config_of(name: str, recording, walk: float) -> Config:
 
 
 def errors(config: Config, recording: Chunk, initial_error: float) -> list[float]:
-    """Return rms of the first 30 s, rms of the whole, time to converge, rms of 10 min of coasting; axes pooled."""
+    """Return rms of the first 30 s, rms of the whole, time to converge, rms of 10 min of prediction; axes pooled."""
     estimates = joined(Run(config, RunLog(), initial_error=initial_error).over([recording]))
     t, coast = estimates["t"], estimates["coast"]
     truth = recording["bias_truth"][np.searchsorted(recording.t, t)]

@@ -62,7 +62,7 @@ def test_a_hysteresis_is_found_in_one_soak_with_its_size_and_none_where_there_is
 def test_every_picture_of_the_gallery_is_small_and_its_command_exists():
     text = (ROOT / "docs" / "gallery.md").read_text()
     pictures = re.findall(r"!\[[^]]+\]\((images/\w+\.png)\)", text)
-    commands = re.findall(r"^    make (\w+) +# (\S+\.py), ", text, re.MULTILINE)
+    commands = re.findall(r"^    make (\w+)\n.*?\| takes \| [^\n]*`(\S+\.py)` \|$", text, re.MULTILINE | re.DOTALL)
     makefile = (ROOT / "Makefile").read_text()
     assert len(pictures) == len(commands) == 8
     assert all((ROOT / "docs" / picture).stat().st_size < 80_000 for picture in pictures)
