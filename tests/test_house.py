@@ -255,7 +255,7 @@ BUDGET = {
     "driftlab/reports": 2910,
     "driftlab/soak": 658,
     "driftlab/spc": 599,
-    "driftlab/starter": 779,
+    "driftlab/starter": 783,
     "driftlab/storage": 1253,
     "fusion_core": 1838,
     "fusion_core/contracts": 1689,
