@@ -6,7 +6,7 @@ The limits that a customer sets for a unit, and its serial number, as a config w
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -272,15 +272,19 @@ LONGEST = 64  # characters of a serial number
 LONGEST_TEXT = 120  # characters of a text on a certificate, which has one sheet
 
 
+def _line(longest: int, wrong: str, value: Any) -> Any:
+    """Return a text in one line; a whole number is one."""
+    text = str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    if isinstance(text, str) and not (0 < len(text) <= longest and is_plain(text) and text == text.strip()):
+        raise _problem(f"'{quote(text)}' {wrong}; write 1 to {longest} characters in one line")
+    return text
+
+
 def _serial(value: Any) -> Any:
     """Return a serial number as text; a number with a point has lost its spelling."""
     if isinstance(value, float):
         raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
-    if isinstance(value, int) and not isinstance(value, bool):
-        return str(value)
-    if isinstance(value, str) and not (0 < len(value) <= LONGEST and is_plain(value) and value == value.strip()):
-        raise _problem(f"'{quote(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
-    return value
+    return _line(LONGEST, "is no serial number", value)
 
 
 Serial = Annotated[str, BeforeValidator(_serial, json_schema_input_type=str | int)]
@@ -311,15 +315,9 @@ class Limits(Settings):
         return {name: float(value) for name, value in self if value is not None}
 
 
-def _text(value: Any) -> Any:
-    """Return a text of a certificate; a whole number is one, as that of the certificate may be."""
-    text = str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-    if isinstance(text, str) and not (0 < len(text) <= LONGEST_TEXT and is_plain(text) and text == text.strip()):
-        raise _problem(f"'{quote(text)}' does not fit the sheet; write 1 to {LONGEST_TEXT} characters in one line")
-    return text
-
-
-Text = Annotated[str, BeforeValidator(_text, json_schema_input_type=str | int)]
+Text = Annotated[
+    str, BeforeValidator(partial(_line, LONGEST_TEXT, "does not fit the sheet"), json_schema_input_type=str | int)
+]
 
 
 class CertificateTexts(Settings):

@@ -23,6 +23,7 @@ from driftlab.noise.innovations import SensorReadings, inflation
 from driftlab.storage.folders import check_writable, refusals
 from driftlab.storage.hdf5 import columns_of, reading
 from driftlab.storage.json import plain, write_json
+from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import document, foreign, sign
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
@@ -37,10 +38,9 @@ from fusion_core.contracts import (
     MeasurementModel,
     Sensor,
     ThermalBias,
-    ThermalMap,
 )
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, quote
+from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
@@ -182,22 +182,6 @@ def _calibrated(sensor: Sensor) -> Calibrated:
         sensor.noise,
         None if walk is None else along_axes(walk, len(sensor.axes)),
     )
-
-
-def read_map(path: Path) -> FittedMap:
-    """Read the map of a file, of whatever installed kind it is; raises MapError where none can read it."""
-    if not path.is_file():
-        raise MapError(f"map file {path} does not exist; fit it with `driftlab fit-map`")
-    why = []
-    for kind, cls in registry().classes(ThermalMap).items():
-        settings: Any = cls.model_validate({"kind": kind, "path": str(path.absolute())})
-        try:
-            return settings.load()  # type: ignore[no-any-return]
-        except FusionError as error:
-            if settings.suffix == path.suffix:
-                why.append(str(error).partition(";")[0])
-    reasons = f" ({', '.join(why)})" if why else ""
-    raise MapError(f"{path}: is a map of no installed kind{reasons}; name one that `driftlab fit-map` wrote")
 
 
 def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Collection[Path]) -> Loss:

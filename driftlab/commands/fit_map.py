@@ -134,8 +134,8 @@ class FitMapResult(Result):
         for place, text in zip(beside, texts, strict=True):
             write_text(place, text, COMMAND)
         if not certificate:  # that of an earlier map is not of this one
-            for place in _beside(path, folder, _names(selected=False, certificate=True)):
-                if "certificate" in place.name and place.is_file() and not why_not_own(place, COMMAND):
+            for place in _beside(path, folder, _names(selected=False, certificate=True)[1:]):
+                if place.is_file() and not why_not_own(place, COMMAND):
                     place.unlink()
         self.written = (path, *beside)
 

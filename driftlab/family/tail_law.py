@@ -158,11 +158,12 @@ def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:
     x, s = values[known], np.nan_to_num(sigma[known])
     centre = float(np.median(x)) if len(x) else 0.0
     off = np.abs(x - centre)
-    width = 1.4826 * float(np.median(off)) if len(x) else 0.0
-    low, high = 0.0, max(width, float(np.finfo(float).tiny))
+    if not np.any(off):
+        return values - centre, centre, 0.0
+    low, high = 0.0, max(1.4826 * float(np.median(off)), float(np.max(off)) * np.finfo(float).eps)
     for _ in range(40):  # the width with which the median of the standardised deviations is that of a Gaussian
         width = (low + high) / 2
-        if len(x) and np.median(off / np.sqrt(width**2 + s**2)) > 1 / 1.4826:
+        if np.median(off / np.sqrt(width**2 + s**2)) > 1 / 1.4826:
             low = width
         else:
             high = width

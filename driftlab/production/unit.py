@@ -23,7 +23,6 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.commands.explain import explain
-from driftlab.commands.export import read_map
 from driftlab.config import Config, part_of, paths_of, products, understood
 from driftlab.evaluation.limits import LimitResult, Measured
 from driftlab.evaluation.measurements import normal, of_map
@@ -36,6 +35,7 @@ from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.certificate import Certificate
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.storage.in_memory import CopyName
+from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import is_as
 from driftlab.units import tracked_unit
 from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, describe_error

@@ -142,7 +142,11 @@ def of_a_sensor(columns: FileColumns) -> OpenQuestion:
     """Return the question for the gyro's columns; three that differ by the axis alone are the guess."""
     known = columns.values
     triads = [triad for path in known if len(triad := {path.translate(axis): 0 for axis in AXES}.keys() & known) == 3]
-    triads.sort(key=lambda triad: of_accel(np.column_stack([known[path] for path in sorted(triad)])).unit is not None)
+    triads.sort(
+        key=lambda triad: (
+            of_accel(np.nan_to_num(np.column_stack([known[path] for path in sorted(triad)]))).unit is not None
+        )
+    )
     choices = (*[",".join(sorted(triad)) for triad in triads[:1]], *known)
     text = "the columns of the gyro's axes: no name says which they are"
     return OpenQuestion("columns", "gyro", text, choices, needed=not triads)

@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from driftlab.storage.folders import check_writable, refusals
 from driftlab.storage.ownership import check_own, put, seal, seal_of
 from driftlab.storage.system import sync
-from fusion_core.contracts import FittedMap
-from fusion_core.errors import ConfigError, MapError
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import ConfigError, FusionError, MapError
+from fusion_core.host.registry import registry
 
 
 def check_place(path: Path, read: Collection[Path], command: str) -> None:
@@ -74,3 +76,19 @@ def _sealed(path: Path, command: str, subject: str) -> Iterator[Path]:
         seal(new)
         sync(new)
         put(new, path, command, subject)
+
+
+def read_map(path: Path) -> FittedMap:
+    """Read the map of a file, of whatever installed kind it is; raises MapError where none can read it."""
+    if not path.is_file():
+        raise MapError(f"map file {path} does not exist; fit it with `driftlab fit-map`")
+    why = []
+    for kind, cls in registry().classes(ThermalMap).items():
+        settings: Any = cls.model_validate({"kind": kind, "path": str(path.absolute())})
+        try:
+            return settings.load()  # type: ignore[no-any-return]
+        except FusionError as error:
+            if settings.suffix == path.suffix:
+                why.append(str(error).partition(";")[0])
+    reasons = f" ({', '.join(why)})" if why else ""
+    raise MapError(f"{path}: is a map of no installed kind{reasons}; name one that `driftlab fit-map` wrote")

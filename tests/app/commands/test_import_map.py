@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 
 from driftlab.cli import app
-from driftlab.commands.export import read_map
 from driftlab.commands.import_map import import_map
+from driftlab.storage.map_file import read_map
 from fusion_core.errors import ConfigError
 from fusion_plugins.exporters.ardupilot import Ardupilot
 from fusion_plugins.exporters.px4 import Px4

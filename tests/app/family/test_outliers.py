@@ -90,6 +90,14 @@ def test_the_width_is_what_units_have_beside_their_own_sigma() -> None:
     assert_allclose(np.std(u), 1.0, atol=0.05)
 
 
+def test_units_that_are_the_same_have_no_width_and_no_deviation():
+    for values, width in (([2.0, 2.0], 0.0), ([2.0, 2.0, 2.0, 3.0], 1e-20)):
+        u, centre, found = standardised(np.array(values), np.zeros(len(values)))
+        np.testing.assert_array_equal(u == 0, np.array(values) == 2.0)
+        assert centre == 2.0
+        assert found <= width
+
+
 def test_simes_and_the_choice_of_units_are_those_of_statsmodels() -> None:
     from statsmodels.stats.multitest import multipletests
 
