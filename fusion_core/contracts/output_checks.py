@@ -396,9 +396,8 @@ def expect_array(
     finite: bool = True,
 ) -> None:
     """Raise PluginError where a value is not an array of finite numbers with one of the shapes."""
-    # what is masked is no plain array: of most, the module of masked ones is not loaded
-    plain = isinstance(array, np.ndarray) and (type(array) is np.ndarray or not np.ma.isMaskedArray(array))
-    if not plain or array.dtype.kind not in kinds:
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or np.ma.isMaskedArray(array):
+        plain = isinstance(array, np.ndarray) and not np.ma.isMaskedArray(array)
         what = f"an array of {array.dtype}" if plain else a_type(array)
         raise plugin_error(plugin, f"{name} is {what}, an array of {KINDS[kinds]} was expected")
     if array.shape not in expected:
