@@ -43,6 +43,7 @@ from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import reading
 from driftlab.storage.json import write_json
+from driftlab.storage.ownership import document
 from driftlab.units import unit_of
 from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError
@@ -93,7 +94,23 @@ class RunResult(Result):
 
     def lines(self) -> list[str]:
         """Return the notes on the run, a sentence each."""
-        return remarks(self.overview, self.model, self.journal)
+        return [*remarks(self.overview, self.model, self.journal), *self._map_notes]
+
+    @cached_property
+    def _map_notes(self) -> list[str]:
+        """Notes on the map: one that has seen this recording, or one beside the config that was not used."""
+        fitted, file, sensor = map_of(self.config), self.config.file, self.model.tracked
+        if fitted is not None:
+            name = Path(self.config.recording).name.partition("::")[0]
+            seen = {one.partition("::")[0] for one in fitted.record.provenance.get("recordings", "").split(", ")}
+            text = f"the map was fitted on {name}: where that is this file, judge the prediction by another recording"
+            return [text] * (name in seen)
+        beside = Path() if file is None else file.with_name(f"{file.stem}.map.json")
+        record = document(beside).get("record") if file is not None and not self.config.tracked_maps() else None
+        if not isinstance(record, dict) or record.get("channel") != sensor.channel:
+            return []
+        line = f"{sensor.section}.calibration: {{kind: {record.get('kind')}, path: {beside.name}}}"
+        return [f"{beside.name} is beside the config, which names no map, so none was used; write {line}"]
 
     @property
     def smoothed(self) -> Mapping[str, NDArray[Any]]:
@@ -121,15 +138,9 @@ class RunResult(Result):
         recording = None if self.recorded is None else [str(self.recorded)]
         sheet = sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"])
         page = page_of(
-            self.overview,
-            self.summary,
-            title=self.name,
-            config=self.config.as_yaml(),
-            model=self.model,
-            journal=self.journal,
-            sheet=sheet,
-            fitted=map_of(self.config),
-        )
+            self.overview, self.summary, title=self.name, config=self.config.as_yaml(), model=self.model,
+            journal=self.journal, sheet=sheet, fitted=map_of(self.config), notes=self._map_notes,
+        )  # fmt: skip
         (folder / "report.html").write_text(page, encoding="utf-8")
         if certificate:
             signed = self._certificate(sheet)

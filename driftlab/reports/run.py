@@ -6,7 +6,7 @@ Drawn from at most a few thousand points, however long the recording. d axes. Pl
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -41,8 +41,12 @@ def page_of(
     journal: RunLog,
     sheet: Sheet,
     fitted: FittedMap | None = None,
+    notes: Sequence[str] = (),
 ) -> str:
-    """Return the page of one run; `fitted` is the map that it used, where it used one, `summary` is for plugins."""
+    """Return the page of one run; `fitted` is the map that it used, where it used one, `summary` is for plugins.
+
+    `notes` are remarks beside those on the filter.
+    """
     scores, sensor, unit = overview.yardsticks, model.tracked, unit_of(model.tracked)
     domain = None if fitted is None else fitted.domain
     aligned = moment(journal.alignments[0].t, journal.faults.first_row)
@@ -53,7 +57,7 @@ def page_of(
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
         results=result_sentences(scores, unit, heading=sensor.integral is not None),
-        remarks=remarks(overview, model, journal),
+        remarks=[*remarks(overview, model, journal), *notes],
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
         bias=bias_chart(overview, model, journal, domain=domain),

@@ -59,10 +59,7 @@ def why_not_own(path: Path, command: str) -> str:
     regular = path.is_file() and not path.is_symlink()
     _, by, said, found = _seal(path) if regular else (None, "", b"", b"")
     if by != command:
-        return (
-            f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote, as an earlier version may "
-            "have kept none"
-        )
+        return f"exists, and nothing in it says that `driftlab {command}` wrote it"
     return "" if said == found else f"was changed since `driftlab {command}` wrote it"
 
 
