@@ -254,7 +254,7 @@ BUDGET = {
     "driftlab/reports": 2911,
     "driftlab/soak": 658,
     "driftlab/spc": 599,
-    "driftlab/starter": 714,
+    "driftlab/starter": 717,
     "driftlab/storage": 1220,
     "fusion_core": 1838,
     "fusion_core/contracts": 1689,

@@ -28,7 +28,7 @@ NO_SENSOR = {"bias", "truth", "true", "std", "sigma", "cov", "covariance", "var"
              "orientation", "position", "velocities", "scale", "error", "seq", "rms", "count"}  # fmt: skip
 UNITS = {
     "dps": "deg/s", "degs": "deg/s", "degps": "deg/s", "degsec": "deg/s", "degs1": "deg/s", "mdps": "mdeg/s",
-    "degh": "deg/h", "deghr": "deg/h", "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "rads1": "rad/s",
+    "degh": "deg/h", "deghr": "deg/h", "dph": "deg/h", "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "rads1": "rad/s",
     "mrads": "mrad/s", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC",
     "kelvin": "K", "degf": "degF", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "ms": "ms",
     "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
