@@ -251,7 +251,7 @@ BUDGET = {
     "driftlab/production": 2300,
     "driftlab/products": 6,
     "driftlab/recordings": 452,
-    "driftlab/reports": 2911,
+    "driftlab/reports": 2910,
     "driftlab/soak": 658,
     "driftlab/spc": 599,
     "driftlab/starter": 717,

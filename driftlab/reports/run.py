@@ -51,6 +51,7 @@ def page_of(
     domain = None if fitted is None else fitted.domain
     aligned = moment(journal.alignments[0].t, journal.faults.first_row)
     headings = scores.heading.items() if sensor.integral is not None else ()
+    whiteness = zip(model.space.labels, overview.whiteness_p, strict=False)
     return page(
         "report",
         title=title,
@@ -69,9 +70,7 @@ def page_of(
         headings=[f"{name} {formatted(np.rad2deg(angle), '.2f')}" for name, angle in headings],
         nis=nis_sentence(overview.nis),
         nis_chart=nis_chart(overview, model.m),
-        whiteness=", ".join(
-            f"{name} {formatted(p, '.2g')}" for name, p in zip(model.space.labels, overview.whiteness_p, strict=False)
-        ),
+        whiteness=", ".join(f"{name} {formatted(p, '.2g')}" for name, p in whiteness),
         map_chart=fitted and map_chart(fitted, overview, unit, sensor.axes),
         config=config,
         sections=sections(summary, overview.curves),

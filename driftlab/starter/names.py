@@ -28,11 +28,11 @@ NO_SENSOR = {"bias", "truth", "true", "std", "sigma", "cov", "covariance", "var"
              "orientation", "position", "velocities", "scale", "error", "seq", "rms", "count"}  # fmt: skip
 UNITS = {
     "dps": "deg/s", "degs": "deg/s", "degps": "deg/s", "degsec": "deg/s", "degs1": "deg/s", "mdps": "mdeg/s",
-    "degh": "deg/h", "deghr": "deg/h", "dph": "deg/h", "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "rads1": "rad/s",
+    "degh": "deg/h", "deghr": "deg/h", "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "rads1": "rad/s",
     "mrads": "mrad/s", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC",
     "kelvin": "K", "degf": "degF", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "ms": "ms",
     "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
-    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm",
+    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm", "dph": "deg/h",
 }  # fmt: skip
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
 FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1
