@@ -371,7 +371,7 @@ def show(result: FitMapResult | FamilyMapResult, given: Mapping[str, Any]) -> No
     if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
         path = os.path.relpath(result.written[0], given["config"].file.parent)
         line = f"{{kind: {result.map.record.kind}, path: {path}}}"
-        say(f"in the config: {result.sensor.section}.calibration: {line}\n")
+        say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import reading
 from driftlab.storage.json import write_json
+from driftlab.storage.ownership import document
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError
 from fusion_core.host.provenance import participants
@@ -76,7 +78,23 @@ class RunResult(Result):
 
     def lines(self) -> list[str]:
         """Return the notes on the run, a sentence each."""
-        return remarks(self.run)
+        return [*remarks(self.run), *self._map_notes]
+
+    @cached_property
+    def _map_notes(self) -> list[str]:
+        """Remarks on a map that has seen this recording, or on one beside the config that was not used."""
+        fitted, file, sensor = map_of(self.config), self.config.file, self.run.sensor
+        if fitted is not None:
+            name = Path(self.config.recording).name.partition("::")[0]
+            seen = {one.partition("::")[0] for one in fitted.record.provenance.get("recordings", "").split(", ")}
+            text = f"the map was fitted on {name}: where that is this file, judge the prediction by another recording"
+            return [text] * (name in seen)
+        beside = Path() if file is None else file.with_name(f"{file.stem}.map.json")
+        record = document(beside).get("record") if file is not None and not self.config.tracked_maps() else None
+        if not isinstance(record, dict) or record.get("channel") != sensor.channel:
+            return []
+        line = f"{sensor.section}.calibration: {{kind: {record.get('kind')}, path: {beside.name}}}"
+        return [f"{beside.name} is beside the config, which names no map, so none was used; write {line}"]
 
     @property
     def smoothed(self) -> Mapping[str, NDArray[Any]]:
@@ -103,7 +121,8 @@ class RunResult(Result):
         write_json(folder / "summary.json", self.summary)
         recording = None if self.recorded is None else [str(self.recorded)]
         sheet = sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"])
-        page = page_of(self.run, self.summary, title=self.name, sheet=sheet, fitted=map_of(self.config))
+        fitted, notes = map_of(self.config), self._map_notes
+        page = page_of(self.run, self.summary, title=self.name, sheet=sheet, fitted=fitted, notes=notes)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if certificate:
             signed = self._certificate(sheet)

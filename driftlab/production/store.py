@@ -112,15 +112,20 @@ class FleetFolder:
         self.stamp(record.unit, record.key, stamp)
 
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
-        """Put the pages among the files of a unit into its folder, whole or not at all; its other files stay."""
-        files = {name: text for name, text in files.items() if name.startswith(f"{PAGE}/")}
-        pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items()}
+        """Put the pages among the files of a unit into its folder, whole or not at all.
+
+        The map there stays, though it was fitted again for them: they name that one, and so does the record.
+        """
         record, place = self.record(unit), self.unit(unit) / PAGE
+        pages = {name: text for name, text in files.items() if name.startswith(f"{PAGE}/")}
         if pages and record is not None:
-            self.note(record.model_copy(update={"written": record.written | _digests(files)}))
+            for name in files.keys() & record.written.keys() - pages.keys():
+                made, known = _digests(files)[name].encode(), record.written[name].encode()
+                pages = {page: text.replace(made, known) for page, text in pages.items()}
+            self.note(record.model_copy(update={"written": record.written | _digests(pages)}))
             if os.path.lexists(place):  # somebody's
                 os.rename(place, free(place))
-            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), place)
+            os.rename(self._made(f".{unit}.{PAGE}{NEW}", {Path(name).name: pages[name] for name in pages}), place)
 
     def put_certificate(self, unit: str, content: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
         """Put a certificate among the files of a unit, in the place of an earlier one of other results.

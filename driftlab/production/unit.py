@@ -14,7 +14,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +64,6 @@ class Task(ManifestEntry):
     folder: str = "."  # that relative paths are relative to
     explain: bool = False  # whether the loop is closed, where there are recordings for it
     page: bool = False  # whether the pages of run and map are written
-    map_known: Mapping[str, str] = field(default_factory=dict)  # facts on the map that the unit has, for later pages
 
     @property
     def names(self) -> list[str]:
@@ -199,8 +198,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "plugins": participants(unit.config),
     }
     if task.page:
-        digest = hashlib.sha256(files[unit.file]).hexdigest()
-        files |= pages_of(unit, run, soaks, faults.lines(), {"sha256": digest, **task.map_known})
+        files |= pages_of(unit, run, soaks, faults.lines(), files[unit.file])
     if task.explain:
         record["loop"] = loop_of(config, recordings, files)
     return record, files
@@ -250,13 +248,13 @@ def loop_of(config: Config, recordings: Recordings, files: dict[str, bytes]) -> 
 
 
 def pages_of(
-    unit: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[str], known: Mapping[str, str]
+    unit: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[str], content: bytes
 ) -> dict[str, bytes]:
-    """Return the pages of map and run; `known` is what its file says of the map."""
+    """Return the pages of map and run; `content` is the map's file."""
     from driftlab.reports import map
     from driftlab.reports import run as run_report
 
-    facts = {**map_facts(unit.fitted, unit.bias_unit), "file": unit.file, **known}
+    facts = {**map_facts(unit.fitted, unit.bias_unit), "file": unit.file, "sha256": hashlib.sha256(content).hexdigest()}
     sheet = replace(sheet_of(unit.config, soaks, plugins=participants(unit.settings)), maps=[facts])
     pages = {"map.report.html": map.page_of(unit.verdict, unit.bias_unit, notes, sheet)}
     if run.result is not None:
@@ -266,14 +264,6 @@ def pages_of(
             result.run, result.summary, title=result.name, sheet=sheet, fitted=unit.fitted
         )
     return {f"page/{name}": page.encode() for name, page in pages.items()}
-
-
-def map_known(record: UnitRecord, folder: Path) -> dict[str, str]:
-    """Return the facts by which a page names the map in a unit's folder; none if it has changed since."""
-    path, known = folder / record.map_file, record.written.get(record.map_file, "")
-    if not is_as(path, known):
-        return {}
-    return {"sha256": known, "fitted_at": read_map(path).record.provenance.get("fitted_at", "")}
 
 
 def certificate_of(record: UnitRecord, folder: Path, config: Config, sheet: Sheet) -> Certificate:

@@ -28,7 +28,7 @@ from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
 from driftlab.production.store import PAGE, FleetFolder
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
-from driftlab.production.unit import Task, certificate_of, key_of, map_known, work
+from driftlab.production.unit import Task, certificate_of, key_of, work
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
 from fusion_core.errors import ConfigError, FusionError
@@ -135,9 +135,9 @@ class UnitJobs:
                 self.again.append(entry.unit)
             yield task
 
-    def _task(self, entry: ManifestEntry, *, page: bool = False, known: Mapping[str, str] | None = None) -> Task:
-        here, explain, of_map = os.getcwd(), self.options.explain, known or {}
-        return Task(**vars(entry), config=self.config, folder=here, explain=explain, page=page, map_known=of_map)
+    def _task(self, entry: ManifestEntry, *, page: bool = False) -> Task:
+        here, explain = os.getcwd(), self.options.explain
+        return Task(**vars(entry), config=self.config, folder=here, explain=explain, page=page)
 
     def _stays(self, record: UnitRecord, task: Task) -> bool:
         """Return True if a unit of another stamp is the same as before, or could not be done again."""
@@ -185,11 +185,7 @@ class UnitJobs:
         stage = Stage("pages", total=len(missing))
         self.progress(stage)
         records = ((entry, self.folder.record(entry.unit)) for entry in missing)
-        todo = [
-            self._task(entry, page=True, known=map_known(record, self.folder.unit(entry.unit)))
-            for entry, record in records
-            if record and record.state == "done"
-        ]
+        todo = [self._task(entry, page=True) for entry, record in records if record and record.state == "done"]
         if todo:
             with self.options.crew() as workers:
                 for task, result in workers.map(work, todo):
@@ -208,17 +204,14 @@ class UnitJobs:
         stage = Stage("certificates", total=len(records))
         for record in records:
             self.progress(stage)
-            if record.unit in self.without_recordings:
-                why = "its recordings are not there, and it may be of another config"
-                failed.append(f"unit {record.unit} has no certificate: {why}")
-                continue
             try:
+                if record.unit in self.without_recordings:
+                    raise ConfigError("its recordings are not there, and it may be of another config")
                 signed = certificate_of(record, self.folder.unit(record.unit), config, sheet)
             except FusionError as error:
                 failed.append(f"unit {record.unit} has no certificate: {error}")
                 continue
-            texts = {"certificate.html": signed.page(), "certificate.json": signed.text()}
-            files = {name: text.encode() for name, text in texts.items()}
+            files = {"certificate.html": signed.page().encode(), "certificate.json": signed.text().encode()}
             self.folder.put_certificate(record.unit, signed.content, files)
             stage.done += 1
         self.progress(stage)

@@ -6,7 +6,7 @@ Drawn from at most a few thousand points, however long the recording. d axes. Pl
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -32,20 +32,25 @@ from fusion_core.host.registry import registry
 
 
 def page_of(
-    run: ScoredRun, summary: dict[str, Any], *, title: str, sheet: Sheet, fitted: FittedMap | None = None
-) -> str:
-    """Return the page of one run; `fitted` is the map that it used, where it used one, `summary` is for plugins."""
+    run: ScoredRun, summary: dict[str, Any], *, title: str, sheet: Sheet, fitted: FittedMap | None = None,
+    notes: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """Return the page of one run; `fitted` is the map that it used, where it used one, `summary` is for plugins.
+
+    `notes` are remarks beside those on the filter.
+    """
     overview, model, scores, sensor, unit = run.overview, run.model, run.yardsticks, run.sensor, run.unit
     domain = None if fitted is None else fitted.domain
     aligned = moment(run.alignment.t, run.journal.faults.first_row)
     headings = scores.heading.items() if sensor.integral is not None else ()
+    whiteness = zip(model.space.labels, overview.whiteness_p, strict=False)
     return page(
         "report",
         title=title,
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
         results=result_sentences(scores, unit, heading=sensor.integral is not None),
-        remarks=remarks(run),
+        remarks=[*remarks(run), *notes],
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
         bias=bias_chart(run, domain=domain),
@@ -57,9 +62,7 @@ def page_of(
         headings=[f"{name} {formatted(np.rad2deg(angle), '.2f')}" for name, angle in headings],
         nis=nis_sentence(overview.nis),
         nis_chart=nis_chart(overview, model.m),
-        whiteness=", ".join(
-            f"{name} {formatted(p, '.2g')}" for name, p in zip(model.space.labels, overview.whiteness_p, strict=False)
-        ),
+        whiteness=", ".join(f"{name} {formatted(p, '.2g')}" for name, p in whiteness),
         map_chart=fitted and map_chart(fitted, overview, unit, sensor.axes),
         config=run.config.as_yaml(),
         sections=sections(summary, overview.curves),

@@ -19,7 +19,7 @@ from driftlab.starter.names import NO_SENSOR, Name, known_unit, leading, named, 
 from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, quote
 from fusion_core.units import convert, same_dimension, to_si
 
 V = TypeVar("V")
@@ -200,6 +200,9 @@ def _stated(
         return Guess(written[field], "as the file says")
     by_name = {name.unit for name in group}
     unit = next(iter(by_name))
+    if unit is not None and field in SENSORS and not same_dimension(unit, USUAL[field].si):
+        why = f"is in {unit}, which is no unit of {field}; name other columns, or its unit with --unit {field}=UNIT"
+        raise ConfigError(f"column '{quote(group[0].path)}': {why}")
     return Guess(unit, "by the name") if len(by_name) == 1 and unit is not None else None
 
 

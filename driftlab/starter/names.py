@@ -32,7 +32,7 @@ UNITS = {
     "mrads": "mrad/s", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC",
     "kelvin": "K", "degf": "degF", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "ms": "ms",
     "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
-    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm",
+    "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm", "dph": "deg/h",
 }  # fmt: skip
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
 FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1

@@ -63,10 +63,7 @@ def why_not_own(path: Path, command: str) -> str:
         by, ours = command, [is_as(path, digest) for digest in written(note).values()]
         said, found = (b"", b"") if any(ours) else (b"", b"another")
     if by != command:
-        return (
-            f"exists, and has no SHA-256 by which `driftlab {command}` knows what it wrote, as an earlier version may "
-            "have kept none"
-        )
+        return f"exists, and nothing in it says that `driftlab {command}` wrote it"
     return "" if said == found else f"was changed since `driftlab {command}` wrote it"
 
 

@@ -78,7 +78,7 @@ def _content(path: Path) -> bytes:
 
 def _text(path: Path, data: bytes) -> str:
     if len(data) > LARGEST:
-        raise ConfigError(f"{path}: has more than {LARGEST // 1024} kB, a config has not; name a YAML file")
+        raise ConfigError(f"{path}: has more than {LARGEST // 1024} kB, a config has not; `driftlab init` writes one")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -370,3 +370,20 @@ def test_the_loop_is_closed_in_memory_as_in_files(files, unit):
     assert Path("explained/explained.yaml").read_text() == result.config
     with pytest.raises(ConfigError, match=r"^holdout .*overlaps .*, which was given for fitting"):
         driftlab.explain(config, first, first, first)
+
+
+def test_a_run_says_that_a_map_lies_unused_beside_its_config_and_that_a_map_has_seen_the_recording(files):
+    def notes(**settings):
+        config = load_config(Path("unit.yaml"), settings=[f"{name}={value}" for name, value in settings.items()])
+        result = driftlab.run(config, "rest.h5", out="out")
+        page = Path("out/report.html").read_text()
+        found = [line for line in result.lines() if "map.json" in line or "map was fitted" in line]
+        assert all(line.partition(";")[0] in page for line in found)
+        return found
+
+    assert notes() == []
+    driftlab.fit_map("unit.yaml", "rest.h5").save("unit.map.json")
+    (unused,) = notes()
+    assert unused.startswith("unit.map.json is beside the config, which names no map, so none was used;")
+    (seen,) = notes(**{"filter.gyro.calibration": unused.partition("calibration: ")[2]})
+    assert seen.startswith("the map was fitted on rest.h5:")

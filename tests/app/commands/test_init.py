@@ -322,6 +322,13 @@ def test_columns_interval_and_decimal_sign_can_be_said(tmp_path):
         init(tmp_path / "rec.csv", decimal="dot")
 
 
+def test_a_column_whose_head_has_another_unit_is_no_gyro(tmp_path):
+    content = table(("t", "Rate ? (deg/s)", "Acc ? (m/s^2)", "temp"), "deg/s")
+    message = r"^column 'Acc x \(m/s\^2\)': is in m/s\^2, which is no unit of gyro; name other columns, or its unit"
+    with pytest.raises(ConfigError, match=message):
+        written(tmp_path, content, columns={"gyro": ",".join(f"Acc {axis} (m/s^2)" for axis in "xyz")})
+
+
 MOVING = {f"g{a}": np.deg2rad(5) * np.sin(np.arange(len(UNIT.t)) / 40 + k) for k, a in enumerate("xyz")}
 
 

@@ -111,7 +111,7 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
         simulate(config, out=out)
     assert out.read_bytes() == edited
     out.write_text("time,gx\n0,1\n")
-    with pytest.raises(ConfigError, match="exists, and has no SHA-256 by which `driftlab simulate` knows what"):
+    with pytest.raises(ConfigError, match="exists, and nothing in it says that `driftlab simulate` wrote it"):
         simulate(config, out=out)
     assert out.read_text() == "time,gx\n0,1\n"
 
@@ -153,7 +153,7 @@ def test_a_simulated_file_of_hdf5_that_was_edited_stays(config, tmp_path):
         simulate(config, out=tmp_path / "edited.h5")
     with h5py.File(tmp_path / "measured.h5", "w") as file:
         file["gyro"] = [1.0]
-    with pytest.raises(ConfigError, match="has no SHA-256"):
+    with pytest.raises(ConfigError, match="nothing in it says"):
         simulate(config, out=tmp_path / "measured.h5")
 
 

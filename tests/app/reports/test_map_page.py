@@ -103,7 +103,7 @@ def test_a_page_or_a_map_of_before_is_replaced_and_nothing_else(folder, tmp_path
     assert [path.name for path in result.written] == ["a.json", "report.html"]
     assert (tmp_path / "why" / "report.html").read_text() != first
     (tmp_path / "b.report.html").write_text("<html>my own notes</html>")
-    with pytest.raises(ConfigError, match=r"exists, and has no SHA-256 by which .* name another folder with report"):
+    with pytest.raises(ConfigError, match=r"exists, and nothing in it says .* name another folder with report"):
         driftlab.fit_map(config, data, out="b.json")
     assert not (tmp_path / "b.json").exists()
     assert not list(tmp_path.rglob("*.part"))

@@ -8,7 +8,7 @@ from driftlab.starter.names import named, read_name
 @pytest.mark.parametrize(("path", "quantity", "axis", "unit"), [
     ("gx", "gyro", "x", None), ("omega_z", "gyro", "z", None), ("GyrY", "gyro", "y", None), ("wz", "gyro", "z", None),
     ("Gyro X (deg/s)", "gyro", "x", "deg/s"),
-    ("gyro_y [rad/s]", "gyro", "y", "rad/s"), ("gz_dps", "gyro", "z", "deg/s"),
+    ("gyro_y [rad/s]", "gyro", "y", "rad/s"), ("gz_dps", "gyro", "z", "deg/s"), ("gx_dph", "gyro", "x", "deg/h"),
     ("gx_rad_s", "gyro", "x", "rad/s"), ("imu0/gyro", "gyro", None, None), ("imu.gyro[2]", "gyro", "z", None),
     ("/imu/data.angular_velocity.x", "gyro", "x", None), ("Rate of Turn Z", "gyro", "z", None),
     ("ax", "accel", "x", None), ("acc_y_m_s2", "accel", "y", "m/s^2"), ("Accel_Z (g)", "accel", "z", "g"),

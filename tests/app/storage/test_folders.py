@@ -414,7 +414,7 @@ def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
     check_place(tmp_path / "new" / "map.json", [], "fit-map")
     for name in ("soak.csv", "/dev/null", "new", "map.json"):
         with pytest.raises(
-            ConfigError, match=r"exists, and has no SHA-256 .*; move it away, or name another file with"
+            ConfigError, match=r"exists, and nothing in it says .*; move it away, or name another file with"
         ):
             check_place(tmp_path / name, [], "fit-map")
     (tmp_path / "link.csv").symlink_to("soak.csv")
@@ -429,7 +429,7 @@ def test_a_file_that_is_edited_while_it_is_made_anew_stays(tmp_path):
     write_text(path, "<svg/>", "fit-map")
     check_file(path, "fit-map", str(path), "name another")
     path.write_text("mine")
-    message = r"map.svg: exists, and has no SHA-256 .*; move it away, or name another file; the new one is .*map.svg"
+    message = r"map.svg: exists, and nothing in it says .*; move it away, or name .*; the new one is .*map.svg"
     for number in ("", ".before-1"):
         with pytest.raises(ConfigError, match=rf"{message}.partial{number}$"):
             write_text(path, "<svg></svg>", "fit-map")
