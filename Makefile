@@ -109,7 +109,7 @@ lint: $(VENV)/ready
 types: $(VENV)/ready
 	$(VENV)/bin/mypy
 
-# the documentation as a site, in site/ (one minute); a link, an anchor or an image that is missing fails
+# the documentation as a site, in site/ (a minute); a link, an anchor or an image that is missing fails
 $(VENV)/docs: $(VENV)/ready pyproject.toml
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
