@@ -20,6 +20,7 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 from fusion_core.escaping import json_text, line, lines
+from fusion_core.fast import WITH_NUMBA
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,6 +79,7 @@ def in_session(quiet: bool, verbose: bool, settings: list[str] | None) -> Iterat
     """Let a command be the one in progress; at its end say how long the stages took, where that is asked."""
     now = Session(quiet, verbose, settings or [])
     token = CURRENT.set(now)
+    WITH_NUMBA[:] = [note_compiling]
     try:
         yield
     finally:
@@ -174,24 +176,34 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 
 @cache
+@cache
 def note_compiling() -> None:
     """Announce once in a process, on standard error, that loops are compiled for an installation or a processor."""
     from numba.core import event
 
     class Notice(event.Listener):  # type: ignore[misc]
-        seconds, announced = 0.0, False
+        """Waits for COMPILED seconds of compiling in all; what is compiled compiles what it calls."""
+
+        seconds, depth, announced = 0.0, 0, False
 
         def on_start(self, event: Any) -> None:
-            if self.seconds > COMPILED and not self.announced:
-                self.announced = True
-                terminal(stderr=True).print(
-                    "compiling the filter for this processor, up to some minutes; it is kept for the next time",
-                    soft_wrap=True,
-                )
-            self.since = time.monotonic()
+            self.depth += 1
+            if self.depth == 1 and not self.announced:
+                self.since = time.monotonic()
+                self.timer = Timer(max(COMPILED - self.seconds, 0.0), self.announce)
+                self.timer.daemon = True
+                self.timer.start()
 
         def on_end(self, event: Any) -> None:
-            self.seconds += time.monotonic() - self.since
+            self.depth -= 1
+            if self.depth == 0 and not self.announced:
+                self.timer.cancel()
+                self.seconds += time.monotonic() - self.since
+
+        def announce(self) -> None:
+            self.announced = True
+            text = "compiling the filter for this processor, up to some minutes; it is kept for the next time"
+            terminal(stderr=True).print(text, soft_wrap=True)
 
     event.register("numba:compile", Notice())
 

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from driftlab.commands.console import note_compiling, print_json, say, session, terminal
+from driftlab.commands.console import print_json, say, session, terminal
 from driftlab.commands.estimates import PERIOD, EstimatesWriter
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.commands.run import RunResult, finish, show
@@ -279,7 +279,6 @@ def live(
     folder, samples = Path(out), None if record is None else Path(record)
     wishes = {"kind": kind, "sigma": sigma, "span": range}
     growing = _growing_map(understood, fit_map, wishes, until_reached, [] if samples is None else [samples])
-    note_compiling()
     run = Live(understood, record=samples, duration=seconds, resume=resume, force=force, soaking=growing)
     # the start-up's objects stay: looking through them again and again takes tens of milliseconds
     gc.collect()

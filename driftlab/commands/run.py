@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab import __version__
-from driftlab.commands.console import keep_freed_memory, note_compiling, print_verdict, say, say_lines, terminal
+from driftlab.commands.console import keep_freed_memory, print_verdict, say, say_lines, terminal
 from driftlab.commands.estimates import (
     CHECKPOINT,
     Columns,
@@ -295,7 +295,6 @@ def finish(
 
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments as they are; the command line's run is the first in its process, and large."""
-    note_compiling()
     keep_freed_memory()
     return arguments
 

@@ -26,6 +26,8 @@ from threading import RLock
 from typing import Any
 
 LOCK = RLock()
+WITH_NUMBA: list[Callable[[], None]] = []
+"""Functions that are called once, when numba has been imported: before anything is compiled."""
 
 
 class Compiled:
@@ -40,9 +42,12 @@ class Compiled:
         """The function as numba has it."""
         from numba import njit
 
+        while WITH_NUMBA:
+            WITH_NUMBA.pop()()
         # nobody asks for the address of a function: without it a sixth less is compiled
         made = njit(self.py_func, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, **self.options)
-        if kept := getattr(made, "_cache", None):  # not where NUMBA_DISABLE_JIT is set
+        kept: Any = getattr(made, "_cache", None)  # None where NUMBA_DISABLE_JIT is set
+        if all(hasattr(kept, name) for name in ("_load_overload", "_guard_against_spurious_io_errors")):
             kept.load_overload = partial(_load, kept)
         return made
 
