@@ -78,7 +78,7 @@ def init(
         A program writes nothing where it is left out. One that `init` wrote and nobody changed is replaced.
     columns : mapping of str to str, optional
         Columns of a channel, one an axis, e.g. gyro=wx,wy,wz; repeatable.
-        As `{"gyro": "wx,wy,wz"}`; the reading.beginning of a name is enough where one column alone begins so.
+        As `{"gyro": "wx,wy,wz"}`; the beginning of a name is enough where one column alone begins so.
     units : mapping of str to str, optional
         A unit that you know, e.g. gyro=deg/s; repeatable.
         As `{"gyro": "deg/s"}`.
@@ -309,9 +309,11 @@ def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
         remedy = "say what is missing with --column, --unit or --interval, or write it there"
         sys.stderr.write(f"driftlab: {line(str(given['file']))}: is not ready for a map; {remedy}\n")
         return
-    say(f"written to {result.path}; look at what is guessed, then: driftlab fit-map {result.path}\n")
     if given.get("go"):
+        say(f"written to {result.path}; look at what is guessed. Now: driftlab fit-map {result.path}\n")
         _fit(result.path or Path())
+    else:
+        say(f"written to {result.path}; look at what is guessed, then: driftlab fit-map {result.path}\n")
 
 
 def _fit(path: Path) -> None:

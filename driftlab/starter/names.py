@@ -50,6 +50,7 @@ class Name:
 
 
 LONGEST = 1000
+TRIADS = ("gyro", "accel")
 
 
 def read_name(path: str) -> Name:
@@ -97,12 +98,16 @@ def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str
 def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[Name]]:
     """Return the columns of a quantity, one list a sensor, in the order of axes.
 
-    Triads and known units come first, then those whose names begin most like the column `beside`.
+    Triads and known units come first, then those whose names begin most like the column `beside`. Three columns without
+    axes, all of one stated unit, are a triad in their order.
     """
     groups: dict[tuple[str, ...], list[Name]] = {}
     for name in names:
         if name.quantity == quantity:
             groups.setdefault(name.group if name.axis else (name.path,), []).append(name)
+    alone = [group[0] for group in groups.values() if group[0].axis is None]
+    if quantity in TRIADS and len(alone) == len(groups) == 3 and len({name.unit for name in alone} | {None}) == 2:
+        groups = {(): [replace(name, axis=axis) for name, axis in zip(alone, "xyz", strict=True)]}
     for group in groups.values():
         if {name.axis for name in group} == set(FROM_ONE):
             group[:] = [replace(name, axis=FROM_ONE[name.axis or ""]) for name in group]

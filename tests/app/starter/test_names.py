@@ -32,3 +32,10 @@ def test_columns_of_one_sensor_go_together_whole_ones_first():
     groups = [[name.path for name in group] for group in named(map(read_name, paths), "gyro")]
     assert groups[0] == ["gyro_a_x", "gyro_a_y", "gyro_a_z"]
     assert ["gyro_b_x", "gyro_b_z"] in groups
+
+
+def test_three_columns_of_one_rate_without_axes_are_a_triad_in_their_order():
+    paths = ["Zeit", "A (°/s)", "B (°/s)", "C (°/s)"]
+    (group,) = named(map(read_name, paths), "gyro")
+    assert [(name.path, name.axis) for name in group] == [("A (°/s)", "x"), ("B (°/s)", "y"), ("C (°/s)", "z")]
+    assert len(named(map(read_name, ["A (°/s)", "B (°/s)", "C (deg/h)"]), "gyro")) == 3  # of three units: guessed alone
