@@ -35,7 +35,7 @@ navigator: $(VENV)/ready
 autopilot: $(VENV)/ready
 	$(VENV)/bin/python examples/05_autopilot/run.py
 
-# a line of 200 gyros with odd units, a shifted lot and a hidden hysteresis: what is found, and new units with 40 % of a soak (five minutes)
+# a line of 200 gyros with odd units, a shifted lot and a hidden hysteresis: what is found, and new units with 40 % of a soak, and a later day (six minutes)
 family: $(VENV)/ready
 	$(VENV)/bin/python examples/06_family/run.py
 
@@ -115,8 +115,8 @@ $(VENV)/docs: $(VENV)/ready pyproject.toml
 	touch $@
 
 docs: $(VENV)/docs
-	rm -rf site
+	rm -rf site .cache/docs
 	$(VENV)/bin/sphinx-build --quiet --fail-on-warning -c docs/.site -d .cache/docs docs site
 
 clean:
-	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out site
+	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out site .cache/docs

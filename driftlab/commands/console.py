@@ -10,7 +10,7 @@ import ctypes
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, field
 from functools import cache
@@ -203,7 +203,8 @@ def note_compiling() -> None:
         def announce(self) -> None:
             self.announced = True
             text = "compiling the filter for this processor, up to some minutes; it is kept for the next time"
-            terminal(stderr=True).print(text, soft_wrap=True)
+            with suppress(OSError, ValueError):  # standard error is closed
+                terminal(stderr=True).print(text, soft_wrap=True)
 
     event.register("numba:compile", Notice())
 
@@ -258,8 +259,8 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 def load_at_first_use(*names: str) -> None:
     """Let modules be loaded when something of them is asked for first."""
     for name in set(names) - sys.modules.keys():
-        spec = find_spec(name)
-        assert spec is not None
+        if (spec := find_spec(name)) is None:
+            continue
         spec.loader = loader = LazyLoader(spec.loader)  # type: ignore[arg-type]
         sys.modules[name] = module = module_from_spec(spec)
         loader.exec_module(module)

@@ -9,6 +9,8 @@ import webbrowser
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any
 
 from driftlab.commands.console import load, say, say_lines, session
@@ -275,7 +277,8 @@ def _picked(text: str, rows: list[str], usual: int) -> str:
         begin = max(0, min(place - SHOWN // 2, len(rows) - SHOWN))
         shown = list(enumerate(rows))[begin : begin + SHOWN]
         marked = [("bold", f"> {row}\n") if k == place else ("", f"  {row}\n") for k, row in shown]
-        return [("", f"\n{text}\n"), *marked, ("", "arrow keys and Enter (Tab: several), a number, or text: ")]
+        folded = fill(text, max(get_terminal_size().columns - 1, 20))
+        return [("", f"\n{folded}\n"), *marked, ("", "arrow keys and Enter (Tab: several), a number, or text: ")]
 
     @keys.add("up")
     @keys.add("down")
@@ -306,7 +309,7 @@ def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
     say_lines(result.problems, "problem: ")
     if result.status:
         say(f"written to {result.path}\n")
-        remedy = "say what is missing with --column, --unit or --interval, or write it there"
+        remedy = "say what is missing with --column, --unit, --interval or --dates, or write it there"
         sys.stderr.write(f"driftlab: {line(str(given['file']))}: is not ready for a map; {remedy}\n")
         return
     if given.get("go"):

@@ -278,6 +278,14 @@ def errors_of(bias: Array, coast: Array, sigma: Array, reference: Array) -> Arra
     return errors
 
 
+def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Scores:
+    """Return the scores of a run by its estimates, all of them at once; the arguments are those of `yardsticks`."""
+    tally = ScoreAccumulator(estimates["bias"].shape[1])
+    still = estimates["still"].astype(bool)
+    tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], still))
+    return tally.yardsticks(up, axes)
+
+
 def rms_over_time(estimates: Mapping[str, Array], error: Array, start: float, length: float = np.inf) -> Array:
     """Return the rms (d,) of an error (N, d), NaN where it is not known, over `length` s from `start` on."""
     integral = Integral(error.shape[1], length)

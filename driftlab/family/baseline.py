@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from driftlab.family.record import Covariances
-from driftlab.family.tail_law import TailLaw
+from driftlab.family.tail_law import DOF, TailLaw
 from fusion_core.chunk import Array
 from fusion_core.thermal.record_texts import Name, Plain
 
 ScaleName = Literal["log", "sqrt", "as it is"]
 MOST = 3.0  # sigmas to which a deviation counts in S
 PER_FIGURE = 3  # units that S needs, for each of its figures
+WIDTH = 1e-3  # sigmas: least width of a side
 SURE = 1e-15  # least p-value, a score of eight
 GRID = np.sinh(np.linspace(-6.0, 6.0, 1201))  # deviations, up to 200 sigmas
 WHOLE = 0.9  # of the range: a soak over less is over a part
@@ -61,6 +62,14 @@ class FrozenLimits(BaseModel):
     share: Annotated[FiniteFloat, Field(ge=0)] = 1.0
     tails: TailLaw | None = None
 
+    @model_validator(mode="after")
+    def _usable(self) -> FrozenLimits:
+        if self.quantity == "level" and self.scale != "as it is":
+            raise ValueError("a level has no scale of its own")
+        if self.tails is not None and not usable(self.tails):
+            raise ValueError("tails are no law of one column")
+        return self
+
     def scores(self, deviations: Array) -> Array:
         """Return the normal scores (U,) of deviations (U,) from the centre in sigmas."""
         from scipy.special import ndtri
@@ -73,6 +82,16 @@ class FrozenLimits(BaseModel):
     def deviations(self, scores: Array) -> Array:
         """Return the deviations (U,) from the centre in sigmas that have such normal scores (U,)."""
         return scores if self.tails is None else np.interp(scores, self.scores(GRID), GRID)
+
+
+def usable(tails: TailLaw) -> bool:
+    """Return True if a law is of one column that has a width: not of values of which most are the same."""
+    columns = (tails.centre, tails.below, tails.above)
+    if any(len(column) != 1 for column in columns) or any(len(side) != len(DOF) for side in tails.share):
+        return False
+    numbers = np.concatenate([*columns, *tails.share, [tails.most]])
+    positive = min(*tails.below, *tails.above) > WIDTH and tails.most > 0 and np.min(tails.share) >= 0
+    return bool(np.all(np.isfinite(numbers)) and positive)
 
 
 class Together(BaseModel):
@@ -165,11 +184,19 @@ class Baseline(BaseModel):
         return next((one for one in self.limits if (one.quantity, one.axis) == (quantity, axis)), None)
 
     def covered(self, domain: tuple[float, float] | None) -> bool:
-        """Return True if a soak over a `domain` (degC) is one over the range of the baseline's units."""
+        """Return True if a soak over a `domain` (degC) is one over the range of the baseline's units, and no wider."""
         if self.domain is None or domain is None:
-            return True
-        (low, high), least = self.domain, WHOLE * (self.domain[1] - self.domain[0])
-        return min(domain[1], high) - max(domain[0], low) >= least
+            return self.domain is domain
+        (low, high), width = self.domain, self.domain[1] - self.domain[0]
+        both = min(domain[1], high) - max(domain[0], low)
+        return both >= WHOLE * width and domain[1] - domain[0] - both <= (1 - WHOLE) * width
+
+    @model_validator(mode="after")
+    def _together_have_limits(self) -> Baseline:
+        known = {(one.quantity, one.axis) for one in self.limits}
+        if any((name, one.axis) not in known for one in self.together for name in one.quantities):
+            raise ValueError("a covariance is of quantities without limits")
+        return self
 
     @classmethod
     def of_levels(cls, units: int, axes: Sequence[str], levels: Sequence[tuple[float, float]]) -> Baseline:

@@ -25,6 +25,7 @@ ALIKE = 0.9  # chance that both sides are
 SHARES = (0.002, 0.01)  # of odd values: of all axes together, each unit may have one or two
 SURE = 0.7  # of a unit: what a width found robustly is worth
 MIN_UNITS = 8
+WIDTH = 1e-9  # of the largest deviation: a side without has no width
 OF_SIDES = 5.4  # times 1/n: variance of the logarithm of the ratio of both sides' widths
 
 
@@ -53,7 +54,8 @@ class TailLaw(BaseModel):
         centre = np.nanmedian(x, axis=0)
         off = x - centre
         below, above = _widths(off)
-        u = off / np.where(off > 0, above, below)
+        wide = np.minimum(below, above) > WIDTH * np.nanmax(np.abs(off), axis=0, initial=0.0)  # most are not the same
+        u = off[:, wide] / np.where(off[:, wide] > 0, above[wide], below[wide])
         at = np.zeros((3, values.shape[1]))
         at[:, known >= MIN_UNITS] = centre, below, above
         return cls(
@@ -73,7 +75,8 @@ class TailLaw(BaseModel):
         off = np.where(np.array(self.below) > 0, values - np.array(self.centre), np.nan)
         p = np.zeros(off.shape)
         for sign, width, shares in zip((-1, 1), (self.below, self.above), self.share, strict=True):
-            x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
+            with np.errstate(over="ignore"):  # beyond all others, where most are the same
+                x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
             for dof, share in zip(DOF, shares, strict=True):
                 tail += share * stdtr(1 / (1 / dof + 1 / self.most), -x * _unit(dof))
             p += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)

@@ -25,6 +25,7 @@ from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
 from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.unit_information import UnitInformation
@@ -33,7 +34,7 @@ from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
 from driftlab.recordings.identity import sha256
-from driftlab.spc.charts import InControl, LineReport
+from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import baseline_of, line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
@@ -118,10 +119,17 @@ def analyse(
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
-        *_judged_by(family, len(units), known), *outliers.remarks,
+        *_judged_by(family, len(units), known), *outliers.remarks, *([] if known else _frozen_after_changes(line)),
     ]  # fmt: skip
     judged = outliers.laws is not None and bool(outliers.laws.curves)
     return FamilyAnalysis(family, common, outliers.odd, line, lines, tuple(lots), judged)
+
+
+def _frozen_after_changes(line: LineReport) -> list[str]:
+    """Return in a sentence the figures whose frozen limits are not those of all units."""
+    changed = [f"{one.axis} {figure_name(one.quantity)}" for one in line.controls if one.changes or one.trend]
+    now = "those of the last units without a change, of a trend its middle"
+    return [f"Limits that are frozen of {', '.join(changed)} are {now}."] if changed else []
 
 
 def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
@@ -130,10 +138,10 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
         return []
     of = "one new unit" if count == 1 else f"{count:,} new units"
     alone = f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}"
-    if family.baseline is None:
+    if all(limits.quantity == LEVEL for limits in _baseline(family).limits):
         return [
             f"{alone}, and levels are charted about theirs; other charts, changes and limits of the line are of {of}, "
-            "and do not say whether the line has moved since: the file has no limits of charts. Fit the family again."
+            "and do not say whether the line has moved since: the family has no limits of other charts."
         ]
     return [
         f"{alone}, and charted against limits that are frozen there (SHA-256 {sha256(known)[:12]}); changes of the "

@@ -33,7 +33,7 @@ def read(
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
-    gaps, look = Gaps(faults), _suspect.py_func if few else _suspect
+    gaps, look = Gaps(faults), getattr(_suspect, "py_func", _suspect) if few else _suspect
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:

@@ -83,7 +83,7 @@ def _use(line: LineReport, odd: int) -> str:
     parts = ["hold the odd units back until their reasons are known"] * bool(odd)
     if any(chart.changes or chart.trend for chart in line.controls):
         parts.append("judge units before and after a change apart, and find what was changed there")
-    if any(np.any(chart.beyond) for chart in line.controls):
+    if alarms(line) or any(np.any(chart.beyond) for chart in line.controls):
         parts.append("look at the units beyond the limits of the charts")
     seen = "no reason is seen to judge these units apart"
     quiet = seen if line.controls else "add units: nothing is known of the line yet"

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
-from driftlab.family.baseline import Baseline, FrozenLimits, Together
+from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.family.tail_law import TailLaw
@@ -87,6 +87,10 @@ def line_of(
         line = replace(line, partial=int(np.sum(part)))
     names = (*FIGURES, *((LEVEL,) if levels else ()))
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
+    for (name, axis), limits_of in known.items():
+        if limits_of.scale == "log" and axis in line.axes and name in table:  # nothing shows: there is no logarithm
+            values = table[name][:, :, line.axes.index(axis)]
+            values[:, ~(values[0] > 0)] = np.nan
     enough = {
         (name, axis): np.sum(np.isfinite(table[name][0, :, k])) >= (1 if (name, axis) in known else MIN_UNITS)
         for name in names for k, axis in enumerate(line.axes)
@@ -155,6 +159,8 @@ def _multivariate(line: LineReport) -> tuple[TSquaredChart, ...]:
                 z[chart.quantity][chart.at] = chart.z
         value, limit, contributions = together.judged(z)
         at = np.flatnonzero(np.isfinite(value))
+        if not len(at):
+            continue
         some = (value[at], limit[at], contributions[at])
         result.append(TSquaredChart(together.axis, together.quantities, at, *some))
     return tuple(result)
@@ -163,31 +169,47 @@ def _multivariate(line: LineReport) -> tuple[TSquaredChart, ...]:
 def baseline_of(line: LineReport, levels: Sequence[InControl]) -> Baseline:
     """Return the limits of a line, frozen; those of levels, which lots may shift, are `levels`, an axis each.
 
-    Tails and covariances are of deviations from the middle of each stretch without a change; tails of a quantity are
-    learnt from all axes.
+    Centres are those of the last stretch without a change. Tails and covariances are of deviations from the middle of
+    each stretch; tails of a quantity are learnt from all axes. A quantity of which most values are the same has none.
     """
     frozen: list[FrozenLimits] = []
     scores: dict[str, dict[str, Array]] = {axis: {} for axis in line.axes}
+    for axis, level in zip(line.axes, levels, strict=True):
+        frozen.append(FrozenLimits(quantity=LEVEL, axis=axis, scale="as it is", **vars(level)))
     for name in dict.fromkeys(chart.quantity for chart in line.controls):
         charts = [chart for chart in line.controls if chart.quantity == name]
-        laws = [levels[line.axes.index(chart.axis)] if name == LEVEL else chart.law for chart in charts]
         u = np.stack([_about_stretches(line, chart) for chart in charts], axis=1)
-        u *= [chart.law.spread / law.spread if name == LEVEL else 1.0 for chart, law in zip(charts, laws, strict=True)]
         tails = None if name == LEVEL else TailLaw.of(u)
-        for k, (chart, law) in enumerate(zip(charts, laws, strict=True)):
+        for k, chart in enumerate(charts):
+            if name == LEVEL:
+                spread = levels[line.axes.index(chart.axis)].spread
+                scores[chart.axis][name] = u[:, k] * chart.law.spread / max(spread, 1e-300)
+                continue
             own = None if tails is None else tails.column(k)
+            if own is None or not usable(own):  # most values are the same: there are no limits of the others
+                continue
+            law = chart.law
             limits = FrozenLimits(
-                quantity=name, axis=chart.axis, scale=chart.scale.name, centre=law.centre, spread=law.spread,
-                share=law.share, tails=own,
+                quantity=name, axis=chart.axis, scale=chart.scale.name, centre=law.centre + _moved(chart),
+                spread=law.spread, share=law.share, tails=own,
             )  # fmt: skip
             frozen.append(limits)
             scores[chart.axis][name] = limits.scores(u[:, k])
     joint = (Together.of(axis, of_axis) for axis, of_axis in scores.items())
-    dates = sorted(filter(None, (date[:10] for date in line.dates))) or [""]
+    when = {time: date[:10] for date in line.dates if (time := _time(date)) is not None}
+    dates = [when[time] for time in sorted(when)] or [""]
     return Baseline(
         units=len(line.units), first=dates[0], last=dates[-1], domain=_domain(line), limits=tuple(frozen),
         together=tuple(one for one in joint if one is not None),
     )  # fmt: skip
+
+
+def _moved(chart: ControlChart) -> float:
+    """Return by how much the last stretch without a change is off that on which the limits stand, in the scale."""
+    since = chart.changes[-1].at if chart.changes else 0
+    x, last = chart.scale.to(chart.value), chart.at >= since
+    basis = (chart.at >= chart.basis[0]) & (chart.at < chart.basis[1])
+    return float(np.median(x[last]) - np.median(x[basis])) if since and np.sum(last) >= MIN_UNITS else 0.0
 
 
 def _domain(line: LineReport) -> tuple[float, float] | None:

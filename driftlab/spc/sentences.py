@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.record import figure_name
+from driftlab.family.record import FIGURES, figure_name
 from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
 
 if TYPE_CHECKING:
@@ -32,14 +32,17 @@ def sentences(line: LineReport) -> list[str]:
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
         within = "within these" if judged else "in"
         lines = [f"{off} change of the line {within} {len(line.units):,} units, {line.order}."]
+    if any(chart.patterns for chart in line.controls):
+        places = sorted({int(k) for c in line.controls for f in c.patterns.values() for k in c.at[_beginnings(f)]})
+        names = ", ".join(line.units[k] for k in places[:NAMED]) + (" ..." if len(places) > NAMED else "")
+        judged.append(f"Run rules begin to alarm at {len(places):,} units{': ' if names else ''}{names}.")
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
-        judged.append(
-            f"{line.partial:,} {soaked} soaked over a part of the range: no swing, no prediction on the charts."
-        )
+        judged.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
     return [*judged, *lines, *_now(line), *_limits(line)]
 
 
+MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
 NAMED = 5  # units that a sentence names
 
 
@@ -81,24 +84,32 @@ def _against_baseline(line: LineReport) -> list[str]:
     if base is None or all(limits.quantity == LEVEL for limits in base.limits):
         return []
     frozen = [chart for chart in line.controls if chart.of_family]
-    out = [chart.at[chart.beyond] for chart in frozen] + [joint.at[joint.beyond] for joint in line.multivariate]
-    places = sorted({int(k) for part in out for k in part})
-    tests = len(frozen) + len(line.multivariate)
+    if not frozen:
+        return [f"Nothing was held against frozen limits (of {base.units:,} units): no unit has such a figure."]
+    charts = [(chart.at, chart.beyond) for chart in frozen] + [(one.at, one.beyond) for one in line.multivariate]
+    places = sorted({int(k) for at, beyond in charts for k in at[beyond]})
     days = f", made from {base.first} to {base.last}" if base.first else ""
     by = f"frozen limits (of {base.units:,} units{days})"
-    chance = f"of a line in control up to {len(line.units) * tests / 370:.2g} would be by chance, of {tests} charts"
+    lacking = [f"{axis} {figure_name(name)}" for name in FIGURES for axis in line.axes if base.of(name, axis) is None]
+    few = "too few of its units have them, or most are alike"
+    beside = [f"No limits are frozen of {', '.join(lacking)}: {few}."] if lacking else []
+    if places:
+        names = ", ".join(line.units[k] for k in places[:NAMED])
+        names += f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
+        usual = sum(len(at) for at, _ in charts) / 370
+        chance = f"of a line in control {usual:.2g} to {MANY * usual:.2g} would be by chance, of {len(charts)} charts"
+        verb = "is" if len(places) == 1 else "are"
+        return [f"{len(places):,} of {len(line.units):,} units {verb} beyond {by}: {names}; {chance}.", *beside]
     moved = ", ".join(_called(chart) for chart in frozen if chart.drifting[-1])
-    if not places and moved:
-        return [
-            f"No single unit of {len(line.units):,} is beyond its {by}, but the EWMA is: the line has moved, {moved}."
-        ]
-    if not places:
-        seen = "a unit that is off by three sigma in one figure shows one time in two, by one sigma one in 44"
-        return [f"No unit of {len(line.units):,} is beyond its {by}; {seen}."]
-    names = ", ".join(line.units[k] for k in places[:NAMED])
-    names += f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
-    verb = "is" if len(places) == 1 else "are"
-    return [f"{len(places):,} of {len(line.units):,} units {verb} beyond {by}: {names}; {chance}."]
+    if moved:
+        single = f"No single unit of {len(line.units):,} is beyond {by}"
+        return [f"{single}, but the EWMA is: the line may have moved, {moved}.", *beside]
+    laws = [law for chart in frozen if (law := base.of(chart.quantity, chart.axis)) is not None]
+    ends = np.array([SIGMAS, -SIGMAS])
+    reach = max(float(np.max(np.abs(law.deviations(ends)))) for law in laws)
+    seen = f"half of the units that are off by {reach:.2g} deviations in one figure, the widest limit, would be seen"
+    count = sum(len(chart.at) for chart in frozen)
+    return [f"None of {count:,} values of {len(line.units):,} units is beyond {by}; {seen}.", *beside]
 
 
 def place(line: LineReport, k: int) -> str:

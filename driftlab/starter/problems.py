@@ -47,7 +47,7 @@ def problems_of(config: Config) -> Iterator[str]:
     lasts = float(np.ptp(t)) if len(t) else 0.0
     steps = np.diff(t)
     if len(steps) and getattr(source, "dates", None) and (jump := float(np.max(steps))) > DAY / 2:
-        yield f"the date jumps by {jump / DAY:.3g} days: if the day stands before the month, correct source.dates"
+        yield f"the date jumps by {jump / DAY:.3g} days: day and month may be the other way round, say it with --dates"
     if len(samples) < ROWS and not lasts > model.align:
         yield f"it lasts {lasts:.3g} s, and {model.align:g} s at rest are needed to begin with: record a whole soak"
     if "gyro" in samples.channels and (least := _stillest(samples.t, samples["gyro"])) > MOVING:

@@ -17,7 +17,7 @@ from driftlab.starter.names import read_name
 from fusion_core.budget import LISTED, check_all, check_size
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
-from fusion_core.errors import DataError, FusionError, UnreadableFile
+from fusion_core.errors import ConfigError, DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
 from fusion_core.host.registry import registry
@@ -109,7 +109,12 @@ def columns_of(path: Path, cls: type[FileSource], known: Mapping[str, Any], firs
     if usual is not None:
         orders = sorted(ORDERS, key=usual.__ne__) if first is None else [first]
         ways = {order: _dated(settings, order) for order in orders}
-        good = [order for order in orders if _reads(path, cls, ways[order])] or orders
+        good = [order for order in orders if _reads(path, cls, ways[order])]
+        if first is not None and not good:
+            raise ConfigError(
+                f"--dates {first}: the dates of {path} cannot be read so; leave it out, or write the other"
+            )
+        good = good or orders
         settings = ways[good[0]]
         if len(good) > 1:
             doubts["dates"] = Doubt("whichever of day and month stands first, all dates can be read", tuple(good))
@@ -138,9 +143,10 @@ def _source(path: Path, cls: type[FileSource], settings: Mapping[str, Any]) -> F
 
 def _may_be_thousands(path: Path) -> bool:
     """Return True where each number with a comma has three digits behind it, and no zero before it."""
-    text = beginning(path, TRIED).decode("latin-1")
+    text = beginning(path, TRIED).replace(b"\0", b"").decode("latin-1")
     groups = re.findall(r"(?<![\d.,])(\d+),(\d+)(?=\D)", text)
-    return all(len(last) == 3 and len(head) <= 3 and head[0] != "0" for head, last in groups)
+    whole = all(len(last) == 3 and len(head) <= 3 and head[0] != "0" for head, last in groups)
+    return bool(groups) and whole and re.search(r"\d\.\d+,\d", text) is None
 
 
 def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts: dict[str, Doubt]) -> FileColumns:

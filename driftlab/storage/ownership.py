@@ -59,8 +59,9 @@ def why_not_own(path: Path, command: str) -> str:
     regular = path.is_file() and not path.is_symlink()
     _, by, said, found = _seal(path) if regular else (None, "", b"", b"")
     note = beside(path)
-    if by != command and regular and document(note) and not why_not_own(note, command):
-        by, ours = command, [is_as(path, digest) for digest in written(note).values()]
+    known = written(note) if by != command and regular and document(note) else {}
+    if path.name in known and not why_not_own(note, command):
+        by, ours = command, [is_as(path, digest) for digest in known.values()]
         said, found = (b"", b"") if any(ours) else (b"", b"another")
     if by != command:
         return f"exists, and nothing in it says that `driftlab {command}` wrote it"

@@ -258,7 +258,7 @@ def recording_file(out: Path, settings: str, framing: Framing | None = None) -> 
             yield writer
         seal(unfinished)
         if framing is not None:  # and before the file has its place: whenever this ends, what is there is known
-            known = {place.name: digest(unfinished), "before": digest(place)}
+            known = {place.name: digest(unfinished), "before/": digest(place)}
             note = json_text({"settings": json.loads(settings), "written": known}, 2)
             write_text(ownership.beside(place), f"{note}\n", "simulate")
         put(unfinished, out, "simulate", f"--out {out}")

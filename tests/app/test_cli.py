@@ -79,7 +79,7 @@ def test_run_writes_whole_outputs(bench):
     done = process("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert done.returncode == 0, done.stderr
     assert "prediction, 1 min" in done.stdout
-    assert done.stderr == ""
+    assert [text for text in done.stderr.splitlines() if not text.startswith("compiling the filter")] == []
     here = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
     assert (here.returncode, here.stdout, here.stderr) == (done.returncode, done.stdout, done.stderr)
     out = bench / "out"

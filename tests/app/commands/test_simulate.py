@@ -141,7 +141,9 @@ def test_bytes_of_a_device_are_replaced_and_those_of_others_are_not(config, tmp_
     with pytest.raises(ConfigError, match=r"unit\.dat: was changed since `driftlab simulate` wrote it; move it away"):
         simulate(config, out=out, framing="xsens_mtdata2")
     (tmp_path / "unit.dat.json").write_text("{}")
-    with pytest.raises(ConfigError, match=r"unit\.dat.*has no SHA-256 by which `driftlab simulate` knows what"):
+    with pytest.raises(
+        ConfigError, match=r"unit\.dat: exists, and nothing in it says that `driftlab simulate` wrote it"
+    ):
         simulate(config, out=out, framing="xsens_mtdata2")
 
 

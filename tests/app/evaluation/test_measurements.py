@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from run_scores import score
 
 from driftlab.config import Limits
 from driftlab.evaluation.limits import SIDE, check_limits, outcome, verdict
 from driftlab.evaluation.measurements import Averages, of_alignment, of_coast, of_map
+from driftlab.evaluation.scores import score
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment

@@ -4,13 +4,12 @@ import h5py
 import numpy as np
 import pytest
 import scipy.stats
-from run_scores import score
 from units_at_rest import unit_at_rest
 
 from driftlab.commands.estimates import estimates_file
 from driftlab.config import Config
 from driftlab.evaluation.overview import POINTS, OverviewAccumulator
-from driftlab.evaluation.scores import moving_average
+from driftlab.evaluation.scores import moving_average, score
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from run_scores import score
 
 from driftlab.evaluation.overview import OverviewAccumulator
-from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, rms_over_time
+from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, rms_over_time, score
 
 UP = np.array([0.6, 0.0, -0.8])
 AXES = ("x", "y", "z")

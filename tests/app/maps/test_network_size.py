@@ -207,7 +207,7 @@ def fit_map(folder, *args):
 def test_fit_map_selects_writes_and_shows(bench):
     done = fit_map(bench, "--select", "--neurons-max", "3")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert [text for text in done.stderr.splitlines() if not text.startswith("compiling the filter")] == []
     assert len(re.findall(r"^ +[123] +[\d.]+", done.stdout, re.MULTILINE)) == 3
     assert done.stdout.count("*") == 3  # the title's, and one of each target
     assert "written to unit.onnx, unit.report.html, unit.select.json, unit.select.svg" in done.stdout.replace(
