@@ -254,7 +254,7 @@ BUDGET = {
     "driftlab/recordings": 454,
     "driftlab/reports": 2926,
     "driftlab/soak": 658,
-    "driftlab/spc": 812,
+    "driftlab/spc": 814,
     "driftlab/starter": 796,
     "driftlab/storage": 1239,
     "fusion_core": 1838,

@@ -34,11 +34,11 @@ def sentences(line: LineReport) -> list[str]:
         lines = [f"{off} change of the line {within} {len(line.units):,} units, {line.order}."]
     if any(chart.patterns for chart in line.controls):
         places = sorted({int(k) for c in line.controls for f in c.patterns.values() for k in c.at[_beginnings(f)]})
-        names = ", ".join(line.units[k] for k in places[:NAMED]) + (" ..." if len(places) > NAMED else "")
-        judged.append(f"Run rules begin to alarm at {len(places):,} units{': ' if names else ''}{names}.")
+        which = f"at {len(places):,} units: {_names(line, places)}" if places else "at no unit"
+        lines.append(f"Run rules begin to alarm {which}.")
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
-        judged.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
+        lines.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
     return [*judged, *lines, *_now(line), *_limits(line)]
 
 
@@ -94,8 +94,7 @@ def _against_baseline(line: LineReport) -> list[str]:
     few = "too few of its units have them, or most are alike"
     beside = [f"No limits are frozen of {', '.join(lacking)}: {few}."] if lacking else []
     if places:
-        names = ", ".join(line.units[k] for k in places[:NAMED])
-        names += f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
+        names = _names(line, places)
         usual = sum(len(at) for at, _ in charts) / 370
         chance = f"of a line in control {usual:.2g} to {MANY * usual:.2g} would be by chance, of {len(charts)} charts"
         verb = "is" if len(places) == 1 else "are"
@@ -110,6 +109,12 @@ def _against_baseline(line: LineReport) -> list[str]:
     seen = f"half of the units that are off by {reach:.2g} deviations in one figure, the widest limit, would be seen"
     count = sum(len(chart.at) for chart in frozen)
     return [f"None of {count:,} values of {len(line.units):,} units is beyond {by}; {seen}.", *beside]
+
+
+def _names(line: LineReport, places: list[int]) -> str:
+    """Return the units at the first places, and the number of the others."""
+    more = f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
+    return ", ".join(line.units[k] for k in places[:NAMED]) + more
 
 
 def place(line: LineReport, k: int) -> str:

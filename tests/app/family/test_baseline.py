@@ -186,3 +186,11 @@ def test_a_spoilt_baseline_is_refused_when_it_is_read(spoil):
     spoil(content)
     with pytest.raises(ValidationError):
         Baseline.model_validate(content)
+
+
+def test_run_rules_are_said_after_the_changes():
+    records = line(60, 3, planted=[("noise", "y", 30, 60, 1.5)])
+    alone, ruled = (line_of(records, None, rules=rules).sentences for rules in (None, "nelson"))
+    assert ruled[0] == alone[0]
+    assert any(text.startswith("Run rules begin to alarm at ") for text in ruled)
+    assert not any("Run rules" in text for text in alone)
