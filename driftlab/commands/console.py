@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
-from threading import Timer
+from threading import TIMEOUT_MAX, Timer
 from typing import TYPE_CHECKING, Any
 
 from fusion_core.escaping import json_text, line, lines
@@ -184,11 +184,12 @@ def note_compiling() -> None:
     class Notice(event.Listener):  # type: ignore[misc]
         """Waits for COMPILED seconds of compiling in all; what is compiled compiles what it calls."""
 
-        seconds, depth, announced = 0.0, 0, False
+        seconds, since, depth, announced = 0.0, 0.0, 0, False
+        timer: Timer | None = None
 
         def on_start(self, event: Any) -> None:
             self.depth += 1
-            if self.depth == 1 and not self.announced:
+            if self.depth == 1 and not self.announced and COMPILED < TIMEOUT_MAX:
                 self.since = time.monotonic()
                 self.timer = Timer(max(COMPILED - self.seconds, 0.0), self.announce)
                 self.timer.daemon = True
@@ -196,8 +197,9 @@ def note_compiling() -> None:
 
         def on_end(self, event: Any) -> None:
             self.depth -= 1
-            if self.depth == 0 and not self.announced:
+            if self.depth == 0 and self.timer is not None:
                 self.timer.cancel()
+                self.timer = None
                 self.seconds += time.monotonic() - self.since
 
         def announce(self) -> None:

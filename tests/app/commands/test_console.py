@@ -7,6 +7,15 @@ from numba.core import event
 from driftlab.commands import console
 
 
+def test_compiling_is_not_announced_where_nobody_asks(monkeypatch, capsys):
+    monkeypatch.setattr(console, "COMPILED", float("inf"))  # as the other tests have it
+    console.note_compiling.cache_clear()
+    console.note_compiling()
+    with event.trigger_event("numba:compile"), event.trigger_event("numba:compile"):
+        sleep(0.1)  # a failure in a thread fails the test
+    assert capsys.readouterr().err == ""
+
+
 def test_compiling_is_announced_once_on_standard_error(monkeypatch, capsys):
     monkeypatch.setattr(console, "COMPILED", 0.1)
     console.note_compiling.cache_clear()
