@@ -17,9 +17,8 @@ from driftlab.commands.console import print_verdict, say, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
 from driftlab.config import Config, load_config, part_of, paths_of, with_recording
-from driftlab.evaluation.limits import LimitResult, check_limits, verdict
-from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.overview import ScoredRun, map_of, scored
+from driftlab.evaluation.limits import LimitResult, least_kept, verdict
+from driftlab.evaluation.overview import ScoredRun, scored
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import remarks
 from driftlab.filtering.run import Run
@@ -194,7 +193,7 @@ def _closed(
         _refute(folder, config, new, whole)
     chosen = 0 if whole.refuted else 1
     whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-    limits = _limit_results(both[chosen], [outcome.runs[chosen] for outcome in outcomes])
+    limits = least_kept(outcome.runs[chosen].judged for outcome in outcomes)
     rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
     whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
     write_prediction(folder / "prediction.h5", whole.outcomes)
@@ -257,21 +256,6 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
     head.append(f"plugins: {', '.join(releases)}")
     head.append("coefficients and sigma of effects are in SI units")
     path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
-
-
-def _limit_results(config: Config, runs: Sequence[ScoredRun]) -> list[LimitResult]:
-    """Hold the worst test recording, and the map, against the limits of the config."""
-    if config.limits is None:
-        return []
-    measured = []
-    for run in runs:
-        noise = of_alignment(run.sensor, run.alignment, run.model.align)
-        coast = of_coast(run.yardsticks, run.span, run.model.align)
-        measured.append({"noise": noise, "coast": coast})
-    worst, fitted = max(measured, key=lambda one: float(np.max(one["coast"].values))), map_of(config)
-    return check_limits(
-        config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))}
-    )
 
 
 def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult]) -> Sheet:

@@ -179,6 +179,11 @@ def worst(rows: Sequence[Mapping[str, Any]]) -> str | None:
     return next((word for word in VERDICTS if word in verdicts), None)
 
 
+def least_kept(runs: Iterable[Sequence[LimitResult]]) -> list[LimitResult]:
+    """Return each limit of one config as the run that keeps it least has it: by verdict, then by value."""
+    return [min(rows, key=lambda row: (VERDICTS.index(row.verdict), -row.value)) for rows in zip(*runs, strict=True)]
+
+
 def verdict_of_units(units: Iterable[Sequence[Mapping[str, Any]]]) -> str:
     """Return the number of units that pass, fail or are undecided, and by which limits; empty where none is set.
 

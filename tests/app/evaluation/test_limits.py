@@ -12,6 +12,7 @@ from driftlab.evaluation.limits import (
     NAMES,
     Measured,
     check_limits,
+    least_kept,
     outcome,
     verdict,
     verdict_of_units,
@@ -164,6 +165,17 @@ def test_all_limits_in_a_line():
     lines = ["PASS: 2 of", "FAIL: x", "UNDECIDED: 1 of", "INCOMPLETE: 0 of"]
     assert [outcome(line) for line in lines] == ["pass", "fail", "undecided", "unknown"]
     assert [EXIT[outcome(line)] for line in lines] == [0, 1, 3, 3]
+
+
+def test_of_several_recordings_each_limit_is_said_as_the_worst_of_them_has_it():
+    """The recording with the largest error of the prediction may keep a limit that another exceeds."""
+    limits = Limits(coast=1.0, noise=1.0)
+    first = {"coast": known([0.9] * 3, [0.01] * 3), "noise": known([0.1] * 3, [0.01] * 3)}
+    second = {"coast": known([0.3] * 3, [0.01] * 3), "noise": known([2.0] * 3, [0.01] * 3)}
+    rows = {row.name: row for row in least_kept(check_limits(limits, one) for one in (first, second))}
+    assert (rows["coast"].verdict, rows["coast"].value) == ("pass", 0.9)
+    assert (rows["noise"].verdict, rows["noise"].value) == ("fail", 2.0)
+    assert least_kept([[], []]) == []
 
 
 def test_a_unit_is_said_to_be_what_its_worst_limit_is():
