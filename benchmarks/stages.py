@@ -96,7 +96,8 @@ def main() -> None:
         timed(GrowingFile, name, "write")
     for owner, names in (
         (overview.OverviewAccumulator, ("add", "read", "overview")),
-        (filtering, ("summarise", "write_report")),
+        (filtering, ("summarise",)),
+        (filtering.RunResult, ("_write",)),
     ):
         for name in names:
             timed(owner, name, "report")
