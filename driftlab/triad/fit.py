@@ -1,0 +1,356 @@
+"""Joint fit of bias, scale factor and misalignment over temperature to the equations of a stimulus.
+
+Gauss-Newton steps on penalised least squares; the equations come in groups whose noise is found from their residuals::
+
+    x = argmin  sum_g |z - A x|_g^2 / s_g^2  +  x' P x,      A = J B(T)
+
+The curve of each term is chosen forward, by the largest fall of::
+
+    m log(residual) + p (log m + 2 log 12)
+
+with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
+Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759). A term that the equations do not tell is zero,
+and its usual size counts in the error of the others. m equations, n coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.triad.model import BIAS, GRID, NARROW, SCALE, TERMS, TermCurve, TriadTerms, curves_of, polynomial
+from driftlab.triad.stimuli import Equations, Stimulus
+from fusion_core.chunk import Array
+from fusion_core.contracts import CurveError, ThermalMap, TriadMatrix
+from fusion_core.errors import SingularFit
+
+STEPS = 30
+WIDE = 20.0  # times the usual size: the prior with which a fit begins
+UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
+POOR = 0.1  # of it: one that is known better is well known
+AHEAD = 2  # curves that are looked at beyond that of a term
+TINY = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class TriadFit:
+    """Terms of a triad that were fitted, with their joint covariance.
+
+    Attributes
+    ----------
+    stimulus : Stimulus
+    terms : TriadTerms
+    domain : pair of float
+        Temperatures of the stimulus.
+    usual : (12,) array
+        Sizes of the terms of a usual unit, beside which a deviation is large or small.
+    free : (12,) array of bool
+        Terms that were looked for.
+    told : (12,) array of bool
+        Terms that the stimulus tells; the others are zero.
+    untold_changes : (12,) array of bool
+        Told terms whose change over temperature it does not tell.
+    design, root : TriadTerms' curves and (n, n) array
+        Curves of the error, and the root of the covariance of their coefficients.
+    noise : tuple of float
+        Deviation of an equation in each group.
+    """
+
+    stimulus: Stimulus
+    terms: TriadTerms
+    domain: tuple[float, float]
+    usual: Array
+    free: NDArray[np.bool_]
+    told: NDArray[np.bool_]
+    untold_changes: NDArray[np.bool_]
+    design: Sequence[TermCurve]
+    root: Array
+    noise: tuple[float, ...]
+
+    @cached_property
+    def grid(self) -> Array:
+        """Temperatures at which the error is kept."""
+        low, high = self.domain
+        middle, half = (low + high) / 2, max(high - low, NARROW) / 2
+        return np.linspace(middle - half, middle + half, GRID if high - low >= NARROW else 2)
+
+    def modes(self, T: Array) -> Array:
+        """Return the modes (n, N, 12) of the joint error of all terms at T (N,)."""
+        parts, at = [], 0
+        for curve in self.design:
+            parts.append(curve.values(T) @ self.root[at : at + curve.q])
+            at += curve.q
+        return np.stack(parts, axis=2).transpose(1, 0, 2)
+
+    def sigma(self, T: Array) -> Array:
+        """Return the deviation (N, 12) of the terms at T (N,)."""
+        return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    def change(self) -> tuple[Array, Array]:
+        """Return the change of each term (12,) from the lowest to the highest temperature, and its deviation."""
+        ends = self.grid[[0, -1]]
+        values, modes = self.terms.at(ends), self.modes(ends)
+        return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
+
+    def curve_error(self, part: slice) -> CurveError:
+        """Return the error of some terms as a map's record holds it; its modes are those of all terms, one by one."""
+        T = self.grid
+        curve = self.terms.at(T)[:, part]
+        bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
+        modes = tuple(tuple(map(tuple, mode)) for mode in self.modes(T)[:, :, part].tolist())
+        return CurveError(T=tuple(T.tolist()), modes=modes, bend=tuple(bend.tolist()))
+
+    def matrix(self) -> TriadMatrix:
+        """Return M over temperature as a map's record holds it."""
+        (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
+        bent = any(curve.q > 4 for curve in self.terms.curves)
+        T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
+        inside = np.clip(T, low + h, high - h)
+        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, 3:] / (2 * h)
+        if not bent:  # exact for a cubic through four points
+            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, 3:])
+            slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
+        frame = "sensor" if self.stimulus.sensor_frame else "given"
+        return TriadMatrix(
+            T=tuple(T.tolist()), values=tuple(map(tuple, self.terms.at(T)[:, 3:].tolist())),
+            slopes=tuple(map(tuple, slopes.tolist())), frame=frame, told=tuple(self.told[3:].tolist()),
+            kinds=tuple(curve.name for curve in self.terms.curves[3:]), error=self.curve_error(slice(3, None)),
+        )  # fmt: skip
+
+    def _scaled(self, T: Array) -> Array:
+        low, high = self.grid[[0, -1]]
+        return (2 * T - low - high) / (high - low)
+
+    def verdict(self) -> list[str]:
+        """Return which terms the stimulus does not tell, why, and what to add, a sentence each."""
+        lines = []
+        middle = self.sigma(np.array([np.mean(self.domain)]))[0]
+        for j, name in enumerate(TERMS):
+            if not self.free[j]:
+                continue
+            if not self.told[j]:
+                lines.append(f"{name}: not told, and taken as zero, since {self.stimulus.lacking(j)}")
+            elif middle[j] > POOR * self.usual[j]:
+                lines.append(f"{name}: poorly told, {middle[j] / self.usual[j]:.0%} of a usual size, since "
+                             f"{self.stimulus.lacking(j)}")  # fmt: skip
+        low, high = self.domain
+        untold = [TERMS[j] for j in np.flatnonzero(self.untold_changes)]
+        if high - low < NARROW:
+            lines.append(
+                f"no change over temperature is told: all of it lies at {np.mean(self.domain):.1f} °C; repeat it at "
+                "other temperatures, 20 K apart or more"
+            )
+        elif untold:
+            lines.append(
+                f"change from {low:.1f} to {high:.1f} °C: not told for {', '.join(untold)}, whose part of the stimulus "
+                "lies at too few temperatures; repeat that part near both ends"
+            )
+        return lines
+
+
+def fit_triad(
+    stimulus: Stimulus, settings: ThermalMap, bias_size: float, wanted: NDArray[np.bool_] | None = None
+) -> TriadFit:
+    """Fit the terms of a triad to a stimulus.
+
+    Parameters
+    ----------
+    stimulus : Stimulus
+    settings : ThermalMap
+        Kind of the curves that are tried beside constants and polynomials.
+    bias_size : float
+        Bias of a usual unit, in its unit; its other terms are 1 % and 10 mrad.
+    wanted : (12,) array of bool, optional
+        Terms that may differ from zero, beside the bias; by default all that the stimulus leaves free.
+
+    Raises
+    ------
+    SingularFit
+        If the stimulus has fewer equations than terms, or the fit does not converge.
+    ConfigError
+        If the kind is a network.
+    """
+    T = stimulus.T
+    domain = float(T.min()), float(T.max())
+    usual = np.array([bias_size] * 3 + [0.01] * 9)
+    free = stimulus.free if wanted is None else stimulus.free & wanted
+    search = _Search(stimulus, curves_of(settings, domain), usual, free)
+    search.check()
+    search.converge()
+    for _ in range(3):  # what is not told changes what is best, and the reverse
+        before = [*search.chosen, *search.told]
+        search.drop_untold()
+        search.choose()
+        search.converge()
+        if before == [*search.chosen, *search.told]:
+            break
+    return search.result(domain)
+
+
+class _Search:
+    """The state of a fit: the curve of each term, its coefficients, and the noise of each group."""
+
+    def __init__(self, stimulus: Stimulus, curves: list[TermCurve], usual: Array, free: NDArray[np.bool_]) -> None:
+        self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
+        self.told = free.copy()
+        self.chosen = [0] * len(TERMS)
+        self.x: list[Array] = [np.zeros(1) for _ in TERMS]
+        self.s = np.ones(2)
+
+    def check(self) -> None:
+        """Raise SingularFit where there are fewer equations than terms."""
+        equations, count = len(self._equations().left), int(np.sum(self.told))
+        if equations <= count:
+            raise SingularFit(
+                f"the stimulus has {equations} equations for {count} terms; add placements or segments, more than "
+                "there are terms"
+            )
+
+    @property
+    def terms(self) -> TriadTerms:
+        return TriadTerms([self.curves[k] for k in self.chosen], self.x)
+
+    def _equations(self) -> Equations:
+        return self.stimulus.equations(self.terms.at(self.stimulus.T))
+
+    def _system(self, e: Equations, z: Array, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Return N (n, n), right side (n,) and whitened design (m, n) of some curves, their priors and penalties in."""
+        weight = 1 / self.s[e.group]
+        columns, prior = [], []
+        for j, k in enumerate(chosen):
+            curve, wide = self.curves[k], 1 / (WIDE * self.usual[j]) ** 2
+            columns.append((weight * e.J[:, j] * self.told[j])[:, None] * curve.values(e.T))
+            own = wide * np.eye(curve.q)
+            if np.any(curve.penalty):
+                own += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
+            prior.append(own)
+        A = np.hstack(columns)
+        N = A.T @ A
+        at = 0
+        for own in prior:
+            N[at : at + len(own), at : at + len(own)] += own
+            at += len(own)
+        return N, A.T @ (weight * z), A
+
+    def _target(self, e: Equations) -> Array:
+        """Return the left sides (m,) as they were without any terms, in the linearisation."""
+        return np.asarray(e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T)))
+
+    def converge(self) -> None:
+        """Go to the optimum of these curves, with the noise that its residuals show."""
+        fall = np.inf
+        for k in range(STEPS):
+            e = self._equations()
+            z = self._target(e)
+            N, right, A = self._system(e, z, self.chosen)
+            solution = np.linalg.solve(N, right)
+            self._take(solution)
+            weight = 1 / self.s[e.group]
+            left = weight * z - A @ solution
+            leverage = np.einsum("mn,mn->m", A @ np.linalg.inv(N), A)
+            change = np.ones(2)
+            for g in np.unique(e.group):
+                own = e.group == g
+                change[g] = np.sqrt(np.sum(left[own] ** 2) / max(np.sum(own) - np.sum(leverage[own]), 1.0) + TINY)
+            self.s = self.s * change
+            last, fall = fall, float(np.max(np.abs(np.log(change))))
+            if k > 1 and fall < 1e-6 and last < 1e-3:
+                return
+        if not fall < 1e-2:
+            raise SingularFit(
+                f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, "
+                "and that the stimulus moves all axes"
+            )
+
+    def _take(self, solution: Array) -> None:
+        sizes = [self.curves[k].q for k in self.chosen]
+        self.x = np.split(solution, np.cumsum(sizes)[:-1])
+
+    def _covariance(self, e: Equations) -> Array:
+        """Return the covariance (12, 12) of the terms in the middle, by the columns that are free."""
+        N, _, _ = self._system(e, e.left, self.chosen)
+        C, T = np.linalg.inv(N), np.array([np.mean([e.T.min(), e.T.max()])])
+        B = np.zeros((len(TERMS), len(N)))
+        at = 0
+        for j, k in enumerate(self.chosen):
+            q = self.curves[k].q
+            B[j, at : at + q] = self.curves[k].values(T)[0]
+            at += q
+        return np.asarray(B @ C @ B.T)
+
+    def drop_untold(self) -> None:
+        """Set terms that are not told to zero, the least known first, and of those that are alike the bias last."""
+        e = self._equations()
+        while True:
+            sigma = np.sqrt(np.diag(self._covariance(e))) / self.usual * self.told
+            sigma[list(BIAS)] *= 0.9
+            worst = int(np.argmax(sigma))
+            if sigma[worst] <= UNTOLD:
+                return
+            self.told[worst] = False
+            self.chosen[worst], self.x[worst] = 0, np.zeros(1)
+
+    def choose(self) -> None:
+        """Give each term the curve that pays for its coefficients."""
+        e = self._equations()
+        z = self._target(e)
+        best = self._price(e, z, self.chosen)
+        while True:
+            trials = []
+            for j in np.flatnonzero(self.told):
+                for k in range(self.chosen[j] + 1, min(self.chosen[j] + 1 + AHEAD, len(self.curves))):
+                    tried = [*self.chosen[:j], k, *self.chosen[j + 1 :]]
+                    trials.append((self._price(e, z, tried), tried))
+            if not trials or (least := min(trials))[0] >= best:
+                break
+            best, self.chosen = least
+        N, right, _ = self._system(e, z, self.chosen)
+        self._take(np.linalg.solve(N, right))
+
+    def _price(self, e: Equations, z: Array, chosen: list[int]) -> float:
+        N, right, A = self._system(e, z, chosen)
+        inverse = np.linalg.inv(N)
+        weight = 1 / self.s[e.group]
+        left, m = weight * z - A @ (inverse @ right), len(z)
+        p = float(np.sum(inverse * (A.T @ A)))
+        if p >= m - 1:
+            return np.inf
+        return m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS)))
+
+    def result(self, domain: tuple[float, float]) -> TriadFit:
+        """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
+        e = self._equations()
+        free, told = self.free, self.told.copy()
+        wide = domain[1] - domain[0] >= NARROW
+        design = [polynomial(1, domain) if wide and self.curves[k].q == 1 else self.curves[k] for k in self.chosen]
+        weight = 1 / self.s[e.group]
+        columns, prior, untold = [], [], np.zeros(len(TERMS), dtype=bool)
+        for j, curve in enumerate(design):
+            columns.append((weight * e.J[:, j] * free[j])[:, None] * curve.values(e.T))
+            own = np.eye(curve.q) / self.usual[j] ** 2
+            if np.any(curve.penalty):
+                own += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
+            prior.append(own if free[j] else np.eye(curve.q) / TINY)
+        A = np.hstack(columns)
+        N = A.T @ A
+        starts = np.cumsum([0, *(curve.q for curve in design)])
+        for j, own in enumerate(prior):
+            N[starts[j] : starts[j + 1], starts[j] : starts[j + 1]] += own
+        sigma = np.sqrt(np.diag(np.linalg.inv(N)))
+        for j, k in enumerate(self.chosen):
+            if wide and self.curves[k].q == 1 and free[j]:
+                untold[j] = told[j] and sigma[starts[j] + 1] > UNTOLD * self.usual[j]
+                if told[j] and not untold[j]:  # no change was seen where one would have been: there is none
+                    N[starts[j] + 1, starts[j] + 1] += 1 / TINY
+        length = np.zeros((len(N), 1))  # an input whose size is unsure: all scale factors go with it
+        for j in SCALE:
+            flat = np.any(design[j].penalty)  # curves of a kind add up to one, of a polynomial the first is one
+            length[starts[j] : starts[j + 1] if flat else starts[j] + 1] = self.stimulus.unsure
+        root = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, length])
+        return TriadFit(
+            self.stimulus, self.terms, domain, self.usual, free, told, untold, design, root, tuple(self.s.tolist())
+        )
