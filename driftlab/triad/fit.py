@@ -1,15 +1,18 @@
 """Joint fit of bias, scale factor and misalignment over temperature to the equations of a stimulus.
 
-Gauss-Newton steps on penalised least squares; the equations come in groups whose noise is found from their residuals::
+Gauss-Newton steps on penalised least squares, with the noise that the residuals show::
 
-    x = argmin  sum_g |z - A x|_g^2 / s_g^2  +  x' P x,      A = J B(T)
+    x = argmin  (z - A x)' V^-1 (z - A x)  +  x' P x,      A = J B(T)
+    V = diag(s_g^2) + q sum_i J_i J_i' min(t, t')
+
+s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes.
 
 The curve of each term is chosen forward, by the largest fall of::
 
-    m log(residual) + p (log m + 2 log 12)
+    m log(residual) + 2 p m / (m - p - 1)
 
-with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
-Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759). A term that the equations do not tell is zero,
+with p the effective number of coefficients (Hurvich and Tsai, Biometrika 76 (1989) 297): a dearer one would leave out
+curves that are as large as the deviation of a term, which then says too little. A term that the equations do not tell is zero,
 and its usual size counts in the error of the others. m equations, n coefficients.
 """
 
@@ -23,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.triad.model import BIAS, GRID, NARROW, SCALE, TERMS, TermCurve, TriadTerms, curves_of, polynomial
-from driftlab.triad.stimuli import Equations, Stimulus
+from driftlab.triad.stimuli import Stimulus
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, ThermalMap, TriadMatrix
 from fusion_core.errors import SingularFit
@@ -32,6 +35,9 @@ STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
 UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
 POOR = 0.1  # of it: one that is known better is well known
+PASSES = 4
+WALKS = (0.0, *(10.0 ** (k / 2) for k in range(-4, 5)))  # variance of the walk over that of an equation, at the end
+SHOWS = 8.0  # by how much twice the logarithm of the likelihood rises with a walk that is there, but for 1 in 200
 AHEAD = 2  # curves that are looked at beyond that of a term
 TINY = 1e-30
 
@@ -84,7 +90,7 @@ class TriadFit:
         for curve in self.design:
             parts.append(curve.values(T) @ self.root[at : at + curve.q])
             at += curve.q
-        return np.stack(parts, axis=2).transpose(1, 0, 2)
+        return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
 
     def sigma(self, T: Array) -> Array:
         """Return the deviation (N, 12) of the terms at T (N,)."""
@@ -123,7 +129,7 @@ class TriadFit:
 
     def _scaled(self, T: Array) -> Array:
         low, high = self.grid[[0, -1]]
-        return (2 * T - low - high) / (high - low)
+        return np.asarray((2 * T - low - high) / (high - low))
 
     def verdict(self) -> list[str]:
         """Return which terms the stimulus does not tell, why, and what to add, a sentence each."""
@@ -181,13 +187,16 @@ def fit_triad(
     search = _Search(stimulus, curves_of(settings, domain), usual, free)
     search.check()
     search.converge()
-    for _ in range(3):  # what is not told changes what is best, and the reverse
+    for _ in range(PASSES):  # noise and walk, curves, and what is not told, each by the others
         before = [*search.chosen, *search.told]
-        search.drop_untold()
         search.choose()
         search.converge()
+        search.measure_walk()
+        search.converge()
+        search.drop_untold()
         if before == [*search.chosen, *search.told]:
             break
+    search.converge()
     return search.result(domain)
 
 
@@ -199,11 +208,12 @@ class _Search:
         self.told = free.copy()
         self.chosen = [0] * len(TERMS)
         self.x: list[Array] = [np.zeros(1) for _ in TERMS]
-        self.s = np.ones(2)
+        self.s, self.walk = np.ones(2), 0.0
+        self.linearise()
 
     def check(self) -> None:
         """Raise SingularFit where there are fewer equations than terms."""
-        equations, count = len(self._equations().left), int(np.sum(self.told))
+        equations, count = len(self.e.left), int(np.sum(self.told))
         if equations <= count:
             raise SingularFit(
                 f"the stimulus has {equations} equations for {count} terms; add placements or segments, more than "
@@ -212,81 +222,114 @@ class _Search:
 
     @property
     def terms(self) -> TriadTerms:
-        return TriadTerms([self.curves[k] for k in self.chosen], self.x)
+        return TriadTerms(self._curves(self.chosen), self.x)
 
-    def _equations(self) -> Equations:
-        return self.stimulus.equations(self.terms.at(self.stimulus.T))
+    def linearise(self) -> None:
+        """Take the equations about these terms, whiten them, and forget the columns of those before."""
+        self.e = e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        sigma = self.s[e.group]
+        self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
+        self._J = e.J / sigma[:, None]
+        self._columns: dict[tuple[int, int], Array] = {}
+        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk)) if self.walk else None
+        if self._root is not None:
+            self.z = np.linalg.solve(self._root, self.z)
 
-    def _system(self, e: Equations, z: Array, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
-        """Return N (n, n), right side (n,) and whitened design (m, n) of some curves, their priors and penalties in."""
-        weight = 1 / self.s[e.group]
+    def _covariance_of_noise(self, walk: float) -> Array:
+        """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
+        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
+        walked = (J @ J.T) * np.minimum.outer(t, t)
+        return np.eye(len(J)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked
+
+    def column(self, j: int, curve: TermCurve) -> Array:
+        """Return the whitened columns (m, q) of a term's curve."""
+        key = j, id(curve)
+        if key not in self._columns:
+            own = self._J[:, j, None] * curve.values(self.e.T)
+            self._columns[key] = own if self._root is None else np.linalg.solve(self._root, own)
+        return self._columns[key]
+
+    def _system(self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE) -> tuple[Array, Array]:
+        """Return N (n, n), with priors and penalties in it, and the whitened design A (m, n) of curves.
+
+        Of terms that are not among `some` (12,) the columns are zero; the prior is `wide` times the usual size.
+        """
         columns, prior = [], []
-        for j, k in enumerate(chosen):
-            curve, wide = self.curves[k], 1 / (WIDE * self.usual[j]) ** 2
-            columns.append((weight * e.J[:, j] * self.told[j])[:, None] * curve.values(e.T))
-            own = wide * np.eye(curve.q)
+        for j, curve in enumerate(curves):
+            columns.append(self.column(j, curve) * some[j])
+            prior.append(np.eye(curve.q) / (wide * self.usual[j]) ** 2)
             if np.any(curve.penalty):
-                own += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
-            prior.append(own)
+                prior[-1] += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
         A = np.hstack(columns)
-        N = A.T @ A
-        at = 0
+        N, at = A.T @ A, 0
         for own in prior:
             N[at : at + len(own), at : at + len(own)] += own
             at += len(own)
-        return N, A.T @ (weight * z), A
+        return np.asarray(N), A
 
-    def _target(self, e: Equations) -> Array:
-        """Return the left sides (m,) as they were without any terms, in the linearisation."""
-        return np.asarray(e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T)))
+    def _curves(self, chosen: Sequence[int]) -> list[TermCurve]:
+        return [self.curves[k] for k in chosen]
 
     def converge(self) -> None:
         """Go to the optimum of these curves, with the noise that its residuals show."""
         fall = np.inf
         for k in range(STEPS):
-            e = self._equations()
-            z = self._target(e)
-            N, right, A = self._system(e, z, self.chosen)
-            solution = np.linalg.solve(N, right)
+            self.linearise()
+            N, A = self._system(self._curves(self.chosen), self.told)
+            inverse = np.linalg.inv(N)
+            solution = np.asarray(inverse @ (A.T @ self.z))
             self._take(solution)
-            weight = 1 / self.s[e.group]
-            left = weight * z - A @ solution
-            leverage = np.einsum("mn,mn->m", A @ np.linalg.inv(N), A)
+            left, leverage = self.z - A @ solution, np.einsum("mn,mn->m", A @ inverse, A)
             change = np.ones(2)
-            for g in np.unique(e.group):
-                own = e.group == g
+            for g in np.unique(self.e.group):
+                own = self.e.group == g
                 change[g] = np.sqrt(np.sum(left[own] ** 2) / max(np.sum(own) - np.sum(leverage[own]), 1.0) + TINY)
             self.s = self.s * change
             last, fall = fall, float(np.max(np.abs(np.log(change))))
             if k > 1 and fall < 1e-6 and last < 1e-3:
-                return
+                break
         if not fall < 1e-2:
             raise SingularFit(
                 f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, "
                 "and that the stimulus moves all axes"
             )
+        self.linearise()
+
+    def measure_walk(self) -> None:
+        """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        prices, z, J = [], self.e.left, self._J
+        z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
+        curves = self._curves(self.chosen)
+        X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.told[j]])
+        for walk in WALKS:
+            root = np.linalg.cholesky(self._covariance_of_noise(walk))
+            A, y = np.linalg.solve(root, X), np.linalg.solve(root, z)
+            N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
+            left = y - A @ np.linalg.solve(N, A.T @ y)
+            spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
+            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(float(left @ left) + TINY)))
+        best = int(np.argmin(prices))
+        self.walk = WALKS[best] if prices[best] < prices[0] - SHOWS else 0.0
 
     def _take(self, solution: Array) -> None:
-        sizes = [self.curves[k].q for k in self.chosen]
+        sizes = [curve.q for curve in self._curves(self.chosen)]
         self.x = np.split(solution, np.cumsum(sizes)[:-1])
 
-    def _covariance(self, e: Equations) -> Array:
+    def _covariance(self) -> Array:
         """Return the covariance (12, 12) of the terms in the middle, by the columns that are free."""
-        N, _, _ = self._system(e, e.left, self.chosen)
-        C, T = np.linalg.inv(N), np.array([np.mean([e.T.min(), e.T.max()])])
+        curves, T = self._curves(self.chosen), np.array([(self.e.T.min() + self.e.T.max()) / 2])
+        N, _ = self._system(curves, self.told)
         B = np.zeros((len(TERMS), len(N)))
         at = 0
-        for j, k in enumerate(self.chosen):
-            q = self.curves[k].q
-            B[j, at : at + q] = self.curves[k].values(T)[0]
-            at += q
-        return np.asarray(B @ C @ B.T)
+        for j, curve in enumerate(curves):
+            B[j, at : at + curve.q] = curve.values(T)[0]
+            at += curve.q
+        return np.asarray(B @ np.linalg.inv(N) @ B.T)
 
     def drop_untold(self) -> None:
         """Set terms that are not told to zero, the least known first, and of those that are alike the bias last."""
-        e = self._equations()
         while True:
-            sigma = np.sqrt(np.diag(self._covariance(e))) / self.usual * self.told
+            sigma = np.sqrt(np.diag(self._covariance())) / self.usual * self.told
             sigma[list(BIAS)] *= 0.9
             worst = int(np.argmax(sigma))
             if sigma[worst] <= UNTOLD:
@@ -296,61 +339,51 @@ class _Search:
 
     def choose(self) -> None:
         """Give each term the curve that pays for its coefficients."""
-        e = self._equations()
-        z = self._target(e)
-        best = self._price(e, z, self.chosen)
+        best = self._price(self.chosen)
         while True:
             trials = []
             for j in np.flatnonzero(self.told):
                 for k in range(self.chosen[j] + 1, min(self.chosen[j] + 1 + AHEAD, len(self.curves))):
                     tried = [*self.chosen[:j], k, *self.chosen[j + 1 :]]
-                    trials.append((self._price(e, z, tried), tried))
+                    trials.append((self._price(tried), tried))
             if not trials or (least := min(trials))[0] >= best:
                 break
             best, self.chosen = least
-        N, right, _ = self._system(e, z, self.chosen)
-        self._take(np.linalg.solve(N, right))
+        N, A = self._system(self._curves(self.chosen), self.told)
+        self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
 
-    def _price(self, e: Equations, z: Array, chosen: list[int]) -> float:
-        N, right, A = self._system(e, z, chosen)
-        inverse = np.linalg.inv(N)
-        weight = 1 / self.s[e.group]
-        left, m = weight * z - A @ (inverse @ right), len(z)
-        p = float(np.sum(inverse * (A.T @ A)))
+    def _price(self, chosen: list[int]) -> float:
+        N, A = self._system(self._curves(chosen), self.told)
+        G, m = A.T @ A, len(self.z)
+        left, p = self.z - A @ np.linalg.solve(N, A.T @ self.z), float(np.trace(np.linalg.solve(N, G)))
         if p >= m - 1:
             return np.inf
-        return m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS)))
+        return float(m * np.log(float(left @ left) / m + TINY) + 2 * p * m / (m - p - 1))
 
     def result(self, domain: tuple[float, float]) -> TriadFit:
         """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
-        e = self._equations()
-        free, told = self.free, self.told.copy()
         wide = domain[1] - domain[0] >= NARROW
-        design = [polynomial(1, domain) if wide and self.curves[k].q == 1 else self.curves[k] for k in self.chosen]
-        weight = 1 / self.s[e.group]
-        columns, prior, untold = [], [], np.zeros(len(TERMS), dtype=bool)
-        for j, curve in enumerate(design):
-            columns.append((weight * e.J[:, j] * free[j])[:, None] * curve.values(e.T))
-            own = np.eye(curve.q) / self.usual[j] ** 2
-            if np.any(curve.penalty):
-                own += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
-            prior.append(own if free[j] else np.eye(curve.q) / TINY)
-        A = np.hstack(columns)
-        N = A.T @ A
+        straight = [wide and curve.q == 1 for curve in self._curves(self.chosen)]
+        design = [
+            polynomial(1, domain) if line else c for line, c in zip(straight, self._curves(self.chosen), strict=True)
+        ]
+        N, _ = self._system(design, self.free, wide=1.0)
         starts = np.cumsum([0, *(curve.q for curve in design)])
-        for j, own in enumerate(prior):
-            N[starts[j] : starts[j + 1], starts[j] : starts[j + 1]] += own
         sigma = np.sqrt(np.diag(np.linalg.inv(N)))
-        for j, k in enumerate(self.chosen):
-            if wide and self.curves[k].q == 1 and free[j]:
-                untold[j] = told[j] and sigma[starts[j] + 1] > UNTOLD * self.usual[j]
-                if told[j] and not untold[j]:  # no change was seen where one would have been: there is none
-                    N[starts[j] + 1, starts[j] + 1] += 1 / TINY
+        untold = np.zeros(len(TERMS), dtype=bool)
+        for j, start in enumerate(starts[:-1]):
+            own = range(start, starts[j + 1])
+            if self.told[j] and straight[j]:
+                untold[j] = sigma[start + 1] > UNTOLD * self.usual[j]
+            # no change was seen where one would have been: there is none; and terms that are not free are known
+            known = own[1:] if self.told[j] and straight[j] and not untold[j] else own[:0] if self.free[j] else own
+            N[known, known] += 1 / TINY
         length = np.zeros((len(N), 1))  # an input whose size is unsure: all scale factors go with it
         for j in SCALE:
             flat = np.any(design[j].penalty)  # curves of a kind add up to one, of a polynomial the first is one
             length[starts[j] : starts[j + 1] if flat else starts[j] + 1] = self.stimulus.unsure
         root = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, length])
         return TriadFit(
-            self.stimulus, self.terms, domain, self.usual, free, told, untold, design, root, tuple(self.s.tolist())
-        )
+            self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
+            tuple(self.s.tolist()),
+        )  # fmt: skip

@@ -97,7 +97,7 @@ class TriadTerms:
 
 def inverted(values: Array) -> tuple[Array, Array]:
     """Return (I + M)^-1 (N, 3, 3) and the bias (N, 3) of terms (N, 12)."""
-    return np.linalg.inv(np.eye(3) + values[:, 3:].reshape(-1, 3, 3)), values[:, :3]
+    return np.asarray(np.linalg.inv(np.eye(3) + values[:, 3:].reshape(-1, 3, 3))), values[:, :3]
 
 
 def input_derivative(W: Array, u: Array) -> Array:

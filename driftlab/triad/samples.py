@@ -118,7 +118,7 @@ def _placed(chunk: Chunk, config: Config, settings: Placed, k: int) -> Stimulus:
     else:
         triads = [chunk[name] for name in ("accel", "gyro") if name in chunk.channels]
         places = rests(chunk.t, *triads, least=float(settings.rest))
-    means = np.stack([T[a:b].mean() for a, b in places])
+    means, times = (np.stack([values[a:b].mean() for a, b in places]) for values in (T, chunk.t))
     if channel == "gyro":
         if "accel" not in chunk.channels:
             raise MissingChannel(
@@ -131,7 +131,7 @@ def _placed(chunk: Chunk, config: Config, settings: Placed, k: int) -> Stimulus:
     if known is None:
         raise ConfigError(f"stimulus: kind {settings.kind} is for an accelerometer or a gyro, not for {channel}")
     length, unsure = known if settings.gravity is None else (float(settings.gravity), 0.0)
-    return PlacedForces(np.stack([y[a:b].mean(axis=0) for a, b in places]), means, length, unsure / length)
+    return PlacedForces(np.stack([y[a:b].mean(axis=0) for a, b in places]), means, times, length, unsure / length)
 
 
 def _turned(chunk: Chunk, config: Config, settings: KnownRate, k: int, count: int) -> KnownRates:
@@ -153,8 +153,9 @@ def _turned(chunk: Chunk, config: Config, settings: KnownRate, k: int, count: in
     if not found:
         raise DataError("stimulus: no segment with a steady rate was found; check stimulus.channel and its unit")
     u = np.stack([(rate + vertical) * axis for _, axis, rate in found])
-    y, means = (np.stack([values[a:b].mean(axis=0) for (a, b), _, _ in found]) for values in (chunk[channel], T))
-    return KnownRates(u, y, means)
+    columns = (chunk[channel], T, t)
+    y, means, times = (np.stack([values[a:b].mean(axis=0) for (a, b), _, _ in found]) for values in columns)
+    return KnownRates(u, y, means, times)
 
 
 def _commanded(chunk: Chunk, settings: KnownRate, k: int, count: int) -> Iterator[tuple[tuple[int, int], Array, float]]:
@@ -180,13 +181,12 @@ def _joined(parts: Sequence[Stimulus]) -> Stimulus:
     first = parts[0]
     if len(parts) == 1:
         return first
+    names = ("y", "temperatures", "times")
+    y, T, t = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     if isinstance(first, KnownRates):
-        rates = [part for part in parts if isinstance(part, KnownRates)]
-        return KnownRates(*(np.concatenate([getattr(p, name) for p in rates]) for name in ("u", "y", "temperatures")))
+        return KnownRates(np.concatenate([part.u for part in parts if isinstance(part, KnownRates)]), y, T, t)
     if isinstance(first, PlacedForces):
-        forces = [part for part in parts if isinstance(part, PlacedForces)]
-        both = (np.concatenate([getattr(p, name) for p in forces]) for name in ("y", "temperatures"))
-        return PlacedForces(*both, first.gravity, first.unsure)
+        return PlacedForces(y, T, t, first.gravity, first.unsure)
     raise ConfigError("positions of a gyro: are of one recording, in which it is turned; name one with --input")
 
 

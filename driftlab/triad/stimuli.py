@@ -48,7 +48,8 @@ class Equations:
     left : (m,) array
         Measured less modelled.
     J : (m, 12) array
-    T : (m,) array
+    T, t : (m,) arrays
+        Temperatures, degC, and times, s, by which the bias walks from one equation to another.
     group : (m,) array of int
         Equations of one kind of noise, whose size is found from them. Within it all count alike: after seconds at rest
         it is the instability and the mounting that are left, and no longer white noise.
@@ -57,6 +58,7 @@ class Equations:
     left: Array
     J: Array
     T: Array
+    t: Array
     group: NDArray[np.int64]
 
 
@@ -101,12 +103,14 @@ class KnownRates(Stimulus):
     ----------
     u, y : (S, 3) arrays
         The input, and the mean reading.
-    temperatures : (S,) array
+    temperatures, times : (S,) arrays
+        Of each, in degC and s.
     """
 
     u: Array
     y: Array
     temperatures: Array
+    times: Array
 
     @property
     def T(self) -> Array:
@@ -120,7 +124,8 @@ class KnownRates(Stimulus):
         J = np.zeros((S, 3, len(TERMS)))
         for i in range(3):
             J[:, i, i], J[:, i, 3 + 3 * i : 6 + 3 * i] = 1.0, self.u
-        return Equations(left.ravel(), J.reshape(-1, 12), np.repeat(self.T, 3), np.zeros(3 * S, dtype=np.int64))
+        each = np.repeat(self.T, 3), np.repeat(self.times, 3)
+        return Equations(left.ravel(), J.reshape(-1, 12), *each, np.zeros(3 * S, dtype=np.int64))
 
     def lacking(self, term: int) -> str:
         """Say which rates are missing."""
@@ -133,7 +138,7 @@ class KnownRates(Stimulus):
 
 @dataclass(frozen=True, eq=False)
 class PlacedForces(Stimulus):
-    """Placements of an accelerometer at rest: mean readings (P, 3), temperatures (P,), and gravity.
+    """Placements of an accelerometer at rest: mean readings (P, 3), temperatures and times (P,), gravity.
 
     Gravity is unsure by a share, which is one in the scale factors of all axes.
 
@@ -142,6 +147,7 @@ class PlacedForces(Stimulus):
 
     y: Array
     temperatures: Array
+    times: Array
     gravity: float
     unsure: float = 0.0
     sensor_frame = True
@@ -154,7 +160,7 @@ class PlacedForces(Stimulus):
     def forces(self, values: Array) -> Array:
         """Return the specific force (P, 3) that terms (P, 12) give."""
         W, bias = inverted(values)
-        return np.einsum("nij,nj->ni", W, self.y - bias)
+        return np.asarray(np.einsum("nij,nj->ni", W, self.y - bias))
 
     def equations(self, values: Array) -> Equations:
         """Return one equation a placement, of the length."""
@@ -162,12 +168,12 @@ class PlacedForces(Stimulus):
         f = self.forces(values)
         length = np.linalg.norm(f, axis=1)
         J = np.einsum("ni,nij->nj", f / length[:, None], input_derivative(W, f))
-        return Equations(self.gravity - length, J, self.T, np.zeros(len(f), dtype=np.int64))
+        return Equations(self.gravity - length, J, self.T, self.times, np.zeros(len(f), dtype=np.int64))
 
     def lacking(self, term: int) -> str:
         """Say which placements are missing."""
         up = self.y / np.linalg.norm(self.y, axis=1)[:, None]
-        i, j = _pair(term)
+        i, j = tuple(_pair(term))
         if i != j:
             tilted = np.abs(up[:, AXES.index(i)] * up[:, AXES.index(j)])
             seen = f"the largest product of both parts of gravity is {np.max(tilted):.2f}"
@@ -189,7 +195,7 @@ class PlacedRates(Stimulus):
         Mean readings at rest.
     up : (P, 3) array
         Unit vectors of gravity's reaction there, in the axes of the accelerometer, which are the frame.
-    temperatures : (P,) array
+    temperatures, times : (P,) arrays
     turns : sequence of (N, 3) arrays
         Readings from each placement to the next.
     steps : sequence of (N,) arrays
@@ -199,13 +205,14 @@ class PlacedRates(Stimulus):
     y: Array
     up: Array
     temperatures: Array
+    times: Array
     turns: Sequence[Array]
     steps: Sequence[Array]
 
     @property
     def T(self) -> Array:
         """Temperatures of the placements, then those of the turns."""
-        return np.concatenate([self.temperatures, (self.temperatures[1:] + self.temperatures[:-1]) / 2])
+        return _with_middles(self.temperatures)
 
     def equations(self, values: Array) -> Equations:
         """Return three equations a placement, of the bias, and three a turn, of gravity's direction after it."""
@@ -217,6 +224,7 @@ class PlacedRates(Stimulus):
             np.concatenate([(self.y - values[:P, :3]).ravel(), (self.up[1:] - ends).ravel()]),
             np.concatenate([at_rest.reshape(-1, 12), J.reshape(-1, 12)]),
             np.repeat(self.T, 3),
+            np.repeat(_with_middles(self.times), 3),
             np.repeat([0, 1], [3 * P, 3 * P - 3]),
         )
 
@@ -247,6 +255,11 @@ class PlacedRates(Stimulus):
         if sum(map(abs, sums)) < TURN:
             return f"it is hardly turned about {axis}; turn it about {axis} by 90 deg or more between placements"
         return f"{len(self.turns)} turns are too few for all terms; add some about {axis}, and one the other way"
+
+
+def _with_middles(values: Array) -> Array:
+    """Return values (P,) at placements, then those half-way from each to the next."""
+    return np.concatenate([values, (values[1:] + values[:-1]) / 2])
 
 
 def _cross(v: Array) -> Array:
@@ -299,5 +312,5 @@ def placed_rates(t: Array, y: Array, T: Array, places: Sequence[tuple[int, int]]
     # between the mean of one rest and that of the next it stands still but for the turn: the bias alone would add up
     return PlacedRates(
         np.stack([y[a:b].mean(axis=0) for a, b in places]), up, np.array([T[a:b].mean() for a, b in places]),
-        [y[part] for part in between], [step[part] for part in between],
+        np.array([t[a:b].mean() for a, b in places]), [y[part] for part in between], [step[part] for part in between],
     )  # fmt: skip
