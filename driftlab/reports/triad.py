@@ -14,8 +14,6 @@ from driftlab.triad.model import AXES, SCALE, TERMS
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
-HEADS = ("term", "unit", "coldest", "warmest", "at {:.1f} °C", "sigma", "change", "its sigma", "curve")
-
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
     """Return the unit in which a term is shown, and the factor to it."""
@@ -25,21 +23,26 @@ def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
 
 
 def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
-    """Return each term in the middle of the range and at its ends, its change over it, and how sure both are."""
+    """Return each term in the middle of the range, its change over the range, how sure both are, and its curve."""
     low, high = fit.domain
-    T = np.array([low, high, (low + high) / 2])
-    values, sigma, (change, of_change) = fit.terms.at(T), fit.sigma(T), fit.change()
+    T = np.array([(low + high) / 2])
+    values, sigma, (change, of_change) = fit.terms.at(T)[0], fit.sigma(T)[0], fit.change()
     rows = []
     for j in map(int, np.flatnonzero(fit.free)):
         name, factor = unit_of(j, unit)
-        shown = [*(values[:, j] * factor), sigma[2, j] * factor, change[j] * factor, of_change[j] * factor]
-        texts = [f"{v:.4g}" for v in shown] if fit.told[j] else [*["-"] * 3, f"{shown[3]:.4g}", "-", "-"]
-        curve = fit.terms.curves[j].name if fit.told[j] else "not told"
-        if high - low < np.ptp(fit.grid) or fit.untold_changes[j]:
-            texts[4:] = ["-", "-"]
-        rows.append([TERMS[j], name, *texts, curve])
-    heads = [head.format(T[2]) for head in HEADS]
-    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", texts=2, framed=False)
+        spec = "+.0f" if name == "ppm" else "+.3f" if name == "mrad" else f"+{unit.digits}"
+        of_term = [f"{values[j] * factor:{spec}}", f"{sigma[j] * factor:.2g}"]
+        of_range = [f"{change[j] * factor:{spec}}", f"{of_change[j] * factor:.2g}"]
+        curve = fit.terms.curves[j].name
+        if not fit.told[j]:
+            of_term[0], of_range, curve = "-", ["-", "-"], "not told"
+        elif high - low < np.ptp(fit.grid) or fit.untold_changes[j]:
+            of_range = ["not told", "-"]
+        elif curve == "constant":
+            of_range = ["none", "-"]
+        rows.append([f"{TERMS[j]} [{name}]", *of_term, *of_range, curve])
+    heads = ("term", f"at {T[0]:.1f} °C", "sigma", "change", "sigma", "curve")
+    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False, rigid=True)
 
 
 def frame_line(fit: TriadFit) -> str:

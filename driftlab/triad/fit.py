@@ -9,11 +9,12 @@ s_g is the white noise of a group of equations, q the walk of the bias over time
 
 The curve of each term is chosen forward, by the largest fall of::
 
-    m log(residual) + 2 p m / (m - p - 1)
+    m log(residual) + p (log m + 2 log 12)
 
-with p the effective number of coefficients (Hurvich and Tsai, Biometrika 76 (1989) 297): a dearer one would leave out
-curves that are as large as the deviation of a term, which then says too little. A term that the equations do not tell is zero,
-and its usual size counts in the error of the others. m equations, n coefficients.
+with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
+Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. The
+walk is the mean of its restricted likelihood. A term that the equations do not tell is zero, and its usual size counts
+in the error of the others. m equations, n coefficients.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ WIDE = 20.0  # times the usual size: the prior with which a fit begins
 UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
 POOR = 0.1  # of it: one that is known better is well known
 PASSES = 4
+LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = (0.0, *(10.0 ** (k / 2) for k in range(-4, 5)))  # variance of the walk over that of an equation, at the end
-SHOWS = 8.0  # by how much twice the logarithm of the likelihood rises with a walk that is there, but for 1 in 200
 AHEAD = 2  # curves that are looked at beyond that of a term
 TINY = 1e-30
 
@@ -102,13 +103,24 @@ class TriadFit:
         values, modes = self.terms.at(ends), self.modes(ends)
         return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
 
+    @cached_property
+    def _joint_modes(self) -> Array:
+        """Modes (r, G, 12) on the grid, those alone that matter beside the deviation of some term."""
+        modes = self.modes(self.grid)
+        size = np.sqrt(np.sum(modes**2, axis=0)) + TINY
+        _, s, V = np.linalg.svd((modes / size).reshape(len(modes), -1), full_matrices=False)
+        kept = s > LEFT * s[0]
+        return np.asarray((s[kept, None] * V[kept]).reshape(-1, *size.shape) * size)
+
     def curve_error(self, part: slice) -> CurveError:
         """Return the error of some terms as a map's record holds it; its modes are those of all terms, one by one."""
         T = self.grid
         curve = self.terms.at(T)[:, part]
         bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
-        modes = tuple(tuple(map(tuple, mode)) for mode in self.modes(T)[:, :, part].tolist())
-        return CurveError(T=tuple(T.tolist()), modes=modes, bend=tuple(bend.tolist()))
+        modes = [[[float(f"{v:.6g}") for v in row] for row in mode] for mode in self._joint_modes[:, :, part].tolist()]
+        return CurveError(
+            T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes), bend=tuple(bend.tolist())
+        )
 
     def matrix(self) -> TriadMatrix:
         """Return M over temperature as a map's record holds it."""
@@ -308,8 +320,8 @@ class _Search:
             left = y - A @ np.linalg.solve(N, A.T @ y)
             spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
             prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(float(left @ left) + TINY)))
-        best = int(np.argmin(prices))
-        self.walk = WALKS[best] if prices[best] < prices[0] - SHOWS else 0.0
+        likelihood = np.exp((np.min(prices) - np.array(prices)) / 2)
+        self.walk = float(likelihood @ WALKS / np.sum(likelihood))
 
     def _take(self, solution: Array) -> None:
         sizes = [curve.q for curve in self._curves(self.chosen)]
@@ -339,6 +351,7 @@ class _Search:
 
     def choose(self) -> None:
         """Give each term the curve that pays for its coefficients."""
+        self.chosen = [0] * len(TERMS)
         best = self._price(self.chosen)
         while True:
             trials = []
@@ -356,9 +369,10 @@ class _Search:
         N, A = self._system(self._curves(chosen), self.told)
         G, m = A.T @ A, len(self.z)
         left, p = self.z - A @ np.linalg.solve(N, A.T @ self.z), float(np.trace(np.linalg.solve(N, G)))
+        p += sum(bool(np.any(self.curves[k].penalty)) for k in chosen)
         if p >= m - 1:
             return np.inf
-        return float(m * np.log(float(left @ left) / m + TINY) + 2 * p * m / (m - p - 1))
+        return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS))))
 
     def result(self, domain: tuple[float, float]) -> TriadFit:
         """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
