@@ -37,6 +37,7 @@ WIDE = 20.0  # times the usual size: the prior with which a fit begins
 UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
 POOR = 0.1  # of it: one that is known better is well known
 PASSES = 4
+SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = (0.0, *(10.0 ** (k / 2) for k in range(-4, 5)))  # variance of the walk over that of an equation, at the end
 AHEAD = 2  # curves that are looked at beyond that of a term
@@ -198,7 +199,8 @@ def fit_triad(
     free = stimulus.free if wanted is None else stimulus.free & wanted
     search = _Search(stimulus, curves_of(settings, domain), usual, free)
     search.check()
-    search.converge()
+    if not search.converge():
+        search.drop_untold()
     for _ in range(PASSES):  # noise and walk, curves, and what is not told, each by the others
         before = [*search.chosen, *search.told]
         search.choose()
@@ -208,7 +210,11 @@ def fit_triad(
         search.drop_untold()
         if before == [*search.chosen, *search.told]:
             break
-    search.converge()
+    if not search.converge():
+        raise SingularFit(
+            f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, and "
+            "that the stimulus moves all axes"
+        )
     return search.result(domain)
 
 
@@ -282,8 +288,11 @@ class _Search:
     def _curves(self, chosen: Sequence[int]) -> list[TermCurve]:
         return [self.curves[k] for k in chosen]
 
-    def converge(self) -> None:
-        """Go to the optimum of these curves, with the noise that its residuals show."""
+    def converge(self) -> bool:
+        """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
+
+        Then the terms are those of usual units, whose equations show which of them are not told.
+        """
         fall = np.inf
         for k in range(STEPS):
             self.linearise()
@@ -300,12 +309,13 @@ class _Search:
             last, fall = fall, float(np.max(np.abs(np.log(change))))
             if k > 1 and fall < 1e-6 and last < 1e-3:
                 break
-        if not fall < 1e-2:
-            raise SingularFit(
-                f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, "
-                "and that the stimulus moves all axes"
-            )
-        self.linearise()
+        if settled := fall < 1e-2:
+            self.linearise()
+        else:
+            self.x = [np.zeros(self.curves[k].q) for k in self.chosen]
+            self.s = np.full(2, SURE * self.usual[0])
+            self.linearise()
+        return settled
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
@@ -366,10 +376,11 @@ class _Search:
         self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
 
     def _price(self, chosen: list[int]) -> float:
-        N, A = self._system(self._curves(chosen), self.told)
-        G, m = A.T @ A, len(self.z)
-        left, p = self.z - A @ np.linalg.solve(N, A.T @ self.z), float(np.trace(np.linalg.solve(N, G)))
-        p += sum(bool(np.any(self.curves[k].penalty)) for k in chosen)
+        curves, m, p = self._curves(chosen), len(self.z), 0.0
+        N, A = self._system(curves, self.told)
+        left, shares = self.z - A @ np.linalg.solve(N, A.T @ self.z), np.diag(np.linalg.solve(N, A.T @ A))
+        for curve, own in zip(curves, np.split(shares, np.cumsum([curve.q for curve in curves])[:-1]), strict=True):
+            p += float(np.sum(own)) + 1 if np.any(curve.penalty) else curve.q
         if p >= m - 1:
             return np.inf
         return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS))))

@@ -141,9 +141,7 @@ def _turned(chunk: Chunk, config: Config, settings: KnownRate, k: int, count: in
     if channel != "gyro":
         raise ConfigError(f"stimulus: rate_table tells of a gyro, not of {channel}; use kind positions")
     if (settings.segments is None) == (settings.channel is None):
-        raise ConfigError(
-            "stimulus: rate_table needs segments, a table, or channel, the table's rate; give one of them"
-        )
+        raise ConfigError("stimulus: rate_table needs segments, a table, or channel, its rate; give one of them")
     vertical = 0.0 if config.latitude is None else EARTH_RATE * float(np.sin(config.latitude))
     if settings.segments is not None:
         table = segments(_file(settings.segments, k), rates=True)

@@ -10,7 +10,7 @@ import numpy as np
 AXES = np.eye(3)
 
 
-def matrix_of(T, rng_free=0):
+def matrix_of(T):
     """M (3, 3) at T: scale factors of 1 % that move by as much over 60 K, misalignments of mrad, one of them moving."""
     x = (T - 20.0) / 40.0
     M = np.array([[0.004, 0.003, -0.005], [0.002, -0.008, 0.006], [-0.001, 0.004, 0.01]])
@@ -62,7 +62,7 @@ class Readings:
         return np.arange(len(y)) * self.dt, y, np.concatenate(self.T)
 
 
-def turntable(seed, temperatures, rate=np.deg2rad(100.0), hold=16.0, hz=10.0, axes=range(3)):
+def turntable(seed, temperatures, rate=1.7453292519943295, hold=16.0, hz=10.0, axes=range(3)):
     """Return t, gyro, T and the table of segments: each axis both ways at each temperature, with ramps between."""
     made = Readings(seed, hz, white=8e-5, walk=1e-6, bias=np.deg2rad(1.0))
     lines = ["start [s],stop [s],axis,rate [deg/s]"]
