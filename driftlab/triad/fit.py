@@ -145,7 +145,7 @@ class TriadFit:
         return np.asarray((2 * T - low - high) / (high - low))
 
     def verdict(self) -> list[str]:
-        """Return which terms the stimulus does not tell, why, and what to add, a sentence each."""
+        """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
         lines = []
         middle = self.sigma(np.array([np.mean(self.domain)]))[0]
         for j, name in enumerate(TERMS):
@@ -257,7 +257,7 @@ class _Search:
         """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
         J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
         walked = (J @ J.T) * np.minimum.outer(t, t)
-        return np.eye(len(J)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked
+        return np.asarray(np.eye(len(J)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
 
     def column(self, j: int, curve: TermCurve) -> Array:
         """Return the whitened columns (m, q) of a term's curve."""

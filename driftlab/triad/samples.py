@@ -41,7 +41,7 @@ HEAD = re.compile(r"\s*(\w+)\s*(?:\[([^\]]+)\])?\s*")
 UNITS = {"start": "s", "stop": "s", "rate": "rad/s"}
 
 
-class Segment(NamedTuple):
+class TurntableSegment(NamedTuple):
     """A part of a recording, s from its first row, and the rate of the unit there (3,), rad/s."""
 
     start: float
@@ -220,7 +220,7 @@ def direction(text: str) -> tuple[float, float, float]:
     raise ConfigError(f"axis '{quote(text)}': is no direction; write x, y, z, -x, -y, -z, or three numbers")
 
 
-def segments(path: Path, *, rates: bool) -> list[Segment]:
+def segments(path: Path, *, rates: bool) -> list[TurntableSegment]:
     """Read a table of segments, with `rates`, or of placements; raises ConfigError or DataError."""
     needed = ("start", "stop", "axis", "rate") if rates else ("start", "stop")
     example = "start [s],stop [s]" + ",axis,rate [deg/s]" * rates
@@ -240,7 +240,7 @@ def segments(path: Path, *, rates: bool) -> list[Segment]:
             axis = direction(line[columns["axis"][0]]) if rates else (0.0, 0.0, 1.0)
         except (ValueError, IndexError, UnitError, ConfigError) as error:
             raise DataError(f"{path}: line {number}: {error}; write lines as `{example}` says") from None
-        found.append(Segment(values["start"], values["stop"], axis, values.get("rate", 0.0)))
+        found.append(TurntableSegment(values["start"], values["stop"], axis, values.get("rate", 0.0)))
     if not found:
         raise DataError(f"{path}: has no line under its head; write one for each segment")
     return found

@@ -1,4 +1,4 @@
-"""Stimuli of a triad: what is known of its input, as equations in its terms.
+"""Stimuli of a triad: its input, as far as it is known, as equations in its terms.
 
 Known rates, as a turntable turns the unit, axis by axis::
 
@@ -66,7 +66,7 @@ class Stimulus(ABC):
     """The input of a triad, as far as it is known; another one is a class with these three methods."""
 
     sensor_frame: bool = False
-    """Whether the frame is the sensor's own: M then has 6 terms."""
+    """True where the frame is the sensor's own: M then has 6 terms."""
     unsure: float = 0.0
     """Deviation of the size of the input, as a share of it, the same in all equations."""
 
@@ -81,7 +81,7 @@ class Stimulus(ABC):
 
     @abstractmethod
     def lacking(self, term: int) -> str:
-        """Return why a term is not told and what to add, in one clause each, with `; ` between; of `TERMS`."""
+        """Return the reason why a term of `TERMS` is not told, and after `; ` the remedy."""
 
     @property
     def free(self) -> NDArray[np.bool_]:

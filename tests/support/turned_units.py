@@ -62,17 +62,17 @@ class Readings:
         return np.arange(len(y)) * self.dt, y, np.concatenate(self.T)
 
 
-def turntable(seed, temperatures, rate=1.7453292519943295, hold=16.0, hz=10.0, axes=range(3)):
+def turntable(seed, temperatures, rate=1.7453292519943295, hold=16.0, hz=10.0, axes=range(3), matrix=matrix_of):
     """Return t, gyro, T and the table of segments: each axis both ways at each temperature, with ramps between."""
     made = Readings(seed, hz, white=8e-5, walk=1e-6, bias=np.deg2rad(1.0))
     lines = ["start [s],stop [s],axis,rate [deg/s]"]
     for T in temperatures:
         for k in axes:
             for sign in (1, -1):
-                made.stretch(1.0, np.linspace(0, 1, 10)[:, None] * sign * rate * AXES[k], T)
+                made.stretch(1.0, np.linspace(0, 1, 10)[:, None] * sign * rate * AXES[k], T, matrix(T))
                 lines.append(f"{made.now:.3f},{made.now + hold:.3f},{'xyz'[k]},{sign * np.rad2deg(rate):.9f}")
-                made.stretch(hold, sign * rate * AXES[k], T)
-                made.stretch(1.0, np.linspace(1, 0, 10)[:, None] * sign * rate * AXES[k], T)
+                made.stretch(hold, sign * rate * AXES[k], T, matrix(T))
+                made.stretch(1.0, np.linspace(1, 0, 10)[:, None] * sign * rate * AXES[k], T, matrix(T))
     return *made.arrays(), "\n".join(lines) + "\n"
 
 
