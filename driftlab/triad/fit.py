@@ -12,9 +12,10 @@ The curve of each term is chosen forward, by the largest fall of::
     m log(residual) + p (log m + 2 log 12)
 
 with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
-Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. The
-walk is the mean of its restricted likelihood. A term that the equations do not tell is zero, and its usual size counts
-in the error of the others. m equations, n coefficients.
+Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
+noise and walk are means over their restricted likelihood, all densities of the walk alike before: one that hardly shows
+may be there. A term that the equations do not tell is zero, and its usual size counts in the error of the others.
+m equations, n coefficients.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ POOR = 0.1  # of it: one that is known better is well known
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
-WALKS = (0.0, *(10.0 ** (k / 2) for k in range(-4, 5)))  # variance of the walk over that of an equation, at the end
+WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
 AHEAD = 2  # curves that are looked at beyond that of a term
 TINY = 1e-30
 
@@ -206,11 +207,11 @@ def fit_triad(
         search.choose()
         search.converge()
         search.measure_walk()
-        search.converge()
+        search.converge(noise=False)
         search.drop_untold()
         if before == [*search.chosen, *search.told]:
             break
-    if not search.converge():
+    if not search.converge(noise=False):
         raise SingularFit(
             f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, and "
             "that the stimulus moves all axes"
@@ -288,12 +289,12 @@ class _Search:
     def _curves(self, chosen: Sequence[int]) -> list[TermCurve]:
         return [self.curves[k] for k in chosen]
 
-    def converge(self) -> bool:
+    def converge(self, *, noise: bool = True) -> bool:
         """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
 
-        Then the terms are those of usual units, whose equations show which of them are not told.
+        Without `noise` that stays as it is. Where there is no optimum, the terms are those of usual units, whose equations show which of them are not told.
         """
-        fall = np.inf
+        fall, size = np.inf, 1 / TINY
         for k in range(STEPS):
             self.linearise()
             N, A = self._system(self._curves(self.chosen), self.told)
@@ -302,11 +303,12 @@ class _Search:
             self._take(solution)
             left, leverage = self.z - A @ solution, np.einsum("mn,mn->m", A @ inverse, A)
             change = np.ones(2)
-            for g in np.unique(self.e.group):
+            for g in np.unique(self.e.group) if noise else ():
                 own = self.e.group == g
                 change[g] = np.sqrt(np.sum(left[own] ** 2) / max(np.sum(own) - np.sum(leverage[own]), 1.0) + TINY)
-            self.s = self.s * change
-            last, fall = fall, float(np.max(np.abs(np.log(change))))
+            self.s, size, before = self.s * change, float(left @ left), size
+            of_size = np.log((size + TINY) / (before + TINY)) if not noise else 0.0
+            last, fall = fall, float(np.max(np.abs([*np.log(change), of_size])))
             if k > 1 and fall < 1e-6 and last < 1e-3:
                 break
         if settled := fall < 1e-2:
@@ -319,7 +321,7 @@ class _Search:
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
-        prices, z, J = [], self.e.left, self._J
+        prices, squares, z, J = [], [], self.e.left, self._J
         z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
         curves = self._curves(self.chosen)
         X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.told[j]])
@@ -329,9 +331,12 @@ class _Search:
             N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
             left = y - A @ np.linalg.solve(N, A.T @ y)
             spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
-            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(float(left @ left) + TINY)))
-        likelihood = np.exp((np.min(prices) - np.array(prices)) / 2)
-        self.walk = float(likelihood @ WALKS / np.sum(likelihood))
+            squares.append(float(left @ left) / max(len(z) - A.shape[1], 1) + TINY)
+            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(squares[-1])))
+        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS)
+        white = float(likely @ squares / np.sum(likely))
+        self.walk = float(likely @ (np.array(squares) * WALKS) / np.sum(likely)) / white
+        self.s = self.s * np.sqrt(white)
 
     def _take(self, solution: Array) -> None:
         sizes = [curve.q for curve in self._curves(self.chosen)]
