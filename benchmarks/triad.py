@@ -28,7 +28,7 @@ ACCEL = {"noise": "5e-4 m/s^2/sqrt(Hz)", "bias": {"kind": "random_walk", "walk":
 
 
 def turned(seed, temperatures=TEMPERATURES, terms=TERMS, **how):
-    """Return what fit-map makes of a turntable's recording."""
+    """Return the map that fit-map makes of a turntable's recording."""
     t, y, T, table = turntable(seed, temperatures, **how)
     data = {"time": (t, "s"), "gyro": (y, "rad/s"), "temperature": (T, "degC")}
     with tempfile.TemporaryDirectory() as folder:
@@ -39,7 +39,7 @@ def turned(seed, temperatures=TEMPERATURES, terms=TERMS, **how):
 
 
 def tumbled(seed):
-    """Return what fit-map makes of a tumble in a chamber."""
+    """Return the map that fit-map makes of a tumble in a chamber."""
     t, y, T = tumble(seed, TEMPERATURES)
     accel = {**ACCEL, "calibration": {"kind": "polynomial"}}
     config = {
@@ -64,7 +64,7 @@ def sigma():
         z = np.abs(np.array(z))
         print(
             f"{name}: {SEEDS} seeds, {z.shape[2]} terms at {len(AT)} temperatures: within one sigma "
-            f"{np.mean(z < 1):.1%}, within 1.96 sigma {np.mean(z < 1.96):.1%}; largest sigma of M {largest * 1e6:.0f} ppm"
+            f"{np.mean(z < 1):.1%}, within 1.96 {np.mean(z < 1.96):.1%}; largest sigma of M {largest * 1e6:.0f} ppm"
         )
 
 

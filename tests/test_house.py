@@ -257,7 +257,7 @@ BUDGET = {
     "driftlab/spc": 814,
     "driftlab/starter": 796,
     "driftlab/storage": 1239,
-    "driftlab/triad": 722,
+    "driftlab/triad": 726,
     "fusion_core": 1838,
     "fusion_core/contracts": 1688,
     "fusion_core/fast": 737,

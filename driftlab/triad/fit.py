@@ -292,7 +292,8 @@ class _Search:
     def converge(self, *, noise: bool = True) -> bool:
         """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
 
-        Without `noise` that stays as it is. Where there is no optimum, the terms are those of usual units, whose equations show which of them are not told.
+        Without `noise` that stays as it is. Where there is no optimum the terms are those of usual units, whose
+        equations show which of them are not told.
         """
         fall, size = np.inf, 1 / TINY
         for k in range(STEPS):
