@@ -276,7 +276,7 @@ def _each(value: Any) -> Any:
     return (value,) if isinstance(value, str | Path) else value
 
 
-Files = Annotated[tuple[ConfigPath, ...], BeforeValidator(_each)]
+Files = Annotated[tuple[ConfigPath, ...], BeforeValidator(_each, json_schema_input_type=str | list[str])]
 
 
 class KnownRate(Settings):
@@ -287,7 +287,7 @@ class KnownRate(Settings):
     """Table of segments (start, stop, axis, rate), CSV; one for each recording."""
     channel: str | None = None
     """Channel of the table's rate, about `axes`."""
-    axes: Annotated[tuple[str, ...], BeforeValidator(_each)] = ()
+    axes: Annotated[tuple[str, ...], BeforeValidator(_each, json_schema_input_type=str | list[str])] = ()
     """Axis of the unit that the table turns about: x, -x, ..., or three numbers; one for all or for each recording."""
     settle: Annotated[float, Unit("s", least=0, example="2 s")] = Quantity(2.0, "2 s")
     """Time at the start of a segment that is left out."""
