@@ -171,7 +171,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3530
+    assert 0 < count <= 3596
 
 
 def imports():
@@ -239,30 +239,31 @@ def test_tests_mirror_the_tree():
 
 
 BUDGET = {
-    "driftlab": 622,
-    "driftlab/commands": 3011,
+    "driftlab": 648,
+    "driftlab/commands": 3158,
     "driftlab/evaluation": 1380,
     "driftlab/family": 2821,
-    "driftlab/filtering": 1195,
+    "driftlab/filtering": 1204,
     "driftlab/identification": 2151,
     "driftlab/live": 848,
-    "driftlab/maps": 1762,
+    "driftlab/maps": 1764,
     "driftlab/noise": 1188,
     "driftlab/planning": 1163,
     "driftlab/production": 2320,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
-    "driftlab/reports": 2926,
+    "driftlab/reports": 2993,
     "driftlab/soak": 658,
     "driftlab/spc": 814,
     "driftlab/starter": 796,
     "driftlab/storage": 1239,
+    "driftlab/triad": 726,
     "fusion_core": 1838,
     "fusion_core/contracts": 1688,
     "fusion_core/fast": 737,
     "fusion_core/host": 691,
     "fusion_core/testing": 935,
-    "fusion_core/thermal": 973,
+    "fusion_core/thermal": 1039,
     "fusion_core/units": 431,
     "plugins": 302,
     "plugins/bias_models": 254,

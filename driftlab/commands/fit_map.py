@@ -16,6 +16,7 @@ from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.family_map import FamilyMapResult, fit_family_map, show_family_map
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_of, recordings_of
 from driftlab.commands.result import Result
+from driftlab.commands.triad_map import TriadMapResult, fit_triad_map, show_triad_map
 from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
@@ -163,8 +164,10 @@ def fit_map(
     family: Place | None = None,
     lot: str | None = None,
     certificate: bool = False,
+    terms: str | None = None,
+    stimulus: str | None = None,
     progress: Progress | None = None,
-) -> FitMapResult | FamilyMapResult:
+) -> FitMapResult | FamilyMapResult | TriadMapResult:
     """Fit a thermal map on a soak at rest, and say how good it is.
 
     Writes the map's file, and a page beside it.
@@ -199,6 +202,11 @@ def fit_map(
     certificate : bool
         Write a certificate too: one sheet with results, uncertainty and limits.
         Beside the map or in `report`, as certificate.html and certificate.json; it needs `out`.
+    terms : str, optional
+        Terms to fit by a stimulus: bias,scale,misalignment.
+        Without bias, that stays as the config's map has it.
+    stimulus : str, optional
+        Stimulus of --terms: rate_table, positions or tumble; default: the config's.
     progress : callable, optional
         Called with the recording's time in s and the number of samples so far, then with texts.
 
@@ -208,6 +216,8 @@ def fit_map(
         `temperature` (N,), `bias`, `slope`, `sigma` (N, d) over the map's domain; `map` is the map itself.
     FamilyMapResult
         With `family`: `temperature` (N,), `bias`, `sigma`, `own_bias`, `own_sigma` (N, d) over the family's domain.
+    TriadMapResult
+        With `terms`: `temperature` (N,), `terms`, `sigma` (N, 12); `map.corrected(reading, T)` gives the input.
 
     Raises
     ------
@@ -222,6 +232,9 @@ def fit_map(
     recordings = [] if data is None else recordings_of(data, units, "data")
     place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
     _check_family(known, lot, bool(kind or neurons or compare or report or certificate))
+    others = bool(neurons or compare or report or certificate or known)
+    if _asks_for_triad(terms, stimulus, others):
+        return fit_triad_map(understood, recordings, str(terms), stimulus, kind, place)
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
     if certificate and place is None:
@@ -328,6 +341,15 @@ def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
         )
 
 
+def _asks_for_triad(terms: str | None, stimulus: str | None, others: bool) -> bool:
+    """Return True where a triad's terms are asked for; raises ConfigError where an option does not go with them."""
+    if terms is None and stimulus is not None:
+        raise ConfigError("--stimulus: is that of --terms; say which to fit, e.g. --terms bias,scale,misalignment")
+    if terms is not None and others:
+        raise ConfigError("--terms: gives one map, and no page; leave --select, --compare, --report, --family out")
+    return terms is not None
+
+
 def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """Say which sizes are tried, and where the map is written: where the config says, or beside the config."""
     config, kind, compare = arguments["config"], arguments.get("kind"), arguments["compare"]
@@ -353,10 +375,13 @@ def _names_a_path(config: Config) -> bool:
     return any(settings.path for settings in config.tracked_maps())
 
 
-def show(result: FitMapResult | FamilyMapResult, given: Mapping[str, Any]) -> None:
+def show(result: FitMapResult | FamilyMapResult | TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the choice of size or kind, the map, and where it was written."""
     if isinstance(result, FamilyMapResult):
         show_family_map(result)
+        return
+    if isinstance(result, TriadMapResult):
+        show_triad_map(result, given)
         return
     unit, axes = result.unit, result.verdict.axes
     if (selection := result.selection) is not None:

@@ -39,7 +39,8 @@ METAVARS = {
     "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
-    "sigma": "SIGMA", "start": "TEMPERATURE", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
+    "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",
+    "terms": "TERM,...", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
     "web": "[PORT]", "without": "KIND",
 }  # fmt: skip
 PAIRS = {

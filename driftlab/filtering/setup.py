@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fusion_core.chunk import Chunk
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import (
     Alignment,
     BiasModel,
@@ -86,7 +86,7 @@ class RunSetup:
 
     def aligned(self, window: Chunk) -> Alignment:
         """Freeze the reference from a stretch at rest, as the filter sees it: calibrations subtracted."""
-        return self.model.aligned(corrected(window, self.calibrations), self.site)
+        return self.model.aligned(corrected(window, self.calibrations, self.followed), self.site)
 
 
 def calibrations_of(model: MeasurementModel) -> dict[str, FittedMap]:
@@ -128,12 +128,28 @@ def check_map(fitted: FittedMap, sensor: Sensor) -> None:
         )
 
 
-def corrected(chunk: Chunk, calibrations: Mapping[str, FittedMap]) -> Chunk:
-    """Return the chunk less the maps of its channels."""
-    if not calibrations:
-        return chunk
-    T, t = chunk["temperature"], chunk.t
-    return chunk.having(**{name: chunk[name] - fitted.bias(T, t) for name, fitted in calibrations.items()})
+def subtracted(
+    chunk: Chunk, calibrations: Mapping[str, FittedMap], followed: Mapping[str, FittedMap] | None = None
+) -> dict[str, Array]:
+    """Return the part (N, d) of each channel that is taken off before the filter.
+
+    Of a calibration all that its map says, of a map that a bias model follows scale and misalignment alone.
+    """
+    parts: dict[str, Array] = {}
+    for name, fitted in calibrations.items():
+        parts[name] = fitted.bias(chunk["temperature"], chunk.t)
+    for name, fitted in {**calibrations, **(followed or {})}.items():
+        if fitted.record.matrix is not None:
+            parts[name] = parts.get(name, 0.0) + fitted.distortion(chunk[name], chunk["temperature"], chunk.t)
+    return parts
+
+
+def corrected(
+    chunk: Chunk, calibrations: Mapping[str, FittedMap], followed: Mapping[str, FittedMap] | None = None
+) -> Chunk:
+    """Return the chunk less what `subtracted` says."""
+    parts = subtracted(chunk, calibrations, followed)
+    return chunk.having(**{name: chunk[name] - part for name, part in parts.items()}) if parts else chunk
 
 
 def followed_map(model: BiasModel) -> FittedMap | None:

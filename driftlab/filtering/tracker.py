@@ -15,7 +15,7 @@ import numpy as np
 
 from driftlab.filtering.coasting import Prediction
 from driftlab.filtering.segment import RunLog, RunSegment, runs
-from driftlab.filtering.setup import RunSetup, bias_steps, prior_again
+from driftlab.filtering.setup import RunSetup, bias_steps, prior_again, subtracted
 from driftlab.units import axis_name
 from fusion_core.checks import NotFinite, TooWide, all_finite
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -136,8 +136,7 @@ class Tracker:
                     self.state = self.prediction.depart(self.state, epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
-                maps = self.plan.calibrations.items()
-                less = {channel: fitted.bias(epochs["temperature"], epochs.t) for channel, fitted in maps}
+                less = subtracted(epochs, self.plan.calibrations, self.plan.followed)
                 parts = {channel: epochs[channel] - part for channel, part in less.items()}
                 corrected = epochs.having(**parts) if parts else epochs
                 channel = self.model.tracked.channel

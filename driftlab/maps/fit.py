@@ -140,6 +140,8 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     unit = BiasUnit(record.unit, sensor.shown if sensor and sensor.unit == record.unit else record.unit).said
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} °C"]
+    if record.matrix is not None:
+        lines.append(f"map {record.kind}: with scale factor and misalignment, {sum(record.matrix.told)} terms of M(T)")
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"

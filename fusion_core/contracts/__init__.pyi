@@ -71,3 +71,4 @@ from fusion_core.thermal.map_file import read_map as read_map
 from fusion_core.thermal.map_file import write_bytes as write_bytes
 from fusion_core.thermal.map_file import write_map as write_map
 from fusion_core.thermal.penalised import Basis as Basis
+from fusion_core.thermal.triad_matrix import TriadMatrix as TriadMatrix

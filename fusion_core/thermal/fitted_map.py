@@ -18,6 +18,7 @@ from fusion_core.settings import Frozen
 from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 from fusion_core.thermal.thermometer import Steps
+from fusion_core.thermal.triad_matrix import TriadMatrix
 
 Outside = Literal["refuse", "clamp", "tangent"]
 
@@ -61,6 +62,8 @@ class MapRecord(Frozen):
     """Noise of the input before it was rounded to them [K]."""
     error: CurveError | None = None
     """Of the curve; None where the kind does not tell."""
+    matrix: TriadMatrix | None = None
+    """Scale factor and misalignment of a triad over temperature; None where only the bias was fitted."""
     provenance: Annotated[Mapping[Plain, Plain], Field(max_length=100)] = {}
     """Recording, date, version, settings."""
 
@@ -76,6 +79,12 @@ class MapRecord(Frozen):
         for name, values in each.items():
             if values is not None and len(values) != self.d:
                 raise ValueError(f"{name} is of {len(values)} axes, the map of {self.d}; give one value an axis")
+        return self
+
+    @model_validator(mode="after")
+    def _matrix_is_of_a_triad(self) -> Self:
+        if self.matrix is not None and self.d != 3:
+            raise ValueError(f"has scale and misalignment of a triad, and {self.d} axes; a triad has three")
         return self
 
     @model_validator(mode="after")
@@ -139,6 +148,19 @@ class FittedMap(ABC):
         if self.outside == "tangent" and inside is not T:
             bias = bias + (T - inside)[:, None] * self._slope(inside)
         return bias
+
+    def distortion(self, reading: Array, T: Array, t: Array | None = None) -> Array:
+        """Return the part M u (N, d) that scale and misalignment have in readings y = (I + M) u + b (N, d) at T (N,).
+
+        Zero for a map of the bias alone. Beyond the domain M is that of its end. Raises as `bias`.
+        """
+        if self.record.matrix is None:
+            return np.zeros_like(reading)
+        return self.record.matrix.distortion(reading - self.bias(T, t), np.clip(self._temperatures(T), *self.domain))
+
+    def corrected(self, reading: Array, T: Array, t: Array | None = None) -> Array:
+        """Return the input u = (I + M(T))^-1 (y - b(T)) (N, d) that readings y (N, d) at T (N,) show; as `bias`."""
+        return np.asarray(reading - self.bias(T, t) - self.distortion(reading, T, t))
 
     def slope(self, T: Array, t: Array | None = None) -> Array:
         """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""

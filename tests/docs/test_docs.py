@@ -19,6 +19,7 @@ import jsonschema
 import numpy as np
 import planted
 import pytest
+import turned_units
 from command_line import driftlab
 from other_formats import write_formats
 from typer.testing import CliRunner
@@ -135,6 +136,11 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
             (tmp_path / path.name).symlink_to(path.resolve())
     if page.stem == "calibrate_a_production_line":
         planted.make(tmp_path, count=14, hours=0.25, fresh=2, later=3)
+    if page.stem == "calibrate_scale_and_misalignment":
+        t, y, T, table = turned_units.turntable(0, [-20.0, 20.0, 60.0], hold=8.0)
+        rows = np.column_stack([t, np.rad2deg(y), T])
+        np.savetxt(tmp_path / "turned.csv", rows, delimiter=",", header="t,gx,gy,gz,T", comments="", fmt="%.9g")
+        (tmp_path / "table.csv").write_text(table)
     with ExitStack() as running:
         follow(page, tmp_path, running)
 
@@ -162,7 +168,7 @@ def follow(page, tmp_path, running):
                     run_in(tmp_path, *command)
 
 
-TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits", "certificate"}
+TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "stimulus", "limits", "certificate"}
 
 
 @pytest.fixture(scope="module")

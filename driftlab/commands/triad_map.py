@@ -1,0 +1,174 @@
+"""The map of a triad with scale factor and misalignment, by a stimulus: `driftlab fit-map --terms`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from driftlab.commands.console import say, say_lines, terminal
+from driftlab.commands.result import Result
+from driftlab.config import Config, KnownRate, Placed, paths_of
+from driftlab.filtering.setup import check_map
+from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
+from driftlab.reports import triad as words
+from driftlab.reports.charts import Chart
+from driftlab.storage.json import plain
+from driftlab.storage.map_file import check_place, save
+from driftlab.triad.fit import TriadFit, fit_triad
+from driftlab.triad.model import BIAS, SCALE, TERMS
+from driftlab.triad.samples import Gathered, stimulus_of
+from driftlab.units import tracked_unit
+from fusion_core.contracts import FittedMap, MapRecord, ThermalMap
+from fusion_core.errors import ConfigError, MapError, quote
+from fusion_core.faults import Faults
+from fusion_core.settings import Settings
+from fusion_core.thermal.record_texts import recorded
+
+GROUPS = {"bias": BIAS, "scale": SCALE, "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
+STIMULI: dict[str, type[Settings]] = {"rate_table": KnownRate, "positions": Placed, "tumble": Placed}
+USUAL_BIAS = {"rad/s": np.deg2rad(1.0), "m/s^2": 0.5}  # of a unit of which nothing is known
+POINTS = 400  # temperatures of the curve
+
+
+class TriadMapResult(Result):
+    """The terms of a triad over `temperature` (N,): `terms` and `sigma` (N, 12), the bias, then M row by row.
+
+    Attributes
+    ----------
+    map : FittedMap
+        `map.corrected(reading, T)` gives the input (N, 3), `map.bias(T)` the bias.
+    fit : TriadFit
+        Terms with their joint covariance, `fit.verdict()` what the stimulus does not tell.
+    written : tuple of Path
+    """
+
+    def __init__(self, config: Config, gathered: Gathered, fit: TriadFit, fitted: FittedMap, faults: Faults) -> None:
+        self.config, self.fit, self.map, self.faults = config, fit, fitted, faults
+        self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
+        self.written: tuple[Path, ...] = ()
+        self.name = f"map of the {gathered.sensor.channel}, with scale factor and misalignment"
+        T = np.linspace(*fitted.domain, POINTS)
+        inside = np.clip(T, fit.grid[0], fit.grid[-1])
+        self._columns = {"temperature": T, "terms": fit.terms.at(inside), "sigma": fit.sigma(inside)}
+        each = tuple(self.unit.si if j in BIAS else "1" for j in range(len(TERMS)))
+        self.units = {"temperature": "degC", "terms": each, "sigma": each}
+        self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in TERMS))
+        self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix"}) | {
+            "triad": plain(words.as_json(fit, self.unit)), "serial": config.serial
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """Return the frame, what the stimulus does not tell, and the notes on the recordings."""
+        return [words.frame_line(self.fit), *self.fit.verdict(), *self.faults.lines()]
+
+    def _chart(self) -> Chart:
+        return words.chart(self.fit, self.unit)
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Write the map to the file `out`; raises ConfigError, Unwritable or MapError."""
+        path = Path(out)
+        check_place(path, [], "fit-map")
+        save(self.map, path, "fit-map")
+        self.written = (path,)
+
+
+def fit_triad_map(
+    config: Config, recordings: Sequence[str], terms: str, stimulus: str | None, kind: str | None, out: Path | None
+) -> TriadMapResult:
+    """Return the map of a triad that a stimulus gives; with `out`, write it there.
+
+    Parameters
+    ----------
+    terms : str
+        Of `bias`, `scale`, `misalignment`, with commas. Without bias, the bias stays that of the config's map.
+    stimulus : str, optional
+        Kind of the stimulus, instead of the config's.
+    kind : str, optional
+        Kind of the curves, instead of the config's; else spline.
+
+    Raises
+    ------
+    ConfigError, DataError, MapError
+        If a recording does not hold the stimulus, or the config's map is of another sensor.
+    """
+    names = [name.strip() for name in terms.split(",")]
+    if unknown := [name for name in names if name not in GROUPS]:
+        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(GROUPS)}; name those")
+    own, faults = _with_stimulus(config, stimulus), Faults()
+    settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
+    if out is not None:
+        read = own.files_to_fit() if "bias" in names else own.files()
+        check_place(out, [*read, *paths_of(recordings)], "fit-map")
+    known = None if "bias" in names else _known_bias(own, settings)
+    gathered = stimulus_of(own, recordings, faults)
+    wanted = np.zeros(len(TERMS), dtype=bool)
+    for name in ("bias", *names):
+        wanted[list(GROUPS[name])] = True
+    fit = fit_triad(gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted)
+    fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
+    result = TriadMapResult(own, gathered, fit, fitted, faults)
+    if out is not None:
+        result.save(out)
+    return result
+
+
+def _with_stimulus(config: Config, kind: str | None) -> Config:
+    if kind is None or (config.stimulus is not None and config.stimulus.kind == kind):
+        return config
+    if kind not in STIMULI:
+        raise ConfigError(f"--stimulus {quote(kind)}: is none of {', '.join(STIMULI)}; name one of them")
+    return config.model_copy(update={"stimulus": STIMULI[kind].model_validate({"kind": kind})})
+
+
+def _known_bias(config: Config, settings: ThermalMap) -> FittedMap:
+    """Return the map of the bias that the config names; raises ConfigError or MapError."""
+    if not settings.has_map or config.filter is None:
+        raise ConfigError(
+            "--terms: without bias it is taken from the config's map, and the config names none; add bias, or a map"
+        )
+    known = settings.load()
+    check_map(known, config.filter.tracked)
+    return known
+
+
+def _map_of(
+    config: Config,
+    gathered: Gathered,
+    fit: TriadFit,
+    settings: ThermalMap,
+    known: FittedMap | None,
+    about: Mapping[str, str],
+) -> FittedMap:
+    """Return the map: the bias of the fit, or one that is known, and the matrix."""
+    try:
+        matrix = fit.matrix()
+    except ValidationError as error:
+        raise MapError(
+            f"the fit gives no map: {error.errors()[0]['msg']}; check the units of the config against the stimulus"
+        ) from None
+    if known is not None:
+        return known.noting(matrix=matrix)
+    T = np.linspace(fit.grid[0], fit.grid[-1], POINTS)
+    record = MapRecord(
+        kind=settings.kind, domain=(float(T[0]), float(T[-1])), channel=gathered.sensor.channel,
+        unit=gathered.sensor.unit, residual=(fit.noise[0],) * 3, samples=gathered.rows,
+        error=fit.curve_error(slice(0, 3)), provenance=recorded(about), matrix=matrix,
+    )  # fmt: skip
+    fitted = settings.from_curve(T, fit.terms.at(T)[:, :3], record)
+    return of_sensor(config, replace(fitted, record=fitted.record))
+
+
+def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
+    """Print the terms, what the stimulus does not tell, and where the map was written."""
+    terminal().print(words.table(result.fit, result.unit))
+    say_lines([words.frame_line(result.fit), *result.fit.verdict()])
+    say_lines(result.faults.lines(), "note: ")
+    say(f"written to {', '.join(map(str, result.written))}\n")
+    line = f"{{kind: {result.map.record.kind}, path: {result.written[0]}}}"
+    say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")

@@ -1,0 +1,1 @@
+"""Scale factor and misalignment of a triad over temperature, from stimuli: turntable, placements, tumbles."""

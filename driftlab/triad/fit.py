@@ -1,0 +1,420 @@
+"""Joint fit of bias, scale factor and misalignment over temperature to the equations of a stimulus.
+
+Gauss-Newton steps on penalised least squares, with the noise that the residuals show::
+
+    x = argmin  (z - A x)' V^-1 (z - A x)  +  x' P x,      A = J B(T)
+    V = diag(s_g^2) + q sum_i J_i J_i' min(t, t')
+
+s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes.
+
+The curve of each term is chosen forward, by the largest fall of::
+
+    m log(residual) + p (log m + 2 log 12)
+
+with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
+Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
+noise and walk are means over their restricted likelihood, all densities of the walk alike before: one that hardly shows
+may be there. A term that the equations do not tell is zero, and its usual size counts in the error of the others.
+m equations, n coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.triad.model import BIAS, GRID, NARROW, SCALE, TERMS, TermCurve, TriadTerms, curves_of, polynomial
+from driftlab.triad.stimuli import Stimulus
+from fusion_core.chunk import Array
+from fusion_core.contracts import CurveError, ThermalMap, TriadMatrix
+from fusion_core.errors import SingularFit
+
+STEPS = 30
+WIDE = 20.0  # times the usual size: the prior with which a fit begins
+UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
+POOR = 0.1  # of it: one that is known better is well known
+PASSES = 4
+SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
+LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
+WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
+AHEAD = 2  # curves that are looked at beyond that of a term
+TINY = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class TriadFit:
+    """Terms of a triad that were fitted, with their joint covariance.
+
+    Attributes
+    ----------
+    stimulus : Stimulus
+    terms : TriadTerms
+    domain : pair of float
+        Temperatures of the stimulus.
+    usual : (12,) array
+        Sizes of the terms of a usual unit, beside which a deviation is large or small.
+    free : (12,) array of bool
+        Terms that were looked for.
+    told : (12,) array of bool
+        Terms that the stimulus tells; the others are zero.
+    untold_changes : (12,) array of bool
+        Told terms whose change over temperature it does not tell.
+    design, root : TriadTerms' curves and (n, n) array
+        Curves of the error, and the root of the covariance of their coefficients.
+    noise : tuple of float
+        Deviation of an equation in each group.
+    """
+
+    stimulus: Stimulus
+    terms: TriadTerms
+    domain: tuple[float, float]
+    usual: Array
+    free: NDArray[np.bool_]
+    told: NDArray[np.bool_]
+    untold_changes: NDArray[np.bool_]
+    design: Sequence[TermCurve]
+    root: Array
+    noise: tuple[float, ...]
+
+    @cached_property
+    def grid(self) -> Array:
+        """Temperatures at which the error is kept."""
+        low, high = self.domain
+        middle, half = (low + high) / 2, max(high - low, NARROW) / 2
+        return np.linspace(middle - half, middle + half, GRID if high - low >= NARROW else 2)
+
+    def modes(self, T: Array) -> Array:
+        """Return the modes (n, N, 12) of the joint error of all terms at T (N,)."""
+        parts, at = [], 0
+        for curve in self.design:
+            parts.append(curve.values(T) @ self.root[at : at + curve.q])
+            at += curve.q
+        return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
+
+    def sigma(self, T: Array) -> Array:
+        """Return the deviation (N, 12) of the terms at T (N,)."""
+        return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    def change(self) -> tuple[Array, Array]:
+        """Return the change of each term (12,) from the lowest to the highest temperature, and its deviation."""
+        ends = self.grid[[0, -1]]
+        values, modes = self.terms.at(ends), self.modes(ends)
+        return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
+
+    @cached_property
+    def _joint_modes(self) -> Array:
+        """Modes (r, G, 12) on the grid, those alone that matter beside the deviation of some term."""
+        modes = self.modes(self.grid)
+        size = np.sqrt(np.sum(modes**2, axis=0)) + TINY
+        _, s, V = np.linalg.svd((modes / size).reshape(len(modes), -1), full_matrices=False)
+        kept = s > LEFT * s[0]
+        return np.asarray((s[kept, None] * V[kept]).reshape(-1, *size.shape) * size)
+
+    def curve_error(self, part: slice) -> CurveError:
+        """Return the error of some terms as a map's record holds it; its modes are those of all terms, one by one."""
+        T = self.grid
+        curve = self.terms.at(T)[:, part]
+        bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
+        modes = [[[float(f"{v:.6g}") for v in row] for row in mode] for mode in self._joint_modes[:, :, part].tolist()]
+        return CurveError(
+            T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes), bend=tuple(bend.tolist())
+        )
+
+    def matrix(self) -> TriadMatrix:
+        """Return M over temperature as a map's record holds it."""
+        (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
+        bent = any(curve.q > 4 for curve in self.terms.curves)
+        T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
+        inside = np.clip(T, low + h, high - h)
+        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, 3:] / (2 * h)
+        if not bent:  # exact for a cubic through four points
+            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, 3:])
+            slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
+        frame = "sensor" if self.stimulus.sensor_frame else "given"
+        return TriadMatrix(
+            T=tuple(T.tolist()), values=tuple(map(tuple, self.terms.at(T)[:, 3:].tolist())),
+            slopes=tuple(map(tuple, slopes.tolist())), frame=frame, told=tuple(self.told[3:].tolist()),
+            kinds=tuple(curve.name for curve in self.terms.curves[3:]), error=self.curve_error(slice(3, None)),
+        )  # fmt: skip
+
+    def _scaled(self, T: Array) -> Array:
+        low, high = self.grid[[0, -1]]
+        return np.asarray((2 * T - low - high) / (high - low))
+
+    def verdict(self) -> list[str]:
+        """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
+        lines = []
+        middle = self.sigma(np.array([np.mean(self.domain)]))[0]
+        for j, name in enumerate(TERMS):
+            if not self.free[j]:
+                continue
+            if not self.told[j]:
+                lines.append(f"{name}: not told, and taken as zero, since {self.stimulus.lacking(j)}")
+            elif middle[j] > POOR * self.usual[j]:
+                lines.append(f"{name}: poorly told, {middle[j] / self.usual[j]:.0%} of a usual size, since "
+                             f"{self.stimulus.lacking(j)}")  # fmt: skip
+        low, high = self.domain
+        untold = [TERMS[j] for j in np.flatnonzero(self.untold_changes)]
+        if high - low < NARROW:
+            lines.append(
+                f"no change over temperature is told: all of it lies at {np.mean(self.domain):.1f} °C; repeat it at "
+                "other temperatures, 20 K apart or more"
+            )
+        elif untold:
+            lines.append(
+                f"change from {low:.1f} to {high:.1f} °C: not told for {', '.join(untold)}, whose part of the stimulus "
+                "lies at too few temperatures; repeat that part near both ends"
+            )
+        return lines
+
+
+def fit_triad(
+    stimulus: Stimulus, settings: ThermalMap, bias_size: float, wanted: NDArray[np.bool_] | None = None
+) -> TriadFit:
+    """Fit the terms of a triad to a stimulus.
+
+    Parameters
+    ----------
+    stimulus : Stimulus
+    settings : ThermalMap
+        Kind of the curves that are tried beside constants and polynomials.
+    bias_size : float
+        Bias of a usual unit, in its unit; its other terms are 1 % and 10 mrad.
+    wanted : (12,) array of bool, optional
+        Terms that may differ from zero, beside the bias; by default all that the stimulus leaves free.
+
+    Raises
+    ------
+    SingularFit
+        If the stimulus has fewer equations than terms, or the fit does not converge.
+    ConfigError
+        If the kind is a network.
+    """
+    T = stimulus.T
+    domain = float(T.min()), float(T.max())
+    usual = np.array([bias_size] * 3 + [0.01] * 9)
+    free = stimulus.free if wanted is None else stimulus.free & wanted
+    search = _Search(stimulus, curves_of(settings, domain), usual, free)
+    search.check()
+    if not search.converge():
+        search.drop_untold()
+    for _ in range(PASSES):  # noise and walk, curves, and what is not told, each by the others
+        before = [*search.chosen, *search.told]
+        search.choose()
+        search.converge()
+        search.measure_walk()
+        search.converge(noise=False)
+        search.drop_untold()
+        if before == [*search.chosen, *search.told]:
+            break
+    if not search.converge(noise=False):
+        raise SingularFit(
+            f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, and "
+            "that the stimulus moves all axes"
+        )
+    return search.result(domain)
+
+
+class _Search:
+    """The state of a fit: the curve of each term, its coefficients, and the noise of each group."""
+
+    def __init__(self, stimulus: Stimulus, curves: list[TermCurve], usual: Array, free: NDArray[np.bool_]) -> None:
+        self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
+        self.told = free.copy()
+        self.chosen = [0] * len(TERMS)
+        self.x: list[Array] = [np.zeros(1) for _ in TERMS]
+        self.s, self.walk = np.ones(2), 0.0
+        self.linearise()
+
+    def check(self) -> None:
+        """Raise SingularFit where there are fewer equations than terms."""
+        equations, count = len(self.e.left), int(np.sum(self.told))
+        if equations <= count:
+            raise SingularFit(
+                f"the stimulus has {equations} equations for {count} terms; add placements or segments, more than "
+                "there are terms"
+            )
+
+    @property
+    def terms(self) -> TriadTerms:
+        return TriadTerms(self._curves(self.chosen), self.x)
+
+    def linearise(self) -> None:
+        """Take the equations about these terms, whiten them, and forget the columns of those before."""
+        self.e = e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        sigma = self.s[e.group]
+        self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
+        self._J = e.J / sigma[:, None]
+        self._columns: dict[tuple[int, int], Array] = {}
+        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk)) if self.walk else None
+        if self._root is not None:
+            self.z = np.linalg.solve(self._root, self.z)
+
+    def _covariance_of_noise(self, walk: float) -> Array:
+        """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
+        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
+        walked = (J @ J.T) * np.minimum.outer(t, t)
+        return np.asarray(np.eye(len(J)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
+
+    def column(self, j: int, curve: TermCurve) -> Array:
+        """Return the whitened columns (m, q) of a term's curve."""
+        key = j, id(curve)
+        if key not in self._columns:
+            own = self._J[:, j, None] * curve.values(self.e.T)
+            self._columns[key] = own if self._root is None else np.linalg.solve(self._root, own)
+        return self._columns[key]
+
+    def _system(self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE) -> tuple[Array, Array]:
+        """Return N (n, n), with priors and penalties in it, and the whitened design A (m, n) of curves.
+
+        Of terms that are not among `some` (12,) the columns are zero; the prior is `wide` times the usual size.
+        """
+        columns, prior = [], []
+        for j, curve in enumerate(curves):
+            columns.append(self.column(j, curve) * some[j])
+            prior.append(np.eye(curve.q) / (wide * self.usual[j]) ** 2)
+            if np.any(curve.penalty):
+                prior[-1] += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
+        A = np.hstack(columns)
+        N, at = A.T @ A, 0
+        for own in prior:
+            N[at : at + len(own), at : at + len(own)] += own
+            at += len(own)
+        return np.asarray(N), A
+
+    def _curves(self, chosen: Sequence[int]) -> list[TermCurve]:
+        return [self.curves[k] for k in chosen]
+
+    def converge(self, *, noise: bool = True) -> bool:
+        """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
+
+        Without `noise` that stays as it is. Where there is no optimum the terms are those of usual units, whose
+        equations show which of them are not told.
+        """
+        fall, size = np.inf, 1 / TINY
+        for k in range(STEPS):
+            self.linearise()
+            N, A = self._system(self._curves(self.chosen), self.told)
+            inverse = np.linalg.inv(N)
+            solution = np.asarray(inverse @ (A.T @ self.z))
+            self._take(solution)
+            left, leverage = self.z - A @ solution, np.einsum("mn,mn->m", A @ inverse, A)
+            change = np.ones(2)
+            for g in np.unique(self.e.group) if noise else ():
+                own = self.e.group == g
+                change[g] = np.sqrt(np.sum(left[own] ** 2) / max(np.sum(own) - np.sum(leverage[own]), 1.0) + TINY)
+            self.s, size, before = self.s * change, float(left @ left), size
+            of_size = np.log((size + TINY) / (before + TINY)) if not noise else 0.0
+            last, fall = fall, float(np.max(np.abs([*np.log(change), of_size])))
+            if k > 1 and fall < 1e-6 and last < 1e-3:
+                break
+        if settled := fall < 1e-2:
+            self.linearise()
+        else:
+            self.x = [np.zeros(self.curves[k].q) for k in self.chosen]
+            self.s = np.full(2, SURE * self.usual[0])
+            self.linearise()
+        return settled
+
+    def measure_walk(self) -> None:
+        """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        prices, squares, z, J = [], [], self.e.left, self._J
+        z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
+        curves = self._curves(self.chosen)
+        X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.told[j]])
+        for walk in WALKS:
+            root = np.linalg.cholesky(self._covariance_of_noise(walk))
+            A, y = np.linalg.solve(root, X), np.linalg.solve(root, z)
+            N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
+            left = y - A @ np.linalg.solve(N, A.T @ y)
+            spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
+            squares.append(float(left @ left) / max(len(z) - A.shape[1], 1) + TINY)
+            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(squares[-1])))
+        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS)
+        white = float(likely @ squares / np.sum(likely))
+        self.walk = float(likely @ (np.array(squares) * WALKS) / np.sum(likely)) / white
+        self.s = self.s * np.sqrt(white)
+
+    def _take(self, solution: Array) -> None:
+        sizes = [curve.q for curve in self._curves(self.chosen)]
+        self.x = np.split(solution, np.cumsum(sizes)[:-1])
+
+    def _covariance(self) -> Array:
+        """Return the covariance (12, 12) of the terms in the middle, by the columns that are free."""
+        curves, T = self._curves(self.chosen), np.array([(self.e.T.min() + self.e.T.max()) / 2])
+        N, _ = self._system(curves, self.told)
+        B = np.zeros((len(TERMS), len(N)))
+        at = 0
+        for j, curve in enumerate(curves):
+            B[j, at : at + curve.q] = curve.values(T)[0]
+            at += curve.q
+        return np.asarray(B @ np.linalg.inv(N) @ B.T)
+
+    def drop_untold(self) -> None:
+        """Set terms that are not told to zero, the least known first, and of those that are alike the bias last."""
+        while True:
+            sigma = np.sqrt(np.diag(self._covariance())) / self.usual * self.told
+            sigma[list(BIAS)] *= 0.9
+            worst = int(np.argmax(sigma))
+            if sigma[worst] <= UNTOLD:
+                return
+            self.told[worst] = False
+            self.chosen[worst], self.x[worst] = 0, np.zeros(1)
+
+    def choose(self) -> None:
+        """Give each term the curve that pays for its coefficients."""
+        self.chosen = [0] * len(TERMS)
+        best = self._price(self.chosen)
+        while True:
+            trials = []
+            for j in np.flatnonzero(self.told):
+                for k in range(self.chosen[j] + 1, min(self.chosen[j] + 1 + AHEAD, len(self.curves))):
+                    tried = [*self.chosen[:j], k, *self.chosen[j + 1 :]]
+                    trials.append((self._price(tried), tried))
+            if not trials or (least := min(trials))[0] >= best:
+                break
+            best, self.chosen = least
+        N, A = self._system(self._curves(self.chosen), self.told)
+        self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
+
+    def _price(self, chosen: list[int]) -> float:
+        curves, m, p = self._curves(chosen), len(self.z), 0.0
+        N, A = self._system(curves, self.told)
+        left, shares = self.z - A @ np.linalg.solve(N, A.T @ self.z), np.diag(np.linalg.solve(N, A.T @ A))
+        for curve, own in zip(curves, np.split(shares, np.cumsum([curve.q for curve in curves])[:-1]), strict=True):
+            p += float(np.sum(own)) + 1 if np.any(curve.penalty) else curve.q
+        if p >= m - 1:
+            return np.inf
+        return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS))))
+
+    def result(self, domain: tuple[float, float]) -> TriadFit:
+        """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
+        wide = domain[1] - domain[0] >= NARROW
+        straight = [wide and curve.q == 1 for curve in self._curves(self.chosen)]
+        design = [
+            polynomial(1, domain) if line else c for line, c in zip(straight, self._curves(self.chosen), strict=True)
+        ]
+        N, _ = self._system(design, self.free, wide=1.0)
+        starts = np.cumsum([0, *(curve.q for curve in design)])
+        sigma = np.sqrt(np.diag(np.linalg.inv(N)))
+        untold = np.zeros(len(TERMS), dtype=bool)
+        for j, start in enumerate(starts[:-1]):
+            own = range(start, starts[j + 1])
+            if self.told[j] and straight[j]:
+                untold[j] = sigma[start + 1] > UNTOLD * self.usual[j]
+            # no change was seen where one would have been: there is none; and terms that are not free are known
+            known = own[1:] if self.told[j] and straight[j] and not untold[j] else own[:0] if self.free[j] else own
+            N[known, known] += 1 / TINY
+        length = np.zeros((len(N), 1))  # an input whose size is unsure: all scale factors go with it
+        for j in SCALE:
+            flat = np.any(design[j].penalty)  # curves of a kind add up to one, of a polynomial the first is one
+            length[starts[j] : starts[j + 1] if flat else starts[j] + 1] = self.stimulus.unsure
+        root = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, length])
+        return TriadFit(
+            self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
+            tuple(self.s.tolist()),
+        )  # fmt: skip

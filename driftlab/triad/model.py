@@ -1,0 +1,106 @@
+"""The readings of a triad as a function of its input and of temperature, and the curves that its terms may follow.
+
+::
+
+    y = (I + M(T)) u + b(T) + noise,    M_ii: error of the scale factor,    M_ij: axis i reads the input along j
+
+The 12 terms are the bias, 3, and M row by row, 9. A term is a curve c' B(T): a constant, a polynomial of an order, or
+the curves that stand for an installed kind of map, as smooth as their penalty has them. m equations, q coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import NetworkMap, ThermalMap
+from fusion_core.errors import ConfigError
+
+AXES = "xyz"
+PAIRS = tuple(i + j for i in AXES for j in AXES)
+TERMS = tuple(f"bias {i}" for i in AXES) + tuple(
+    f"scale {p[0]}" if p[0] == p[1] else f"misalignment {p}" for p in PAIRS
+)
+BIAS, SCALE = range(3), (3, 7, 11)
+BELOW = (6, 9, 10)  # of the terms: M below its diagonal, zero in the frame that the sensor itself defines
+NARROW = 2.0  # K: temperatures that move less have one value of each term
+ORDERS = 3  # highest order that is tried, where the map's kind names none
+SMOOTHINGS = tuple(10.0**k for k in range(-3, 5))  # of a kind with a penalty, relative to its information
+GRID = 25  # temperatures at which the error is kept
+
+
+@dataclass(frozen=True, eq=False)
+class TermCurve:
+    """One form that a term may have over temperature."""
+
+    name: str
+    values: Callable[[Array], Array]  # of T (m,): (m, q)
+    penalty: Array  # (q, q)
+
+    @property
+    def q(self) -> int:
+        """Number of coefficients."""
+        return len(self.penalty)
+
+
+def polynomial(order: int, domain: tuple[float, float]) -> TermCurve:
+    """Return the Chebyshev polynomials up to an order, on the domain."""
+    low, high = domain
+
+    def values(T: Array) -> Array:
+        return np.asarray(chebyshev.chebvander(np.clip((2 * T - low - high) / max(high - low, 1e-9), -1, 1), order))
+
+    return TermCurve("constant" if order == 0 else f"order {order}", values, np.zeros((order + 1, order + 1)))
+
+
+def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCurve]:
+    """Return the forms that are tried for each term, the simplest first.
+
+    Raises
+    ------
+    ConfigError
+        If the kind is a network, whose coefficients no information matrix holds.
+    """
+    if isinstance(settings, NetworkMap):
+        raise ConfigError(f"--kind {settings.kind}: is not linear in its coefficients; take spline or polynomial")
+    if domain[1] - domain[0] < NARROW:
+        return [polynomial(0, domain)]
+    most = getattr(settings, "order", ORDERS)
+    curves = [polynomial(order, domain) for order in range(most + 1)]
+    basis = settings.basis(domain)
+    if np.any(basis.penalty):
+        unit = basis.penalty / np.trace(basis.penalty) * len(basis.penalty)
+        curves += [TermCurve(settings.kind, basis.values, smoothing * unit) for smoothing in SMOOTHINGS[::-1]]
+    return curves
+
+
+@dataclass(frozen=True, eq=False)
+class TriadTerms:
+    """The 12 terms over temperature: curves with their coefficients."""
+
+    curves: Sequence[TermCurve]
+    coefficients: Sequence[Array]  # (q_j,) of each
+
+    def at(self, T: Array) -> Array:
+        """Return the terms (N, 12) at T (N,)."""
+        T = np.atleast_1d(np.asarray(T, dtype=np.float64))
+        return np.stack([c.values(T) @ x for c, x in zip(self.curves, self.coefficients, strict=True)], axis=1)
+
+    def matrix(self, T: Array) -> Array:
+        """Return M (N, 3, 3)."""
+        return self.at(T)[:, 3:].reshape(-1, 3, 3)
+
+
+def inverted(values: Array) -> tuple[Array, Array]:
+    """Return (I + M)^-1 (N, 3, 3) and the bias (N, 3) of terms (N, 12)."""
+    return np.asarray(np.linalg.inv(np.eye(3) + values[:, 3:].reshape(-1, 3, 3))), values[:, :3]
+
+
+def input_derivative(W: Array, u: Array) -> Array:
+    """Return du/dterms (N, 3, 12) of the input u = W (y - b) (N, 3), where W (N, 3, 3) = (I + M)^-1."""
+    of_M = -np.einsum("nki,nj->nkij", W, u).reshape(len(u), 3, 9)
+    return np.concatenate([-W, of_M], axis=2)

@@ -1,0 +1,99 @@
+"""Scale factor and misalignment of a triad as a function of temperature.
+
+The readings y of a triad whose input is u are::
+
+    y = (I + M(T)) u + b(T),    M_ij: change of what axis i reads with the input along axis j
+
+The diagonal of M holds the errors of the scale factors, the rest the misalignments. Each of the 9 terms is a piecewise
+cubic through values and slopes at K temperatures, which holds constants, lines, parabolas, cubics and the cubic spline
+exactly. N samples.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.settings import Frozen
+from fusion_core.thermal.curve_error import CurveError
+from fusion_core.thermal.record_texts import Plain
+
+Rows = tuple[tuple[FiniteFloat, ...], ...]
+Frame = Literal["given", "sensor"]
+
+TERMS = 9
+SINGULAR = 0.5  # largest sum of |M_ij| along a row: beyond, an axis reads another one
+
+
+class TriadMatrix(Frozen):
+    """The matrix M(T), as a map's record holds it.
+
+    Attributes
+    ----------
+    T : (K,) floats
+        Temperatures, rising, degC.
+    values, slopes : (K, 9) floats
+        M there, row by row, and its derivative, 1/K.
+    frame : str
+        `given`: all 9 terms are from the frame of the stimulus. `sensor`: that the triad defines itself, z along its
+        z axis and y in the plane of y and z; the terms below the diagonal are zero.
+    kinds : (9,) texts
+        The curve of each term.
+    told : (9,) bools
+        Whether the stimulus tells a term; one that it does not is zero.
+    error : CurveError
+        Of the 9 terms, with how their errors go together. Its modes are those of the error of the bias, one by one.
+    """
+
+    T: tuple[FiniteFloat, ...]
+    values: Rows
+    slopes: Rows
+    frame: Frame
+    kinds: tuple[Plain, ...]
+    told: tuple[bool, ...]
+    error: CurveError
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        shape = (len(self.T), TERMS)
+        if len(self.T) < 2 or np.any(np.diff(self.T) <= 0):
+            raise ValueError("the temperatures of the matrix do not rise")
+        if np.shape(self.values) != shape or np.shape(self.slopes) != shape:
+            raise ValueError(f"values and slopes of the matrix are not of the shape {shape}")
+        if not len(self.kinds) == len(self.told) == len(self.error.bend) == TERMS:
+            raise ValueError(f"kinds, told and error of the matrix are not of its {TERMS} terms")
+        rows = np.abs(np.asarray(self.values)).reshape(-1, 3, 3).sum(axis=2)
+        if np.max(rows) >= SINGULAR:
+            raise ValueError(f"a row of the matrix adds up to {np.max(rows):.3g}, below {SINGULAR:g} was expected")
+        return self
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, Array]:
+        return np.asarray(self.T), np.asarray(self.values), np.asarray(self.slopes)
+
+    def terms(self, T: Array) -> Array:
+        """Return the terms (N, 9) at T (N,) degC within the temperatures of the matrix, row by row."""
+        grid, values, slopes = self._arrays
+        k = np.clip(np.searchsorted(grid, T, side="right") - 1, 0, len(grid) - 2)
+        h = (grid[k + 1] - grid[k])[:, None]
+        x = np.clip((T - grid[k])[:, None] / h, 0.0, 1.0)
+        left, right = (1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)
+        bent = h * x * (1 - x) * ((1 - x) * slopes[k] - x * slopes[k + 1])
+        return np.asarray(left * values[k] + right * values[k + 1] + bent)
+
+    def at(self, T: Array) -> Array:
+        """Return M (N, 3, 3) at T (N,) degC."""
+        return self.terms(T).reshape(-1, 3, 3)
+
+    def sigma(self, T: Array) -> Array:
+        """Return the standard deviation (N, 9) of the terms at T (N,) degC."""
+        return np.asarray(np.sqrt(self.error.variance(T)))
+
+    def distortion(self, less: Array, T: Array) -> Array:
+        """Return M u (N, 3), the part of readings less their bias (I + M) u (N, 3) that is no input."""
+        u = np.linalg.solve(np.eye(3) + self.at(T), less[:, :, None])[:, :, 0]
+        return np.asarray(less - u)

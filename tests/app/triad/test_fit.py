@@ -1,0 +1,175 @@
+import numpy as np
+import pytest
+from turned_units import bias_of, matrix_of, sensor_frame, tumble, turntable
+
+from driftlab.triad.fit import fit_triad
+from driftlab.triad.model import TERMS
+from driftlab.triad.stimuli import KnownRates, PlacedForces, rests
+from fusion_core.contracts import ThermalMap
+from fusion_core.errors import ConfigError, SingularFit
+from fusion_core.host.registry import registry
+
+KINDS = registry().classes(ThermalMap)
+POLYNOMIAL = KINDS["polynomial"].model_validate({"kind": "polynomial", "order": 3})
+TEMPERATURES = [-20.0, 0.0, 20.0, 40.0, 60.0]
+AT = np.array([-20.0, 20.0, 60.0])
+
+
+def known_rates(seed=0, temperatures=TEMPERATURES, **how):
+    """The segments of a turntable, cut by its table with nothing of the reader."""
+    t, y, T, table = turntable(seed, temperatures, **how)
+    rows = [line.split(",") for line in table.splitlines()[1:]]
+    parts = [slice(*np.searchsorted(t, [float(start) + 1, float(stop)])) for start, stop, _, _ in rows]
+    u = [np.deg2rad(float(rate)) * np.eye(3)["xyz".index(axis)] for _, _, axis, rate in rows]
+    means = (np.stack([values[part].mean(axis=0) for part in parts]) for values in (y, T, t))
+    return KnownRates(np.stack(u), *means)
+
+
+def placed_forces(seed=0, temperatures=TEMPERATURES, **how):
+    t, y, T = tumble(seed, temperatures, **how)
+    places = rests(t, y, least=2.0)
+    return PlacedForces(*(np.stack([v[a:b].mean(axis=0) for a, b in places]) for v in (y, T, t)), 9.80665)
+
+
+def truth(sensor, size):
+    return np.array([np.concatenate([bias_of(T, size), sensor(matrix_of(T)).ravel()]) for T in AT])
+
+
+@pytest.mark.parametrize(
+    ("stimulus", "sensor", "size", "usual"),
+    [(known_rates, lambda M: M, np.deg2rad(1.0), 0.02), (placed_forces, sensor_frame, 0.3, 0.5)],
+    ids=["rate table", "tumble"],
+)
+def test_terms_over_temperature_are_within_their_sigma(stimulus, sensor, size, usual):
+    """Of 50 seeds `benchmarks/triad_sigma.py` counts how many are within one and two sigma."""
+    z = []
+    for seed in range(4):
+        fit = fit_triad(stimulus(seed), POLYNOMIAL, usual)
+        z.append(((fit.terms.at(AT) - truth(sensor, size)) / fit.sigma(AT))[:, fit.told])
+    z = np.array(z)
+    assert z.shape[2] == (12 if stimulus is known_rates else 9)
+    assert np.mean(np.abs(z) < 1) > 0.5
+    assert np.mean(np.abs(z) < 1.96) > 0.85
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    sigma = fit.sigma(AT)[:, 3:]
+    assert np.max(sigma) < 1e-4  # 100 ppm, 0.1 mrad
+
+
+def test_each_term_has_the_order_that_the_recording_supports():
+    kinds = dict(zip(TERMS, (c.name for c in fit_triad(known_rates(), POLYNOMIAL, 0.02).terms.curves), strict=True))
+    assert kinds["scale x"] == "order 1"
+    assert kinds["scale z"] == "order 2"
+    assert kinds["bias x"] == "order 2"
+    assert kinds["misalignment yz"] == "order 1"
+    assert kinds["scale y"] == kinds["misalignment zx"] == "constant"
+
+
+@pytest.mark.parametrize("kind", ["spline"])
+def test_a_term_may_follow_the_curves_of_an_installed_kind(kind):
+    """A scale factor with a bend that no cubic follows."""
+    T = np.repeat(np.linspace(-20, 60, 17), 6)
+    u = np.tile(np.vstack([np.eye(3), -np.eye(3)]), (17, 1))
+    bent = 0.01 * np.tanh((T - 20) / 4)
+    y = u + np.random.default_rng(0).normal(0, 1e-4, u.shape)
+    y[:, 0] += bent * u[:, 0]
+    fit = fit_triad(KnownRates(u, y, T, 60.0 * np.arange(len(T))), KINDS[kind].model_validate({"kind": kind}), 0.02)
+    assert fit.terms.curves[TERMS.index("scale x")].name == kind
+    left = fit.terms.at(T)[:, TERMS.index("scale x")] - bent
+    assert np.sqrt(np.mean(left**2)) < 2e-4
+    matrix = fit.matrix()  # in the file it is a piecewise cubic through one point a kelvin
+    np.testing.assert_allclose(matrix.terms(T), fit.terms.at(T)[:, 3:], rtol=0, atol=1e-5)
+
+
+def test_the_file_has_terms_and_joint_error_of_the_fit():
+    fit = fit_triad(known_rates(), POLYNOMIAL, 0.02)
+    T = fit.grid
+    matrix, bias = fit.matrix(), fit.curve_error(slice(0, 3))
+    np.testing.assert_allclose(matrix.terms(T), fit.terms.at(T)[:, 3:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(matrix.sigma(T), fit.sigma(T)[:, 3:], rtol=1e-2)
+    np.testing.assert_allclose(np.sqrt(bias.variance(T)), fit.sigma(T)[:, :3], rtol=1e-2)
+    modes = fit.modes(T)
+    joint = np.einsum("rn,rn->n", np.array(bias.modes)[:, :, 0], np.array(matrix.error.modes)[:, :, 0])
+    np.testing.assert_allclose(joint, np.sum(modes[:, :, 0] * modes[:, :, 3], axis=0), atol=1e-2 * np.abs(joint).max())
+
+
+def test_what_a_turntable_about_two_axes_does_not_tell_stands_in_the_verdict():
+    fit = fit_triad(known_rates(axes=(0, 1)), POLYNOMIAL, 0.02)
+    assert [TERMS[j] for j in np.flatnonzero(~fit.told)] == ["misalignment xz", "misalignment yz", "scale z"]
+    assert np.all(fit.terms.at(AT)[:, ~fit.told] == 0)
+    assert np.all(fit.sigma(AT)[:, ~fit.told] > 0.009)  # its usual size
+    lines = fit.verdict()
+    assert sum("no segment turns about z; add segments about z" in line for line in lines) == 3
+
+
+def test_one_rate_about_an_axis_leaves_its_scale_and_the_bias_one():
+    whole = known_rates()
+    some = (whole.u[:, 2] >= 0) & (np.abs(whole.u[:, :2]).max(axis=1) < 1e-9)  # about z, one way alone
+    fit = fit_triad(
+        KnownRates(*(v[some].repeat(4, axis=0) for v in (whole.u, whole.y, whole.temperatures, whole.times))),
+        POLYNOMIAL,
+        0.02,
+    )
+    assert not fit.told[TERMS.index("scale z")]
+    assert fit.told[:3].all()
+    assert np.all(fit.sigma(AT)[:, 2] > 0.5 * 0.01 * np.deg2rad(100))  # the scale that is not told counts in the bias
+
+
+def test_faces_alone_tell_no_misalignment():
+    faces = np.repeat(np.vstack([np.eye(3), -np.eye(3)]), 2, axis=0)
+    fit = fit_triad(placed_forces(up=faces), POLYNOMIAL, 0.5)
+    assert [TERMS[j] for j in np.flatnonzero(fit.free & ~fit.told)] == [
+        "misalignment xy", "misalignment xz", "misalignment yz",
+    ]  # fmt: skip
+    assert "add some tilted by 45 deg between the two" in fit.verdict()[0]
+
+
+def test_a_face_that_is_missing_is_named():
+    """An accelerometer that stays upright: its z axis sees all of gravity, and nothing else."""
+    up = np.random.default_rng(1).normal(size=(20, 3)) * [0.03, 0.03, 0.0] + [0, 0, 1]
+    fit = fit_triad(placed_forces(up=up, temperatures=[20.0]), POLYNOMIAL, 0.5)
+    lines = {line.split(":")[0]: line for line in fit.verdict()}
+    assert "no placement has +x or -x up; add one each" in lines["scale x"]
+    assert "no placement has -z up; add one" in lines["scale z"]
+
+
+def test_a_part_of_the_stimulus_at_one_temperature_tells_no_change():
+    whole = known_rates()
+    about_y = np.abs(whole.u[:, 1]) > 0
+    some = ~about_y | (whole.temperatures == 20.0)
+    fit = fit_triad(
+        KnownRates(*(v[some] for v in (whole.u, whole.y, whole.temperatures, whole.times))), POLYNOMIAL, 0.02
+    )
+    assert [TERMS[j] for j in np.flatnonzero(fit.untold_changes)] == ["misalignment xy", "scale y", "misalignment zy"]
+    sigma = fit.sigma(AT)[:, TERMS.index("scale y")]
+    assert sigma[1] < 1e-4 < 5e-3 < sigma[0]
+    assert "change from -20.0 to 60.0 °C: not told for misalignment xy, scale y" in fit.verdict()[-1]
+
+
+def test_one_temperature_gives_constants_and_says_so():
+    fit = fit_triad(known_rates(temperatures=[25.0] * 3), POLYNOMIAL, 0.02)
+    assert all(curve.name == "constant" for curve in fit.terms.curves)
+    assert "no change over temperature is told: all of it lies at 25.0 °C" in fit.verdict()[0]
+    assert fit.grid.tolist() == [24.0, 26.0]
+
+
+def test_gravity_that_is_unsure_is_unsure_in_all_scale_factors_alike():
+    sure = placed_forces(temperatures=[-20.0, 20.0, 60.0], placements=14)
+    unsure = PlacedForces(sure.y, sure.temperatures, sure.times, sure.gravity, unsure=1e-3)
+    one, other = (fit_triad(stimulus, POLYNOMIAL, 0.5) for stimulus in (sure, unsure))
+    scale = [3, 7, 11]
+    np.testing.assert_allclose(other.sigma(AT)[:, scale] ** 2, one.sigma(AT)[:, scale] ** 2 + 1e-6, rtol=1e-6)
+    modes = other.modes(AT)
+    correlation = np.sum(modes[:, 1, 3] * modes[:, 1, 7]) / np.prod(other.sigma(AT)[1, [3, 7]])
+    assert correlation > 0.99
+
+
+def test_too_few_segments_are_refused():
+    whole = known_rates(temperatures=[25.0])
+    with pytest.raises(SingularFit, match="12 equations for 12 terms; add placements or segments"):
+        fit_triad(KnownRates(whole.u[:4], whole.y[:4], whole.temperatures[:4], whole.times[:4]), POLYNOMIAL, 0.02)
+
+
+def test_a_network_is_refused():
+    network = KINDS["onnx_network"].model_validate({"kind": "onnx_network"})
+    with pytest.raises(ConfigError, match="not linear in its coefficients; take spline or polynomial"):
+        fit_triad(known_rates(), network, 0.02)

@@ -1,0 +1,89 @@
+"""Units on a turntable and in a tumble over temperature, simulated sample by sample; nothing is shared with a fit.
+
+The readings are y = u + M(T) u + b(T) + white noise + a walk of the bias. N samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+AXES = np.eye(3)
+
+
+def matrix_of(T):
+    """M (3, 3) at T: scale factors of 1 % that move by as much over 60 K, misalignments of mrad, one of them moving."""
+    x = (T - 20.0) / 40.0
+    M = np.array([[0.004, 0.003, -0.005], [0.002, -0.008, 0.006], [-0.001, 0.004, 0.01]])
+    M[0, 0] += 0.006 * x
+    M[2, 2] += -0.004 * x + 0.002 * x**2
+    M[1, 2] += 0.0015 * x
+    return M
+
+
+def bias_of(T, size):
+    """Return b (3,) at T, in the unit of `size`."""
+    x = (T - 20.0) / 40.0
+    return size * np.array([0.5 + 0.6 * x - 0.3 * x**2, -0.3 + 0.2 * x**3, 0.1 * x])
+
+
+def sensor_frame(M):
+    """Return M in the frame that the sensor itself defines: (I + M) R is upper triangular, R a rotation."""
+    A = np.eye(3) + M
+    rotated, _ = np.linalg.qr(A[::-1].T)  # rows from the last on: z first, then y
+    A = A @ rotated[:, ::-1]
+    return A * np.sign(np.diag(A)) - np.eye(3)
+
+
+class Readings:
+    """Samples of a triad that are put together stretch by stretch."""
+
+    def __init__(self, seed, rate, white, walk, bias):
+        self.rng, self.dt = np.random.default_rng(seed), 1.0 / rate
+        self.white, self.walk, self.bias = white, walk, bias
+        self.y, self.T, self.drift = [], [], np.zeros(3)
+
+    @property
+    def now(self):
+        return sum(map(len, self.y)) * self.dt
+
+    def stretch(self, seconds, u, T, M=None):
+        """Take readings under an input u (3,) or (N, 3)."""
+        N = round(seconds / self.dt)
+        u = np.broadcast_to(np.asarray(u, float), (N, 3))
+        drift = self.drift + np.cumsum(self.rng.normal(0, self.walk * np.sqrt(self.dt), (N, 3)), axis=0)
+        self.drift = drift[-1]
+        noise = self.rng.normal(0, self.white / np.sqrt(self.dt), (N, 3))
+        M = matrix_of(T) if M is None else M
+        self.y.append(u + u @ M.T + bias_of(T, self.bias) + drift + noise)
+        self.T.append(np.full(N, float(T)))
+
+    def arrays(self):
+        y = np.concatenate(self.y)
+        return np.arange(len(y)) * self.dt, y, np.concatenate(self.T)
+
+
+def turntable(seed, temperatures, rate=1.7453292519943295, hold=16.0, hz=10.0, axes=range(3), matrix=matrix_of):
+    """Return t, gyro, T and the table of segments: each axis both ways at each temperature, with ramps between."""
+    made = Readings(seed, hz, white=8e-5, walk=1e-6, bias=np.deg2rad(1.0))
+    lines = ["start [s],stop [s],axis,rate [deg/s]"]
+    for T in temperatures:
+        for k in axes:
+            for sign in (1, -1):
+                made.stretch(1.0, np.linspace(0, 1, 10)[:, None] * sign * rate * AXES[k], T, matrix(T))
+                lines.append(f"{made.now:.3f},{made.now + hold:.3f},{'xyz'[k]},{sign * np.rad2deg(rate):.9f}")
+                made.stretch(hold, sign * rate * AXES[k], T, matrix(T))
+                made.stretch(1.0, np.linspace(1, 0, 10)[:, None] * sign * rate * AXES[k], T, matrix(T))
+    return *made.arrays(), "\n".join(lines) + "\n"
+
+
+def tumble(seed, temperatures, placements=18, hold=5.0, hz=10.0, g=9.80665, up=None):
+    """Return t, accel, T: a unit laid in random directions, faces among them, with handling between."""
+    made = Readings(seed, hz, white=5e-4, walk=1e-6, bias=0.3)
+    others = np.random.default_rng(7).normal(size=(max(placements - 6, 0), 3))
+    faces = np.vstack([AXES, -AXES, others])[:placements]
+    for T in temperatures:
+        for direction in faces if up is None else up:
+            made.stretch(1.0, 9 + 3 * made.rng.normal(size=(round(hz), 3)), T)
+            made.stretch(hold, g * direction / np.linalg.norm(direction), T)
+    made.stretch(1.0, 9 + 3 * made.rng.normal(size=(round(hz), 3)), T)
+    return made.arrays()
