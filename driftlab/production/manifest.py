@@ -198,10 +198,26 @@ def _mistakes_of(row: Mapping[str, str]) -> Iterator[str]:
     for column, text in row.items():
         if not (is_plain(column) and is_plain(text) and len(text) <= TEXT):
             yield f"column {quote(column)} has '{quote(text)}', which is no text of one line; mend it"
+    if date and not _iso(date):
+        yield f"date '{quote(date)}' is no date, or two; write it as 2026-01-31, 31.01.2026 or 2026-01-31T14:05"
+
+
+def _iso(date: str) -> str:
+    """Return a date in ISO 8601: of one with points the day is first, of one with slashes where no month is so large.
+
+    Empty where it is none, or may be two.
+    """
+    if match := re.fullmatch(r"(\d\d?)([./])(\d\d?)\2(\d{4})((?:[ T].*)?)", date):
+        first, sign, second, year, clock = match.groups()
+        if sign == "/" and first != second and max(int(first), int(second)) <= 12:
+            return ""
+        day, month = (second, first) if sign == "/" and int(second) > 12 else (first, second)
+        date = f"{year}-{month:0>2}-{day:0>2}{clock}"
     try:
-        datetime.fromisoformat(date or "2026-01-31")
+        datetime.fromisoformat(date)
     except ValueError:
-        yield f"date '{quote(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05"
+        return ""
+    return date
 
 
 def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, wrong: _Mistakes) -> ManifestEntry:
@@ -215,7 +231,7 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, w
         if row["lot"]:
             lots.setdefault(row["lot"], number)
         if row["date"]:
-            dates.setdefault(role, row["date"])
+            dates.setdefault(role, _iso(row["date"]))
         for column, value in row.items():
             if column not in COLUMNS and value:
                 more.setdefault(column, {})[value] = None

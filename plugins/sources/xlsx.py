@@ -29,10 +29,12 @@ from fusion_plugins.sources.unpacked import Stream, damaged, plain_file, transla
 
 SIGNATURE = b"PK\x03\x04"
 PARTS = re.compile(r"\[Content_Types\]\.xml|_rels/.*|xl/(?:[^/]*\.xml|_rels/.*|worksheets/[^/]*)")
-PLACE = re.compile(  # of a cell; none where its tag does not name one of Excel's
-    rb"<(?:[^\s<>/:]+:)?c(?=[\s/>])"
-    rb"(?:(?:[ \t\r\n]+(?!r[ \t\r\n=])[^\s=<>\"'/]+[ \t\r\n]*=[ \t\r\n]*(?:\"[^\"<]*\"|'[^'<]*'))*"
-    rb"[ \t\r\n]+r[ \t\r\n]*=[ \t\r\n]*[\"']([A-Za-z]{1,3})(\d{1,7})[\"'])?"
+ATTRIBUTES = (  # but for `r`
+    rb"(?:[ \t\r\n]+(?!r[ \t\r\n=])[^\s=<>\"'/]+[ \t\r\n]*=[ \t\r\n]*(?:\"[^\"<]*\"|'[^'<]*'))*"
+)
+PLACE = re.compile(  # of a row or a cell, after the letter of its tag: column and row, or the tag's end without one
+    rb"<(?:[^\s<>/:]+:)?(c|row)(?=[\s/>])(?:" + ATTRIBUTES + rb"(?:"
+    rb"[ \t\r\n]+r[ \t\r\n]*=[ \t\r\n]*[\"']([A-Za-z]{0,3})(\d{1,7})[\"']|([ \t\r\n]*/?>)))?"
 )
 SHARED, ITEM = re.compile(rb"\bt\s*=\s*[\"']s[\"']"), re.compile(rb"<(?:[^\s<>/:]+:)?si[\s/>]")  # texts: cell, list
 CELL = 64.0  # bytes that one takes
@@ -168,19 +170,25 @@ def _repacked(path: Path) -> io.BytesIO:
 
 
 def _check_places(path: Path, part: str, content: bytes) -> None:
-    """Raise UnreadableFile where the cells of a part need too much room, or do not say where they are."""
-    columns, rows, count = set(), set(), 0
-    for cell in PLACE.finditer(content):
-        if cell[1] is None:
+    """Raise UnreadableFile where the cells of a part need too much room, or have a place that is none.
+
+    A row or a cell without a place follows the one before it.
+    """
+    row = column = height = width = count = 0
+    known: dict[bytes, int] = {}
+    for tag, letters, number, end in PLACE.findall(content):
+        if not (end or (number and bool(letters) == (tag == b"c"))):
             raise UnreadableFile(
-                f"{path}: {part} has a cell without a place, one from A1 to XFD1048576 was expected; "
+                f"{path}: {part} has a cell at a place that is none, one from A1 to XFD1048576 was expected; "
                 "save it with Excel, or export the sheet as CSV"
             )
-        count += 1
-        columns.add(cell[1].upper())
-        rows.add(cell[2])
-    width = max((sum((c - 64) * 26**k for k, c in enumerate(reversed(name))) for name in columns), default=0)
-    height = max(map(int, rows), default=0)
+        if tag == b"row":
+            row, column = int(number) if number else row + 1, 0
+            continue
+        if letters and letters not in known:
+            known[letters] = sum((c - 64) * 26**k for k, c in enumerate(reversed(letters.upper())))
+        column = known[letters] if letters else column + 1
+        count, width, height = count + 1, max(width, column), max(height, int(number) if number else row)
     what = f"a sheet of {height:,} rows and {width:,} columns"
     check_size(path, what, CELL * max(height * width, count), 2 * PIECE)
 

@@ -64,6 +64,27 @@ def test_what_spreadsheets_write_is_read(manifest, text):
     assert (unit.lot, unit.date, unit.more) == ("", "", {})
 
 
+@pytest.mark.parametrize(
+    ("written", "iso"),
+    [
+        ("06.11.2026", "2026-11-06"),
+        ("6.1.2026 14:05", "2026-01-06 14:05"),
+        ("31/01/2026", "2026-01-31"),
+        ("1/31/2026", "2026-01-31"),
+        ("05/05/2026", "2026-05-05"),
+        ("2026-01-31T14:05", "2026-01-31T14:05"),
+    ],
+)
+def test_dates_of_spreadsheets_are_read_where_they_are_one(manifest, written, iso):
+    assert manifest(f"unit,path,date\n1,a.h5,{written}\n").units[0].date == iso
+
+
+@pytest.mark.parametrize("date", ["05/06/2026", "31.02.2026", "13/13/2026", "05-06-2026"])
+def test_a_date_that_is_none_or_two_is_a_mistake(manifest, date):
+    with pytest.raises(ConfigError, match=rf"line 2: date '{date}' is no date, or two; write it as 2026-01-31"):
+        manifest(f"unit,path,date\n1,a.h5,{date}\n")
+
+
 def test_a_manifest_may_be_called_tsv(manifest):
     assert manifest("unit\trole\tpath\na\tcalibration\ta.h5\n", "units.tsv").units[0].unit == "a"
 
@@ -88,7 +109,7 @@ def test_the_same_recording_may_calibrate_and_train(manifest):
         ("unit,role,path\n1,soaked,a.h5\n", "line 2: role 'soaked' is not known"),
         ("unit,role,path\n1,test,a.h5\n", "line 2: unit 1 has no recording to fit on"),
         ("unit,path,lot\n1,a.h5,A\n1,b.h5,B\n", "line 3: unit 1 is of lot B here and of A before"),
-        ("unit,path,date\n1,a.h5,5.1.26\n", "line 2: date '5.1.26' is no date"),
+        ("unit,path,date\n1,a.h5,5.1.26\n", "line 2: date '5.1.26' is no date, or two"),
         ("unit,path\n1,\n", "line 2: unit 1 has no path"),
         ("unit,path\n../1,a.h5\n", "line 2: unit '../1' can be no folder's name"),
         ("unit,path\n.1,a.h5\n", "line 2: unit '.1' can be no folder's name"),

@@ -54,18 +54,25 @@ def test_a_cell_far_away_makes_no_room_for_all_before_it(tmp_path, place):
         read(Xlsx(path=path, channels=CHANNELS))
 
 
-@pytest.mark.parametrize(
-    "cells",
-    [
-        b'<c><v>1</v></c></row><row r="30000">',
-        b'<c r="AAAA1"><v>1</v></c>',
-        b"<c t=\"r='A1'\"><v>1</v></c>",
-        b'<x:c s="1"/>',
-    ],
-)
-def test_a_cell_says_where_it_is(tmp_path, cells):
-    path = changed(book(tmp_path), SHEET, lambda data: data.replace(b"</row>", cells + b"</row>", 1))
-    with pytest.raises(UnreadableFile, match=r"sheet1\.xml has a cell without a place, .* was expected; save it"):
+@pytest.mark.parametrize("places", [rb' r="[A-Z]+\d+"', rb' r="[A-Z]*\d+"', rb' r="[B-Z]\d+"'])
+def test_a_cell_or_row_without_a_place_follows_the_one_before(tmp_path, places):
+    path = changed(book(tmp_path, Data=[["t", "g"], [0, 1.5], [1, 3]]), SHEET, lambda data: re.sub(places, b"", data))
+    got = read(Xlsx(path=path, channels=CHANNELS))
+    assert got.t.tolist() == [0, 1]
+    np.testing.assert_allclose(got["gyro"][:, 0], np.deg2rad([1.5, 3]))
+
+
+@pytest.mark.parametrize("row", [b'<row r="900000"><c/><c r="ZZ900000"/>', b'<row r="900000"/><x:row><c/><c r="ZZ1"/>'])
+def test_a_row_far_away_makes_no_room_for_all_before_it(tmp_path, row):
+    path = changed(book(tmp_path), SHEET, lambda data: data.replace(b"</sheetData>", row + b"</row></sheetData>", 1))
+    with pytest.raises(UnreadableFile, match=r"a sheet of 900,00[01] rows and 702 columns takes"):
+        read(Xlsx(path=path, channels=CHANNELS))
+
+
+@pytest.mark.parametrize("cell", [b'<c r="AAAA1"/>', b'<c r="7"/>', b"<c a=b/>", b'</row><row r="A1"><c/>'])
+def test_a_place_that_is_none_is_damage(tmp_path, cell):
+    path = changed(book(tmp_path), SHEET, lambda data: data.replace(b"</row>", cell + b"</row>", 1))
+    with pytest.raises(UnreadableFile, match=r"sheet1\.xml has a cell at a place that is none, .* was expected; save"):
         read(Xlsx(path=path, channels=CHANNELS))
 
 
