@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __version__ = version("driftlab")
 __all__ = [
     "allan", "check", "compare", "errors", "explain", "export",
-    "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
+    "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate", "vehicle",
 ]  # fmt: skip
 
 

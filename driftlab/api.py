@@ -39,12 +39,13 @@ if TYPE_CHECKING:
     from driftlab.commands.plan import plan
     from driftlab.commands.run import run
     from driftlab.commands.simulate import simulate
+    from driftlab.commands.vehicle import vehicle
     from driftlab.production.fleet import fleet
 
 __all__ = [
     "ConfigLike", "DataLike", "Place", "Progress", "Units",
     "allan", "check", "compare", "explain", "export", "fit_map", "fleet", "import_map", "init", "plan", "run",
-    "simulate",
+    "simulate", "vehicle",
 ]  # fmt: skip
 
 OPTIONS = {"input": "data", "select": "neurons", "set": "settings", "unit": "units"}  # where an argument's name differs

@@ -96,6 +96,7 @@ COMMANDS = (
         options={"go": Option("--go", "Run fit-map with it at once, and show its page."), "json": JSON},
     ),
     Command("export", "exporting", metavars={"out": "PATH"}),
+    Command("vehicle", "fitting", defaults={"out": NEEDED}),
     Command("import_map", "importing", title="import", metavars={"out": "MAP"}),
     Command("plugins", module="driftlab.commands.check", options={}),
     Command("schema", module="driftlab.commands.check", options={}),

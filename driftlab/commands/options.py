@@ -28,15 +28,24 @@ TYPES: dict[str, Any] = {  # by the first word of an annotation; of what is not 
     "Mapping[str, ConfigLike]": list[Path], "DataLike": list[str], "Sequence[str]": list[str],
     "Mapping[str, Any]": list[str], "Mapping[str, str]": list[str],
 }  # fmt: skip
-ARGUMENTS = {"config": "CONFIG", "configs": "CONFIG...", "kind": "KIND", "what": "MAP|CONFIG", "file": "FILE"}
+ARGUMENTS = {
+    "config": "CONFIG",
+    "configs": "CONFIG...",
+    "kind": "KIND",
+    "what": "MAP|CONFIG",
+    "file": "FILE",
+    "logs": "LOG...",
+}
 FLAGS = {
     "data": "--input", "settings": "--set", "units": "--unit", "columns": "--column", "map_kind": "--kind",
 }  # fmt: skip  # where the name differs
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
     "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
-    "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json",
-    "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR",
+    "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME",
+    "export": "px4|ardupilot", "family": "FAMILY.json",
+    "fit_map": "MAP", "heading": "ANGLE", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME",
+    "latitude": "ANGLE", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
     "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",

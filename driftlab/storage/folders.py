@@ -319,6 +319,7 @@ FILES = {  # of each command; the first says that all are there
     "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
     "compare": ("summary.json", "report.html"),
     "plan": ("plan.json", "setpoints.csv", "report.html"),
+    "vehicle": ("vehicle.json", "*.map.json", "vehicle.params", "vehicle.parm", "report.html"),
     "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
 }
 LOCK, BEFORE = "driftlab.lock", ".replaced"

@@ -88,18 +88,22 @@ class Ardupilot(Autopilot):
     """True if the offsets of the accelerometers are written too."""
 
     def shared(self, sensors: tuple[Calibrated, ...]) -> tuple[list[Parameter], list[str]]:
-        """Return the switch and the limits of temperature, which an IMU's sensors share."""
-        low, high = _limits(sensors)
-        begin = thermal_group(self._imu(sensors))
-        values = {"ENABLE": 1.0, "TMIN": float(low), "TMAX": float(high)}
-        note = f"parameters of {begin}_* are there once {begin}_ENABLE is 1: load it twice"
-        return [Parameter(f"{begin}_{name}", value) for name, value in values.items()], [note]
+        """Return the switch and the limits of temperature of each IMU, which its sensors share."""
+        parameters, notes = list[Parameter](), list[str]()
+        for imu in dict.fromkeys(map(self._imu, sensors)):
+            low, high = _limits(self._of(imu, sensors))
+            begin = thermal_group(imu)
+            values = {"ENABLE": 1.0, "TMIN": float(low), "TMAX": float(high)}
+            parameters += [Parameter(f"{begin}_{name}", value) for name, value in values.items()]
+            notes.append(f"parameters of {begin}_* are there once {begin}_ENABLE is 1: load it twice")
+        return parameters, notes
 
     def corrections(self, sensor: Calibrated, sensors: tuple[Calibrated, ...]) -> Corrections:
         """Return the coefficients of a sensor, and its offset with its temperature where they are to be written."""
-        low, high = _limits(sensors)
+        imu = self._imu(sensor)
+        low, high = _limits(self._of(imu, sensors))
         kind = autopilot.kind_of(SENSORS, sensor, self.kind, CORRECTED)
-        names = ParameterNames(kind.short, self._imu(sensors))
+        names = ParameterNames(kind.short, imu)
         T_cal = np.clip(T_REF, low, high)  # where it can be 35 degC, nothing is added back
         reference, scale = float(T_REF), float(SCALE)
 
@@ -150,18 +154,16 @@ class Ardupilot(Autopilot):
             "that is calibrated, and its --set imu=N"
         )
 
-    def _imu(self, sensors: tuple[Calibrated, ...]) -> int:
-        """Return the number that is set, else the one of the logs of which the maps were made."""
+    def _imu(self, sensor: Calibrated) -> int:
+        """Return the number that is set, else the one of the log of which the map was made."""
         if self.imu is not None:
             return self.imu
-        known = {sensor.fitted.record.provenance.get("imu", "1") for sensor in sensors}
-        if len(known) > 1:
-            raise ConfigError(
-                f"export ardupilot: the maps are of IMU {' and '.join(sorted(known))}, a file is for one; give "
-                "--set imu=N, or the maps of one"
-            )
-        (number,) = known
+        number = sensor.fitted.record.provenance.get("imu", "1")
         return int(number) if number in {"1", "2", "3", "4", "5"} else 1
+
+    def _of(self, imu: int, sensors: tuple[Calibrated, ...]) -> tuple[Calibrated, ...]:
+        """Return the sensors of an IMU."""
+        return tuple(sensor for sensor in sensors if self._imu(sensor) == imu)
 
     def _notes(self, sensor: Calibrated, names: ParameterNames, low: np.float32, high: np.float32) -> list[str]:
         first, last = sensor.fitted.domain

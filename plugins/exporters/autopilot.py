@@ -123,7 +123,7 @@ class Autopilot(contracts.Exporter):
             (*notes, *(note for one in each for note in one.notes)),
         )
         head = [f"Thermal calibration of {self.title}, by driftlab", *loss.lines(), *self.heading]
-        parameters += [parameter for one in each for parameter in one.parameters]
+        parameters = _without_repeats([*parameters, *(parameter for one in each for parameter in one.parameters)])
         lines = [*map(comment, head), *map(self.written, parameters)]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss
@@ -194,6 +194,18 @@ class Autopilot(contracts.Exporter):
         }
         loss = SensorLoss.measured(modelled, target, renewed, contracts.causes(steps), flown)
         return held, loss, (*left_out, *(uncorrected(sensor) if len(kind.axes) > 1 else ()))
+
+
+def _without_repeats(parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Return each parameter once; raises ConfigError where two sensors give one another value."""
+    once: dict[str, Parameter] = {}
+    for parameter in parameters:
+        if once.setdefault(parameter.name, parameter) != parameter:
+            raise ConfigError(
+                f"{parameter.name}: two of the sensors set it, to {single(once[parameter.name].value)} and "
+                f"{single(parameter.value)}; export them one by one"
+            )
+    return list(once.values())
 
 
 def kind_of(kinds: Sequence[Kind], sensor: Calibrated, exporter: str, corrected: str) -> Kind:

@@ -22,7 +22,7 @@ from fusion_core.host.registry import registry
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 PROGRAM = [sys.executable, "-m", "driftlab"]
 WITH_CONFIG = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check")
-COMMANDS = (*WITH_CONFIG, "init", "export", "import", "plugins", "schema")
+COMMANDS = (*WITH_CONFIG, "init", "export", "import", "vehicle", "plugins", "schema")
 CONFIG = """
 extends: mems_crs05
 source: {kind: synthetic, duration: 2 min, rate: 20 Hz}
@@ -134,7 +134,7 @@ def test_no_color_is_obeyed():
 def test_how_much_is_said_can_be_chosen_of_every_command(command):
     taken = {option for parameter in get_command(app).commands[command].params for option in parameter.opts}
     assert {"-q", "--quiet", "-v", "--verbose"} <= taken
-    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export", "import"))
+    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export", "import", "vehicle"))
 
 
 def test_an_export_can_be_quiet_and_keeps_its_own_set(tmp_path):

@@ -191,5 +191,8 @@ def test_the_imu_of_the_log_is_taken(path):
     ardupilot().export(unit(fitted(provenance={"imu": "3"})), path)
     assert "INS_TCAL3_GYR1_X" in rows(path)
     two = Export((sensor(fitted(provenance={"imu": "1"})), sensor(fitted(provenance={"imu": "2"}), channel="gyro2")))
-    with pytest.raises(ConfigError, match="the maps are of IMU 1 and 2, a file is for one; give --set imu=N"):
-        ardupilot().export(two, path)
+    ardupilot().export(two, path)
+    assert {"INS_TCAL1_GYR1_X", "INS_TCAL2_GYR1_X", "INS_TCAL2_ENABLE", "INS_GYR2OFFS_X"} <= set(rows(path))
+    of_one = Export((sensor(fitted()), sensor(fitted(unit="rad/s", high=40.0), channel="gyro2")))
+    with pytest.raises(ConfigError, match="two of the sensors set it"):
+        ardupilot(imu=1).export(of_one, path)
