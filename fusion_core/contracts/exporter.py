@@ -63,6 +63,7 @@ class Exporter(Plugin):
 
     suffix: ClassVar[str] = ""  # of the file; empty where it is a folder
     folder: ClassVar[bool] = False  # whether it writes several files, into a folder
+    holds_matrix: ClassVar[bool] = False  # whether scale factor and misalignment leave too
 
     @abstractmethod
     def export(self, what: Export, path: Path) -> Loss:
