@@ -252,7 +252,7 @@ BUDGET = {
     "driftlab/production": 2335,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
-    "driftlab/reports": 2993,
+    "driftlab/reports": 3098,
     "driftlab/soak": 658,
     "driftlab/spc": 882,
     "driftlab/starter": 796,

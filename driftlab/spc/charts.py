@@ -387,7 +387,7 @@ def _core(x: Array) -> Array:
 
 
 def far_out(x: Array) -> NDArray[np.bool_]:
-    """Return which of the values (n,) lie beyond five robust deviations; none where most are the same."""
+    """Return True of the values (n,) beyond five robust deviations; of none where most are the same."""
     about = np.abs(x - np.median(x))
     reach = 5 * 1.4826 * np.median(about)
     return np.asarray((about > reach) & (reach > 0))
