@@ -180,6 +180,10 @@ class _Command:
             units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
             line=analysis.line.sentences, judged=analysis.judged,
             alarms={analysis.line.units[k]: why for k, why in alarms(analysis.line).items()},
+            capability=[
+                row.as_json(analysis.line.shown(row.quantity).si, analysis.line.units[row.since])
+                for row in analysis.line.capability
+            ],
         )  # fmt: skip
         return self._mark(complete=True, key=key, family=family, pages=pages)
 

@@ -95,7 +95,7 @@ MAX_PAGES = 20  # pages of units that stand out and were not asked for
 class FamilySummary(BaseModel):
     """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
 
-    `alarms` are why units are out of control, by frozen limits and run rules.
+    `alarms` are why units are out of control, by frozen limits and run rules; `capability` has the indices.
     """
 
     units: int
@@ -104,6 +104,7 @@ class FamilySummary(BaseModel):
     lines: list[str] = []
     line: list[str] = []
     alarms: dict[str, list[str]] = {}
+    capability: list[dict[str, Any]] = []
     judged: bool = True
 
     def sentences(self) -> list[str]:

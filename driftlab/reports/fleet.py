@@ -18,7 +18,8 @@ import numpy as np
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
-from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, joint_charts, map_charts
+from driftlab.reports.fleet_charts import FleetOverview, map_charts
+from driftlab.reports.line_charts import control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
 from driftlab.spc.sentences import alarms, by_how_much, place
@@ -58,6 +59,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         alarms=[(line.units[k], overview.links.get(line.units[k], ""), "; ".join(why)) for k, why in out[:LISTED]],
         alarms_count=len(out),
         line=line,
+        against=limit_charts(line),
         changes=changes(line),
         effects=effects,
         odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],

@@ -24,12 +24,12 @@ from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.family.tail_law import TailLaw
+from driftlab.spc.capability import Capability, indices, share_beyond, why_no_index
 from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
     MIN_UNITS,
     SIGMAS,
-    Capability,
     ChartScale,
     ControlChart,
     InControl,
@@ -40,12 +40,11 @@ from driftlab.spc.charts import (
     TSquaredChart,
     ewma,
     ewma_limit,
+    far_out,
     huber,
     in_control,
-    indices,
     normality,
     scale_of,
-    share_beyond,
 )
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import sentences
@@ -316,12 +315,13 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
                 continue
             x = chart.scale.to(chart.value[part])
             n, beyond = len(x), int(np.sum(chart.value[part] > limit))
-            spread = in_control(x, np.zeros(n)).spread
-            cpk_ppk = indices(x, float(chart.scale.to(np.array(limit))), spread)
+            normal, why_not = why_no_index(x, far_out(x))
+            limit_x = float(chart.scale.to(np.array(limit)))
+            found = (np.nan,) * 6 if why_not else indices(x, limit_x)
             rows.append(
                 Capability(
-                    chart.quantity, chart.axis, limit, n, since, *cpk_ppk, beyond, *share_beyond(beyond, n),
-                    chart.scale.name, normality(x),
+                    chart.quantity, chart.axis, limit, n, since, *found, beyond, *share_beyond(beyond, n),
+                    chart.scale.name, normal, why_not,
                 )
             )  # fmt: skip
     return tuple(rows)

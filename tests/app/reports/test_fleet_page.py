@@ -14,7 +14,8 @@ from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES, figure_name
 from driftlab.reports import fleet as fleet_rows
 from driftlab.reports.fleet import write_fleet_report
-from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, control_charts, percentiles
+from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, percentiles
+from driftlab.reports.line_charts import control_charts
 from driftlab.spc.line import line_of
 from driftlab.units import RATE
 
@@ -87,18 +88,21 @@ def test_it_says_what_the_fleet_is(path, overview, opened):
         assert said in text
     assert shown.locator(".verdict.fail").inner_text().startswith("Limits: ")
     assert shown.title() == "line"  # no text of a file is taken for a part of the page
-    noise = next(row for row in overview.line.capability if (row.quantity, row.axis) == ("noise", "x"))
-    assert f"{noise.ppk_low:.2f} to {noise.ppk_high:.2f}" in text
+    rows = [row for row in overview.line.capability if row.quantity == "noise"]
+    assert {row.trusted for row in rows} == {True, False}  # x, which has changed, is not normal over the whole line
+    for row in rows:
+        said = f"({row.cpk_low:.2f} to {row.cpk_high:.2f})\t{row.ppk:.2f} (" if row.trusted else f"none: {row.why_not}"
+        assert said in text
 
 
 def test_all_of_it_is_drawn_on_a_desk_and_on_a_phone(path, opened):
-    assert_drawn_everywhere(opened, path, figures=2 + 5)
+    assert_drawn_everywhere(opened, path, figures=2 + 5 + 1)
 
 
 def test_every_panel_and_every_figure_has_its_unit(path, opened):
     shown = opened(path)
     labels = shown.locator(".panels .label").all_inner_texts()
-    assert len(labels) == 7 + 15
+    assert len(labels) == 7 + 15 + 6
     assert all("[" in label for label in labels if label != "units measured")
     shown.select_option("#columns", "all")
     heads = shown.locator(".rows th button").all_inner_texts()
@@ -209,7 +213,7 @@ def test_few_units_have_a_page(opened, tmp_path, count):
     path = tmp_path / "report.html"
     write_fleet_report(path, fleet(count))
     shown = opened(path)
-    assert shown.locator("figure.chart").count() == (7 if count == 10 else 1)  # of one unit no differences
+    assert shown.locator("figure.chart").count() == (8 if count == 10 else 1)  # of one unit no differences
     assert shown.locator("#count").inner_text() == f"{count} of {count} units"
 
 
@@ -302,7 +306,7 @@ def test_long_names_are_told_apart_on_a_phone_and_under_the_charts(opened, tmp_p
     assert overflow(shown) == 0
     reason = shown.locator(".reasons td").first
     assert reason.bounding_box()["x"] + reason.bounding_box()["width"] <= 390
-    said = shown.evaluate("driftlab.charts.at(-1).label(18).split('\\n')[0]")
+    said = shown.evaluate("driftlab.charts.findLast((chart) => chart.names).label(18).split('\\n')[0]")
     assert said == "…l-2026-0017"  # the unit at place 18, by what no other unit has
     lefts = shown.eval_on_selector_all(
         ".rows td.left:first-child", "(all) => all.map((a) => getComputedStyle(a).position)"
