@@ -223,7 +223,7 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
 def _matrices(kind: str, what: Export) -> Iterator[str]:
     """Yield the size of scale factor and misalignment over temperature, which a form of export does not hold."""
     for sensor in what.sensors:
-        matrix = None if sensor.map is None else sensor.map.record.matrix
+        matrix = sensor.matrix
         if matrix is not None:
             M = np.max(np.abs(matrix.at(np.linspace(matrix.T[0], matrix.T[-1], 100))), axis=0)
             yield (

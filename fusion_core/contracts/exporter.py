@@ -63,7 +63,11 @@ class Exporter(Plugin):
 
     suffix: ClassVar[str] = ""  # of the file; empty where it is a folder
     folder: ClassVar[bool] = False  # whether it writes several files, into a folder
-    holds_matrix: ClassVar[bool] = False  # whether scale factor and misalignment leave too
+
+    @property
+    def holds_matrix(self) -> bool:
+        """True where the file has scale factor and misalignment too; `Loss` says then what of them is lost."""
+        return False
 
     @abstractmethod
     def export(self, what: Export, path: Path) -> Loss:

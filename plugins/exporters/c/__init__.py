@@ -36,7 +36,6 @@ class C99(Exporter):
     """C99 with a table of knots, its memories in a struct."""
 
     folder: ClassVar[bool] = True
-    holds_matrix: ClassVar[bool] = True
 
     kind: Literal["c"] = "c"
     loss: Annotated[float, Unit("bias", positive=True, example="1 deg/h")] | None = None
@@ -44,6 +43,11 @@ class C99(Exporter):
 
     knots: Literal["smallest", "float"] = "smallest"
     """As what knots are kept: 16-bit integers with a scale where these are fine enough for the loss, or float."""
+
+    @property
+    def holds_matrix(self) -> bool:
+        """True: as a table beside that of the bias."""
+        return True
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write header, source and self-test of each sensor that has a map."""

@@ -146,7 +146,7 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
         tables.append(table)
     weights = np.stack(list(signals.values()), axis=1) if signals else np.zeros((len(sensor.axes), 0))
     matrix = None
-    if sensor.fitted.record.matrix is not None:
+    if sensor.matrix is not None:
         matrix = fewest(TEMPERATURE, inverse_of(sensor), (low, high), _matrix_loss(sensor), floats=floats)
         if matrix is None:
             return None
@@ -155,14 +155,14 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
 
 def inverse_of(sensor: Calibrated) -> Curve:
     """Return the function of T (N,) -> (N, 9), N = (I + M)^-1 - I row by row, of a map with a matrix."""
-    matrix, one = sensor.fitted.record.matrix, np.eye(3)
+    matrix, one = sensor.matrix, np.eye(3)
     assert matrix is not None
     return lambda T: (np.linalg.inv(one + matrix.at(T)) - one).reshape(-1, 9)
 
 
 def _matrix_loss(sensor: Calibrated) -> Array:
     """Return a tenth (9,) of what the terms are known to, 0.1 to 10 ppm."""
-    matrix = sensor.fitted.record.matrix
+    matrix = sensor.matrix
     assert matrix is not None
     known = matrix.sigma(np.linspace(*sensor.fitted.domain, MATRIX_PLACES))
     return np.asarray(np.clip(0.1 * np.sqrt(np.mean(known**2, axis=0)), 1e-7, 1e-5))
