@@ -36,18 +36,17 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     failed = [record for record in records if record.state == "failed"]
     done = [record for record in records if record.state == "done"]
     limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
-    units, out = f"{len(records):,} unit{'s' * (len(records) != 1)}", [*alarms(line).items()]
-    lead = [f"{units}: {len(records) - len(failed):,} done, {len(failed):,} failed", f"{odd:,} odd"]
-    lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
+    out = [*alarms(line).items()]
     write_page(
         path,
         "fleet",
         title=overview.title,
-        lead="; ".join(lead),
+        lead=_lead(len(records), len(failed), odd, len(effects)),
         limits=verdict_of_units(limits).capitalize(),
         outcome=worst([row for of_unit in limits for row in of_unit]),
         verdict=_headline(line, odd, len(done)),
         use=_use(line, odd),
+        yields=overview.yields,
         called=figure_name,
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=_numbers(records),
@@ -71,6 +70,13 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
         table=embedded(table),
     )
+
+
+def _lead(units: int, failed: int, odd: int, effects: int) -> str:
+    """Return the numbers of units and of effects that they share."""
+    parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    parts += [f"{effects} effect{'s' * (effects != 1)} that they share"] if effects else []
+    return "; ".join(parts)
 
 
 def _headline(line: LineReport, odd: int, done: int) -> str:
