@@ -34,7 +34,7 @@ FLAGS = {
 }  # fmt: skip  # where the name differs
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
-    "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
+    "after": RECORDING, "by": "COLUMN", "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
     "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME", "family": "FAMILY.json",
     "fit_map": "MAP", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",

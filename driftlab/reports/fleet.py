@@ -46,6 +46,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         outcome=worst([row for of_unit in limits for row in of_unit]),
         verdict=_headline(line, odd, len(done)),
         use=_use(line, odd),
+        yields=overview.yields,
         called=figure_name,
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=_numbers(records),

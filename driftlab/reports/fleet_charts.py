@@ -16,6 +16,7 @@ from driftlab.family.record import UnitRecord
 from driftlab.reports.charts import SERIES, Chart, Line, Panel, axis_panels, series
 from driftlab.reports.line_charts import SHARES
 from driftlab.spc.charts import LineReport
+from driftlab.spc.yields import Yield
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
@@ -87,6 +88,7 @@ class FleetOverview:
         Units' pages, relative to this one.
     remarks : sequence of str
         What else should be known.
+    yields : Yield or None
     """
 
     title: str
@@ -101,6 +103,7 @@ class FleetOverview:
     effects: Sequence[SharedEffectRow] = ()
     links: Mapping[str, str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
+    yields: Yield | None = None
 
 
 def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:
