@@ -194,6 +194,7 @@ class _Command:
                 row.as_json(analysis.line.shown(row.quantity).si, analysis.line.units[row.since])
                 for row in analysis.line.capability
             ],
+            charts=[chart.as_json(analysis.line) for chart in analysis.line.controls],
         )  # fmt: skip
         return self._mark(complete=True, key=key, family=family, pages=pages)
 

@@ -96,7 +96,8 @@ MAX_PAGES = 20  # pages of units that stand out and were not asked for
 class FamilySummary(BaseModel):
     """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
 
-    `alarms` are why units are out of control, by frozen limits and run rules; `capability` has the indices.
+    `alarms` are why units are out of control, by frozen limits and run rules; `capability` has the indices, `charts`
+    limits, changes and lots of each chart.
     """
 
     units: int
@@ -106,6 +107,7 @@ class FamilySummary(BaseModel):
     line: list[str] = []
     alarms: dict[str, list[str]] = {}
     capability: list[dict[str, Any]] = []
+    charts: list[dict[str, Any]] = []
     judged: bool = True
 
     def sentences(self) -> list[str]:

@@ -19,7 +19,7 @@ from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
 from driftlab.reports.fleet_charts import FleetOverview, map_charts
-from driftlab.reports.line_charts import control_charts, distributions, joint_charts, limit_charts
+from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
 from driftlab.spc.sentences import alarms, by_how_much, place
@@ -33,8 +33,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
     line, effects, records = overview.line, overview.effects, overview.records
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
-    failed = [record for record in records if record.state == "failed"]
-    done = [record for record in records if record.state == "done"]
+    failed, done = ([record for record in records if record.state == state] for state in ("failed", "done"))
     limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
     out = [*alarms(line).items()]
     write_page(
@@ -54,6 +53,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
             overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
         ),
         lots=distributions(line),
+        lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
         charts=[*joint_charts(line), *control_charts(line)],
         alarms=[(line.units[k], overview.links.get(line.units[k], ""), "; ".join(why)) for k, why in out[:LISTED]],
         alarms_count=len(out),

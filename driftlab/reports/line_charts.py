@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from driftlab.family.record import figure_name
 from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, without_spikes
-from driftlab.spc.capability import Capability
-from driftlab.spc.charts import ControlChart, LineReport
-from driftlab.units import number, rounded
+from driftlab.spc.capability import D2, Capability
+from driftlab.spc.charts import D4, ControlChart, LineReport
+from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
 
 NAMED = SERIES - 1  # units far off that a label names
 SHARES = (5, 25, 50, 75, 95)
 MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
+MAX_RANGES = 1000  # moving ranges of a panel, beside those beyond the limit
 MAX_LOTS = 60  # lots that are drawn: the latest
 MANY = 0.05  # share of the units that may lie beyond an axis
 LIMITS = 300  # points of a limit that differs from unit to unit
@@ -36,7 +37,9 @@ TITLES = {
 CAPTION = (
     "A point a unit; one far off stands at the edge, its value in the label. "
     "Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
-    "well. Dotted: limits of the EWMA. Broad: what is usual between the changes; shaded: where a change is, by 95 %."
+    "well. Dotted: limits of the EWMA. Broad: what is usual between the changes; shaded: where a change is, by 95 %. "
+    "Below, the moving range: how far a unit is from the one before it, in sigmas; of a line in control one in 110 is "
+    "beyond the limit."
 )
 
 
@@ -44,7 +47,7 @@ def control_charts(line: LineReport) -> list[Chart]:
     """Return the chart of each quantity; x is the place of the unit in the line, from 1."""
     result: list[Chart] = []
     for name, charts in _by_quantity(line).items():
-        panels = tuple(_panel(line, chart) for chart in charts)
+        panels = tuple(panel for chart in charts for panel in (_panel(line, chart), *_ranges(chart)))
         caption = "" if result else CAPTION  # once on a page
         result.append(Chart(panels, "unit", TITLES.get(name, name), caption, named="units-of-the-line"))
     return result
@@ -107,6 +110,25 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     names += f" and {len(cut) - NAMED} more" if len(cut) > NAMED else ""
     label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"
     return Panel(tuple(lines), label, shades, log=wide, span=span)
+
+
+def _ranges(chart: ControlChart) -> tuple[Panel, ...]:
+    """Return the panel of the moving ranges; none of a single unit."""
+    place, value = (chart.at[1:] + 1).astype(np.float64), chart.ranges
+    if not len(value):
+        return ()
+    out, top = value > D4, 2.5 * D4
+    few = np.unique(np.linspace(0, len(value) - 1, MAX_RANGES).astype(np.intp))
+    shown = np.array([rounded(v, 4) for v in np.minimum(value, top).tolist()], dtype=np.float64)
+    ends = (chart.at[[0, -1]] + 1).astype(np.float64)  # as wide as the values above
+    lines = (
+        Line(place[few], shown[few], "moving range", "data"),
+        Line(place[out], shown[out], "beyond three sigma", "alarm", style="points"),
+        Line(ends, np.full(2, D2), "usual", "reference"),
+        Line(ends, np.full(2, D4), "limit of the moving range", "limit", style="dashed"),
+    )
+    label = f"moving range, {figure_name(chart.quantity)} {chart.axis} [sigma]"
+    return (Panel(lines, label, height=0.45, span=(0.0, max(1.1 * D4, float(np.max(shown))))),)
 
 
 def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tuple[float, float]:
@@ -172,9 +194,51 @@ def distributions(line: LineReport) -> list[dict[str, Any]]:
                 "scale": [[number(end * unit.factor, zeros=True) for end in span] for span in spans],
                 "rows": [(lot, [by_lot.get(lot) for by_lot in boxes]) for lot in lots[-MAX_LOTS:]],
                 "left_out": max(len(lots) - MAX_LOTS, 0),
+                "chart": lot_chart(line, name, lots[-MAX_LOTS:]),
             }
         )
     return result
+
+
+def lot_chart(line: LineReport, name: str, lots: list[str]) -> Chart:
+    """Return the X-bar-S chart of a quantity: mean and deviation of each lot, two panels an axis."""
+    unit, panels = line.shown(name), list[Panel]()
+    for chart in _by_quantity(line)[name]:
+        at = {lot: k + 1.0 for k, lot in enumerate(lots)}
+        points = [point for point in chart.lots if point.name in at]
+        if not points:
+            continue
+        x = np.array([at[point.name] for point in points])
+        called = f"{figure_name(name)} {chart.axis}"
+        mean = np.array([(point.mean, point.low, point.high) for point in points]).T * unit.factor
+        out = np.array([point.out for point in points])
+        panels.append(Panel(_points(x, mean, out), f"mean, {called} [{unit.shown}]", height=0.7))
+        factor, of = _deviation_unit(chart.scale.name, unit)
+        s = np.array([(point.deviation, point.deviation_low, point.deviation_high) for point in points]).T * factor
+        uneven, known = np.array([point.uneven for point in points]), np.isfinite(s[0])
+        if np.any(known):
+            panels.append(
+                Panel(_points(x[known], s[:, known], uneven[known]), f"deviation, {called} [{of}]", height=0.7)
+            )
+    return Chart(tuple(panels), "lot", f"{TITLES.get(name, name)}, X-bar-S by lot", named="lots-of-the-line")
+
+
+def _deviation_unit(scale: str, unit: BiasUnit) -> tuple[float, str]:
+    """Return the factor and the unit in which deviations in a scale are shown."""
+    if scale == "log":
+        return 100.0, "% of the value"
+    return (float(np.sqrt(unit.factor)), f"sqrt({unit.shown})") if scale == "sqrt" else (unit.factor, unit.shown)
+
+
+def _points(x: Array, values: Array, out: NDArray[np.bool_]) -> tuple[Line, ...]:
+    value, low, high = np.array([[rounded(v, 4) for v in row] for row in values.tolist()])
+    return (
+        Line(x, value, "lot", "data"),
+        Line(x, value, "lot", "data", style="points"),
+        Line(x[out], value[out], "beyond the limits of so many units", "alarm", style="points"),
+        Line(x, low, "limits of so many units", "limit", style="dashed"),
+        Line(x, high, "limits of so many units", "limit", style="dashed"),
+    )
 
 
 def _lot_span(chart: ControlChart) -> tuple[float, float]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from driftlab.family.baseline import Baseline, ScaleName
 from driftlab.family.record import PER
 from driftlab.spc.capability import D2, Capability
+from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
@@ -70,18 +72,6 @@ class Trend:
 
     before: float
     after: float
-
-
-@dataclass(frozen=True)
-class LotPoint:
-    """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
-
-    name: str
-    n: int
-    mean: float
-    low: float
-    high: float
-    out: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +137,30 @@ class ControlChart:
     trend: Trend | None = None
     patterns: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     of_family: bool = False
+
+    @property
+    def ranges(self) -> Array:
+        """Moving ranges (m - 1,) of each unit and the one before it, in sigmas: D2 is usual, D4 the limit."""
+        return np.abs(np.diff(self.z))
+
+    def as_json(self, line: LineReport) -> dict[str, Any]:
+        """Return limits, alarms, changes and lots as `fleet.json` has them; in SI, ranges in sigmas."""
+        names, usual = line.units, (float(np.median(self.low)), float(np.median(self.high)))
+        changes = [
+            {
+                "unit": names[step.at], "unit_95": [names[step.low], names[step.high]], "before": step.before,
+                "after": step.after, "p": step.p, "lot": step.of_lot or None,
+            }
+            for step in self.changes
+        ]  # fmt: skip
+        return {
+            "quantity": self.quantity, "axis": self.axis, "unit": self.unit, "units": len(self.at),
+            "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre, "low": usual[0],
+            "high": usual[1], "beyond": int(np.sum(self.beyond)), "ewma_beyond": int(np.sum(self.drifting)),
+            "moving_range": {"usual": D2, "limit": D4, "beyond": int(np.sum(self.ranges > D4))},
+            "changes": changes, "trend": None if self.trend is None else vars(self.trend),
+            "lots": [lot.as_json() for lot in self.lots if lot.name],
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

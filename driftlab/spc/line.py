@@ -34,7 +34,6 @@ from driftlab.spc.charts import (
     ControlChart,
     InControl,
     LineReport,
-    LotPoint,
     StepChange,
     Trend,
     TSquaredChart,
@@ -48,6 +47,7 @@ from driftlab.spc.charts import (
 )
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import sentences
+from driftlab.spc.subgroups import LotPoint, lots_of
 from driftlab.units import BiasUnit, default_unit
 from fusion_core.chunk import Array
 
@@ -112,13 +112,13 @@ def _control(
     """Return the chart of values and deviations (2, n) of a quantity of axis k."""
     values, sigmas = figures
     at = np.flatnonzero(np.isfinite(values))
-    value = values[at]
+    value, lots = values[at], np.array(line.lots, dtype=np.str_)[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
     usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at], usual)
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
-    level_steps = _steps(x, whole, alpha, _runs([line.lots[place] for place in at]))
+    level_steps = _steps(x, whole, alpha, _runs(lots.tolist()))
     trend = _trend(x, whole, level_steps, scale)
     level_steps = level_steps if trend is None else []
     edges = [0, *(step.at for step in level_steps), len(x)]
@@ -135,14 +135,14 @@ def _control(
         return scale.back(law.centre + sigma * (z if known is None else known.deviations(z)))
 
     three = np.full(len(z), SIGMAS)
-
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
         centre=float(scale.back(np.array(law.centre))), low=back(-three, sigma), high=back(three, sigma),
         ewma=back(w, middle), ewma_low=back(-reach, middle), ewma_high=back(reach, middle),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
-        changes=_changes(level_steps, stretches, x, sigma, scale, at), lots=_lots(line, at, x, sigma, law, scale),
+        changes=_changes(level_steps, stretches, x, sigma, scale, at),
+        lots=_lots(lots, x, sigma, law, scale, known=known is not None),
         trend=trend, z=z, law=law, patterns={rule: alarms(z) for rule, alarms in rules.items()},
         of_family=known is not None,
     )  # fmt: skip
@@ -286,18 +286,13 @@ def _changes(
 
 
 def _lots(
-    line: LineReport, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: ChartScale
+    names: NDArray[np.str_], x: Array, sigma: Array, law: InControl, scale: ChartScale, *, known: bool
 ) -> tuple[LotPoint, ...]:
-    names = np.array(line.lots)[at]
     points = []
-    for name in dict.fromkeys(names.tolist()):
-        own = names == name
-        weight = 1 / sigma[own] ** 2
-        z = np.clip((x[own] - np.median(x[own])) / sigma[own], -SIGMAS, SIGMAS)
-        mean = float(np.median(x[own]) + np.sum(weight * z * sigma[own]) / np.sum(weight))
-        reach = SIGMAS / float(np.sqrt(np.sum(weight)))
-        value, low, high = scale.back(np.array([mean, law.centre - reach, law.centre + reach])).tolist()
-        points.append(LotPoint(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
+    for name, of_lot in lots_of(names, x - law.centre, sigma, float(np.median(sigma)) if known else None):
+        mean, low, high = scale.back(law.centre + of_lot[1:4]).tolist()
+        out = bool(not of_lot[2] <= of_lot[1] <= of_lot[3])
+        points.append(LotPoint(name, int(of_lot[0]), mean, low, high, out, *of_lot[4:].tolist()))
     return tuple(points)
 
 
