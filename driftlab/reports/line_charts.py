@@ -25,6 +25,7 @@ MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even
 MAX_RANGES = 1000  # moving ranges of a panel, beside those beyond the limit
 MAX_LOTS = 60  # lots that are drawn: the latest
 MANY = 0.05  # share of the units that may lie beyond an axis
+CURVE = 20  # points of a trend
 LIMITS = 300  # points of a limit that differs from unit to unit
 TITLES = {
     "residual": "Residual of the map, rms of 30 s averages",
@@ -152,6 +153,10 @@ def _drawn(chart: ControlChart) -> NDArray[np.intp]:
 
 def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:
     """Return the usual level of each stretch; of a line without a change, the middle that the limits stand on."""
+    if chart.trend is not None:
+        first, last = chart.scale.to(np.array([chart.trend.before, chart.trend.after])).tolist()
+        level = chart.scale.back(np.linspace(first, last, CURVE))
+        return [Line(np.linspace(chart.at[0] + 1.0, chart.at[-1] + 1.0, CURVE), shown(level), "usual", "reference")]
     starts = [float(chart.at[0] + 1), *(change.at + 1.0 for change in chart.changes)]
     stops = [*(start - 1.0 for start in starts[1:]), float(chart.at[-1] + 1)]
     first = chart.changes[0].before if chart.changes else chart.centre
