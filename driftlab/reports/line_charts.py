@@ -334,7 +334,8 @@ def _against(chart: ControlChart, row: Capability, edges: Array, factor: float, 
     mean, sd = float(np.mean(x)), float(np.std(x, ddof=1))
     called = f"{figure_name(chart.quantity)} {chart.axis}"
     out = chart.value[(chart.value < edges[0]) | (chart.value > edges[-1])] * factor
-    beyond = f"; beyond the axis: {len(out):,}, {np.min(out):.3g} to {np.max(out):.3g}" if len(out) else ""
+    ends = dict.fromkeys(f"{end(out):.3g}" for end in (np.min, np.max) if len(out))
+    beyond = f"; beyond the axis: {len(out):,} at {' to '.join(ends)}" if ends else ""
     bars = [_bars(chart.value, edges, factor, "all units", "data")]
     if row.since:
         bars.append(_bars(now, edges, factor, "since the last change", "estimate"))

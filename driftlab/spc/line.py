@@ -291,13 +291,13 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
                 continue
             x = chart.scale.to(chart.value[part])
             n, beyond = len(x), int(np.sum(chart.value[part] > limit))
-            normal, why_not = why_no_index(x, far_out(x))
             limit_x = float(chart.scale.to(np.array(limit)))
+            normal, why_not = why_no_index(x, far_out(x), limit_x)
             found = (np.nan,) * 6 if why_not else indices(x, limit_x)
             rows.append(
                 Capability(
                     chart.quantity, chart.axis, limit, n, since, *found, beyond, *share_beyond(beyond, n),
-                    chart.scale.name, normal, why_not,
+                    chart.scale.name, normal, why_not, chart.trend is not None,
                 )
             )  # fmt: skip
     return tuple(rows)

@@ -220,5 +220,6 @@ def _limits(line: LineReport) -> list[str]:
             f"no index of {', '.join(axis for axis in why if why[axis] == reason)}: {reason}"
             for reason in dict.fromkeys(why.values())
         )
+        text += ", of a line with a trend" * (worst.trend and worst.trusted)
         lines.append(f"{text}{'; ' * bool(reasons)}{reasons}.")
     return lines

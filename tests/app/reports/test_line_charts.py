@@ -96,7 +96,7 @@ def test_units_since_a_change_have_bars_and_a_plot_of_their_own():
 
 def test_values_far_off_leave_the_bins_to_the_others_and_are_counted():
     (x, *_), (plot, *_), _ = panels(line(100, 4, planted=[("noise", "x", 50, 51, 40.0)]))
-    assert "; beyond the axis: 1, " in x.label
+    assert "; beyond the axis: 1 at " in x.label
     assert np.sum(named(x, "all units").y[::2]) == 99
     assert max(named(plot, "unit").x) < 5
 
