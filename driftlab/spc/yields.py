@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -110,7 +111,7 @@ class Yield:
         if not whole.reasons:
             return []
         first = ", ".join(f"{reason} {count:,}" for reason, count in [*whole.reasons.items()][:3])
-        more = f" and {len(whole.reasons) - 3:,} more reasons" if len(whole.reasons) > 3 else ""
+        more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
         lines = [f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}; not accepted: {first}{more}"]
         for column, groups in self.by.items():
             if self.differs(column):
@@ -132,9 +133,9 @@ def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iter
     why = [reasons(record) for record in records]
     stands_out = {record.unit for record in records}.intersection(odd)
     whole = _group("", [*zip(records, why, strict=True)], stands_out)
-    covered = tuple(
-        sum(not set(one).isdisjoint([*whole.reasons][: k + 1]) for one in why) for k in range(len(whole.reasons))
-    )
+    place = {reason: k for k, reason in enumerate(whole.reasons)}
+    first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
+    covered = tuple(accumulate(first[k] for k in place.values()))
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
         parts: dict[str, list[tuple[UnitRecord, list[str]]]] = {}

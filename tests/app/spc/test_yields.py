@@ -72,6 +72,14 @@ def test_groups_by_a_column_of_the_manifest_and_of_the_table():
     assert (said["units"], said["accepted"], said["judged"]) == (20, 14, True)
 
 
+def test_a_million_reasons_take_no_square_of_time():
+    units = [unit(k, error=f"{chr(97 + k % 26)}{chr(97 + k // 26)} is broken") for k in range(676)] * 20
+    found = yields_of(units)
+    assert len(found.whole.reasons) == 676
+    assert found.covered[:2] == (20, 40)
+    assert found.covered[-1] == len(units) == found.whole.units
+
+
 def test_many_numbers_are_told_in_quarters():
     units = [unit(k, "pass" if k < 60 else "fail", torque=f"{k / 10}") for k in range(80)]
     found = yields_of(units, by=["torque", "hours"])
