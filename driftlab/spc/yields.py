@@ -31,6 +31,7 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
     "hours": lambda record: f"{record.hours:g}" if record.hours else "",
 }
 """Columns of the units' table by which a line is told, beside those of the manifest itself."""
+UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
 SAID = {"fail": "above limit", "undecided": "undecided", "not measured": "not measured"}
 NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
@@ -92,6 +93,10 @@ class Yield:
     def differs(self, column: str) -> bool:
         """Return True if the yield differs between the groups of a column by more than chance."""
         return self.p[column] < ALPHA / len(self.p)
+
+    def titled(self, column: str) -> str:
+        """Return the name of a column with its unit."""
+        return f"{column} [{UNITS[column]}]" if column in UNITS else column
 
     def said(self, column: str) -> str:
         """Return the probability in words: `p = 0.02`."""

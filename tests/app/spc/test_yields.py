@@ -88,6 +88,7 @@ def test_many_numbers_are_told_in_quarters():
     ]  # fmt: skip
     assert [one.units for one in found.by["hours"]] == [80]
     assert found.p["hours"] == 1.0
+    assert (found.titled("hours"), found.titled("torque")) == ("hours [h]", "torque")
     with_names = [unit(k, "pass", bench=f"{k}" if k else "none") for k in range(40)]
     assert len(yields_of(with_names, by=["bench"]).by["bench"]) == 40  # names, not numbers
 
