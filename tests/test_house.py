@@ -254,7 +254,7 @@ BUDGET = {
     "driftlab/recordings": 454,
     "driftlab/reports": 3162,
     "driftlab/soak": 658,
-    "driftlab/spc": 1162,
+    "driftlab/spc": 1170,
     "driftlab/starter": 796,
     "driftlab/storage": 1239,
     "driftlab/triad": 726,

@@ -43,6 +43,7 @@ SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by
 RESEMBLING = 2.0  # deviations (1 / sqrt(n)) of an autocorrelation beyond which it is not chance
 MOST = 0.95  # autocorrelation: what is nearer to 1 is a wandering line
 FAR = 3.0  # sigmas to which a residual counts
+PLACES = 50  # of a step, that are compared
 PHI = np.linspace(0.0, MOST, 96)
 
 Index = NDArray[np.intp]
@@ -132,7 +133,8 @@ def _levels(x: Array, sigma: Array, found: Sequence[LevelStep]) -> Array:
     edges = [0, *(step.at for step in found), len(x)]
     for k, step in enumerate(found, 1):
         start, stop = edges[k - 1], edges[k + 1]
-        some = range(max(step.low, start + SHORTEST), min(step.high, stop - SHORTEST) + 1)
+        ends = max(step.low, start + SHORTEST), min(step.high, stop - SHORTEST)
+        some = sorted({*np.linspace(*ends, PLACES).astype(int).tolist(), step.at}) if ends[0] <= ends[1] else []
         fits = {at: np.concatenate([_level(x[start:at]), _level(x[at:stop])]) for at in some}
         part = slice(start, stop)
         edges[k] = min(

@@ -7,6 +7,7 @@ import pytest
 from lines import TYPICAL, record
 from scipy import stats
 
+from driftlab.spc import yields
 from driftlab.spc.yields import ALPHA, chance, reasons, yields_of
 
 
@@ -109,6 +110,15 @@ def test_the_chance_of_a_difference_is_the_hypergeometric_one_for_two_groups(uni
     k = np.arange(max(0, a + b - m), min(n, a + b) + 1)
     far = np.abs(k - (a + b) * n / (n + m)) >= abs(a - (a + b) * n / (n + m)) - 1e-9
     assert chance(units, accepted) == pytest.approx(np.sum(law.pmf(k)[far]), abs=0.015)
+
+
+def test_of_many_groups_there_are_fewer_draws_in_parts(monkeypatch):
+    units = np.full(60, 20)
+    accepted = np.random.default_rng(1).binomial(20, 0.9, size=60)
+    whole = chance(units, accepted)
+    monkeypatch.setattr(yields, "CELLS", 30_000)  # as of 20,000 groups
+    assert chance(units, accepted) == pytest.approx(whole, abs=0.05)
+    assert chance(units, np.where(np.arange(60) < 6, 0, 20)) == pytest.approx(1e-3)  # of 999
 
 
 def test_lines_without_a_difference_say_one_in_twenty_times():
