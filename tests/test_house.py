@@ -252,7 +252,7 @@ BUDGET = {
     "driftlab/production": 2363,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
-    "driftlab/reports": 3162,
+    "driftlab/reports": 3163,
     "driftlab/soak": 658,
     "driftlab/spc": 1170,
     "driftlab/starter": 796,

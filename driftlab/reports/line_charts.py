@@ -276,6 +276,7 @@ AGAINST = (
 WIDE = 5.0  # largest value over the smallest, from which on x is logarithmic where the scale is
 SCORES = 400  # points of a probability plot: all ends, and an even sample of the middle
 ENDS = 50  # of them on either side
+LAW = 80  # points of the law over a histogram
 BINS = (8, 60)  # of a histogram, at least and at most
 
 
@@ -340,11 +341,11 @@ def _against(chart: ControlChart, row: Capability, edges: Array, factor: float, 
     if row.since:
         bars.append(_bars(now, edges, factor, "since the last change", "estimate"))
     if row.trusted:
-        share = np.diff(ndtr((chart.scale.to(np.maximum(edges, 1e-300)) - mean) / sd))
-        middle = np.concatenate([edges[:1], (edges[1:] + edges[:-1]) / 2, edges[-1:]])
-        bars.append(
-            Line(middle * factor, len(x) * np.concatenate([share[:1], share, share[-1:]]), "normal law", "sigma")
-        )
+        middle = np.interp(np.linspace(0.5, len(edges) - 1.5, LAW), np.arange(len(edges)), edges)  # of bins anywhere
+        places = np.interp(middle, edges, np.arange(len(edges)))
+        sides = (np.interp(places + half, np.arange(len(edges)), edges) for half in (-0.5, 0.5))
+        low, high = (ndtr((chart.scale.to(np.maximum(end, 1e-300)) - mean) / sd) for end in sides)
+        bars.append(Line(middle * factor, len(x) * (high - low), "normal law", "sigma"))
     p = "p < 0.0001" if row.normal < 1e-4 else f"p = {row.normal:.2g}"
     plot = Panel(
         _plot(chart, now, edges, factor, "estimate" if row.since else "data"),
