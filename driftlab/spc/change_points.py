@@ -34,6 +34,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.spc.charts import huber
 from fusion_core.chunk import Array
 
 SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
@@ -122,8 +123,6 @@ def course_of(x: Array, sigma: Array, alpha: float, blocks: Iterable[tuple[int, 
 
 def _line(x: Array, sigma: Array) -> Array:
     """Return the straight line (n,) through values x (n,) that no single odd one moves."""
-    from driftlab.spc.charts import huber
-
     X = np.column_stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))])
     return X @ huber(X, x, sigma, np.array([np.median(x), 0.0]))
 
