@@ -63,13 +63,13 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         effects=effects,
         odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
         odd_count=odd,
-        first=FIRST,
+        first=FIRST, listed=LISTED,
         failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
         failed_count=len(failed),
         left_out=len(records) - len(table["unit"]),
         names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
         table=embedded(table),
-    )
+    )  # fmt: skip
 
 
 def _lead(units: int, failed: int, odd: int, effects: int) -> str:

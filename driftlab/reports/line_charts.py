@@ -25,6 +25,7 @@ MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even
 MAX_RANGES = 1000  # moving ranges of a panel, beside those beyond the limit
 MAX_LOTS = 60  # lots that are drawn: the latest
 MANY = 0.05  # share of the units that may lie beyond an axis
+CURVE = 20  # points of a trend
 LIMITS = 300  # points of a limit that differs from unit to unit
 TITLES = {
     "residual": "Residual of the map, rms of 30 s averages",
@@ -152,6 +153,10 @@ def _drawn(chart: ControlChart) -> NDArray[np.intp]:
 
 def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:
     """Return the usual level of each stretch; of a line without a change, the middle that the limits stand on."""
+    if chart.trend is not None:
+        first, last = chart.scale.to(np.array([chart.trend.before, chart.trend.after])).tolist()
+        level = chart.scale.back(np.linspace(first, last, CURVE))
+        return [Line(np.linspace(chart.at[0] + 1.0, chart.at[-1] + 1.0, CURVE), shown(level), "usual", "reference")]
     starts = [float(chart.at[0] + 1), *(change.at + 1.0 for change in chart.changes)]
     stops = [*(start - 1.0 for start in starts[1:]), float(chart.at[-1] + 1)]
     first = chart.changes[0].before if chart.changes else chart.centre
@@ -271,6 +276,7 @@ AGAINST = (
 WIDE = 5.0  # largest value over the smallest, from which on x is logarithmic where the scale is
 SCORES = 400  # points of a probability plot: all ends, and an even sample of the middle
 ENDS = 50  # of them on either side
+LAW = 80  # points of the law over a histogram
 BINS = (8, 60)  # of a histogram, at least and at most
 
 
@@ -329,16 +335,17 @@ def _against(chart: ControlChart, row: Capability, edges: Array, factor: float, 
     mean, sd = float(np.mean(x)), float(np.std(x, ddof=1))
     called = f"{figure_name(chart.quantity)} {chart.axis}"
     out = chart.value[(chart.value < edges[0]) | (chart.value > edges[-1])] * factor
-    beyond = f"; beyond the axis: {len(out):,}, {np.min(out):.3g} to {np.max(out):.3g}" if len(out) else ""
+    ends = dict.fromkeys(f"{end(out):.3g}" for end in (np.min, np.max) if len(out))
+    beyond = f"; beyond the axis: {len(out):,} at {' to '.join(ends)}" if ends else ""
     bars = [_bars(chart.value, edges, factor, "all units", "data")]
     if row.since:
         bars.append(_bars(now, edges, factor, "since the last change", "estimate"))
     if row.trusted:
-        share = np.diff(ndtr((chart.scale.to(np.maximum(edges, 1e-300)) - mean) / sd))
-        middle = np.concatenate([edges[:1], (edges[1:] + edges[:-1]) / 2, edges[-1:]])
-        bars.append(
-            Line(middle * factor, len(x) * np.concatenate([share[:1], share, share[-1:]]), "normal law", "sigma")
-        )
+        middle = np.interp(np.linspace(0.5, len(edges) - 1.5, LAW), np.arange(len(edges)), edges)  # of bins anywhere
+        places = np.interp(middle, edges, np.arange(len(edges)))
+        sides = (np.interp(places + half, np.arange(len(edges)), edges) for half in (-0.5, 0.5))
+        low, high = (ndtr((chart.scale.to(np.maximum(end, 1e-300)) - mean) / sd) for end in sides)
+        bars.append(Line(middle * factor, len(x) * (high - low), "normal law", "sigma"))
     p = "p < 0.0001" if row.normal < 1e-4 else f"p = {row.normal:.2g}"
     plot = Panel(
         _plot(chart, now, edges, factor, "estimate" if row.since else "data"),

@@ -60,6 +60,8 @@ class Capability:
         p-value of the Anderson-Darling test in that scale.
     why_not : str
         Reason for which there is no index; empty where there is one.
+    trend : bool
+        Whether the line has a trend: the indices are of no steady line.
     """
 
     quantity: str
@@ -79,6 +81,7 @@ class Capability:
     scale: str
     normal: float
     why_not: str = ""
+    trend: bool = False
 
     @property
     def trusted(self) -> bool:
@@ -97,6 +100,7 @@ class Capability:
             "since": first, **index("cpk"), **index("ppk"), "above": self.beyond,
             "share_above_95": [self.share_low, self.share_high], "scale": self.scale,
             "anderson_darling_p": self.normal, "why_not": self.why_not or None,
+            "trend": self.trend,
         }  # fmt: skip
 
 
@@ -115,10 +119,10 @@ def _with_interval(index: float, n: int, nu: float) -> tuple[float, float, float
     return index, float(low), float(high)
 
 
-def why_no_index(x: Array, odd: NDArray[np.bool_]) -> tuple[float, str]:
+def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float) -> tuple[float, str]:
     """Return the p-value of normality of values x (n,), and why there is no index of them; empty where there is.
 
-    `odd` (n,) marks values so far out that they may be the reason by themselves.
+    `odd` (n,) marks values so far out that they may be the reason by themselves: Ppk of the others is said then.
     """
     n = len(x)
     if np.ptp(x) == 0:
@@ -132,7 +136,8 @@ def why_no_index(x: Array, odd: NDArray[np.bool_]) -> tuple[float, str]:
     rest, count = x[~odd], int(np.sum(odd))
     if count and len(rest) >= ENOUGH and np.ptp(rest) > 0 and (without := anderson_darling(rest)[1]) >= NORMAL:
         far = "1 unit that is" if count == 1 else f"{count:,} units that are"
-        why += f", by {far} far out: p = {without:.2g} of the others"
+        ppk, low, high = indices(rest, limit)[3:]
+        why += f", by {far} far out; of the others p = {without:.2g}, Ppk {ppk:.2f} ({low:.2f} to {high:.2f})"
     return p, why
 
 

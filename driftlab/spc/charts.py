@@ -110,6 +110,8 @@ class ControlChart:
         Where a straight line fits better than steps; then there are no changes.
     patterns : mapping of str to (m,) bool array
         Alarms of the run rules that were asked for, by rule.
+    phi : float
+        Autocorrelation of neighbouring units about the line's course, 0 where it may be chance.
     of_family : bool
         Whether centre and limits are those of a family that was known.
     """
@@ -136,6 +138,7 @@ class ControlChart:
     law: InControl
     trend: Trend | None = None
     patterns: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    phi: float = 0.0
     of_family: bool = False
 
     @property
@@ -158,7 +161,7 @@ class ControlChart:
             "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre, "low": usual[0],
             "high": usual[1], "beyond": int(np.sum(self.beyond)), "ewma_beyond": int(np.sum(self.drifting)),
             "moving_range": {"usual": D2, "limit": D4, "beyond": int(np.sum(self.ranges > D4))},
-            "changes": changes, "trend": None if self.trend is None else vars(self.trend),
+            "autocorrelation": self.phi, "changes": changes, "trend": None if self.trend is None else vars(self.trend),
             "lots": [lot.as_json() for lot in self.lots if lot.name],
         }  # fmt: skip
 

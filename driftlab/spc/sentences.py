@@ -42,6 +42,7 @@ def sentences(line: LineReport) -> list[str]:
 
 MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
 NAMED = 5  # units that a sentence names
+ALIKE = 0.3  # autocorrelation from which on limits by neighbours are too narrow by a fifth
 
 
 def alarms(line: LineReport) -> dict[int, list[str]]:
@@ -172,6 +173,13 @@ def _now(line: LineReport) -> list[str]:
     lines.append(
         f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
     )
+    alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
+    if alike:
+        more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
+        lines.append(
+            f"Units resemble those before them (autocorrelation: {', '.join(alike[:NAMED])}{more}): changes are told "
+            "beyond that, and limits by neighbours alarm more often than they say."
+        )
     if line.too_few:
         lines.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
     return lines
@@ -212,5 +220,6 @@ def _limits(line: LineReport) -> list[str]:
             f"no index of {', '.join(axis for axis in why if why[axis] == reason)}: {reason}"
             for reason in dict.fromkeys(why.values())
         )
+        text += ", of a line with a trend" * (worst.trend and worst.trusted)
         lines.append(f"{text}{'; ' * bool(reasons)}{reasons}.")
     return lines

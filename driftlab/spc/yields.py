@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,12 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
     "hours": lambda record: f"{record.hours:g}" if record.hours else "",
 }
 """Columns of the units' table by which a line is told, beside those of the manifest itself."""
+UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
 SAID = {"fail": "above limit", "undecided": "undecided", "not measured": "not measured"}
 NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
 DRAWS = 9999  # permutations
+CELLS = 10_000_000  # groups of all draws
 ALPHA = 0.05  # chance, over all columns, that a yield is said to differ where it does not
 
 
@@ -92,6 +95,10 @@ class Yield:
         """Return True if the yield differs between the groups of a column by more than chance."""
         return self.p[column] < ALPHA / len(self.p)
 
+    def titled(self, column: str) -> str:
+        """Return the name of a column with its unit."""
+        return f"{column} [{UNITS[column]}]" if column in UNITS else column
+
     def said(self, column: str) -> str:
         """Return the probability in words: `p = 0.02`."""
         return "p ≤ 0.0001" if self.p[column] <= 1e-4 else f"p = {self.p[column]:.2g}"
@@ -110,7 +117,7 @@ class Yield:
         if not whole.reasons:
             return []
         first = ", ".join(f"{reason} {count:,}" for reason, count in [*whole.reasons.items()][:3])
-        more = f" and {len(whole.reasons) - 3:,} more reasons" if len(whole.reasons) > 3 else ""
+        more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
         lines = [f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}; not accepted: {first}{more}"]
         for column, groups in self.by.items():
             if self.differs(column):
@@ -132,9 +139,9 @@ def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iter
     why = [reasons(record) for record in records]
     stands_out = {record.unit for record in records}.intersection(odd)
     whole = _group("", [*zip(records, why, strict=True)], stands_out)
-    covered = tuple(
-        sum(not set(one).isdisjoint([*whole.reasons][: k + 1]) for one in why) for k in range(len(whole.reasons))
-    )
+    place = {reason: k for k, reason in enumerate(whole.reasons)}
+    first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
+    covered = tuple(accumulate(first[k] for k in place.values()))
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
         parts: dict[str, list[tuple[UnitRecord, list[str]]]] = {}
@@ -200,12 +207,17 @@ def _number(text: str) -> float:
 def chance(units: Sequence[int], accepted: Sequence[int]) -> float:
     """Return the probability of shares that differ so much between groups, were those accepted dealt out by chance.
 
-    By 9,999 draws of them, so at least 1e-4.
+    By 9,999 draws of them, so at least 1e-4; of more than a thousand groups by fewer, at least 999.
     """
     n, got = np.array(units, dtype=np.int64), np.array(accepted, dtype=np.int64)
     share = np.sum(got) / np.sum(n)
     if len(n) < 2 or share in (0.0, 1.0):
         return 1.0
-    draws = np.random.default_rng(0).multivariate_hypergeometric(n, int(np.sum(got)), size=DRAWS, method="marginals")
-    seen, by_chance = (np.sum((one - n * share) ** 2 / n, axis=-1) for one in (got, draws))
-    return float((1 + np.sum(by_chance >= seen * (1 - 1e-9))) / (1 + DRAWS))
+    rng, left, draws, above = np.random.default_rng(0), max(min(DRAWS, CELLS // len(n)), 999), 0, 0
+    seen = np.sum((got - n * share) ** 2 / n) * (1 - 1e-9)
+    while draws < left:
+        size = min(left - draws, max(CELLS // (10 * len(n)), 1))
+        dealt = rng.multivariate_hypergeometric(n, int(np.sum(got)), size=size, method="marginals")
+        above += int(np.sum(np.sum((dealt - n * share) ** 2 / n, axis=-1) >= seen))
+        draws += size
+    return (1 + above) / (1 + draws)

@@ -17,6 +17,7 @@ from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, percentiles
 from driftlab.reports.line_charts import control_charts
 from driftlab.spc.line import line_of
+from driftlab.spc.yields import yields_of
 from driftlab.units import RATE
 
 LIMITS = Limits.model_validate({"noise": "2.6 deg/h/sqrt(Hz)"})
@@ -215,6 +216,31 @@ def test_few_units_have_a_page(opened, tmp_path, count):
     shown = opened(path)
     assert shown.locator("figure.chart").count() == (13 if count == 10 else 1)  # of one unit no differences
     assert shown.locator("#count").inner_text() == f"{count} of {count} units"
+
+
+def test_yield_reasons_and_groups_are_on_the_page_and_fit_a_phone(opened, tmp_path):
+    found = fleet(300, failed=(7, 30), odd=(11, 45))
+    told = yields_of(found.records, found.odd, ["chamber", "lot", "date"])
+    path = tmp_path / "report.html"
+    write_fleet_report(path, replace(found, yields=told))
+    for width in (1100, 390):
+        shown = opened(path, width=width)
+        text = shown.locator("body").inner_text()
+        assert overflow(shown) == 0
+        assert f"{told.whole.accepted} of 300 units are accepted: {100 * told.whole.share:.3g} % (" in text
+        assert "noise above limit" in shown.locator(".pareto").inner_text()
+        counts = shown.eval_on_selector_all(".pareto tbody tr", "rows => rows.map((row) => row.cells[1].textContent)")
+        assert counts == [str(count) for count in told.whole.reasons.values()]
+        rows = shown.locator(".yields").first.locator("tbody tr").all_inner_texts()
+        assert [row.split()[:4] for row in rows] == [
+            [one.name, str(one.accepted), "of", str(one.units)] for one in told.by["chamber"]
+        ]
+        assert "The yield differs by lot (p ≤ 0.0001 by chance)" in text  # the noise has changed
+        assert "No difference by chamber is seen" in text
+        bar, stroke = (shown.locator(f".yields .track {tag}").first.bounding_box() for tag in "bu")
+        assert bar["x"] < stroke["x"] + 2 <= bar["x"] + bar["width"] + 4
+        assert shown.locator(".yields").last.locator("tbody tr").count() == 180  # of 300 days, 20 before them
+        assert "100 more are in fleet.json" in shown.locator("body").text_content()
 
 
 def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):

@@ -92,13 +92,25 @@ def test_there_is_no_index_of_what_is_not_normal_and_the_page_says_why():
     assert "units above (95 %: " in said
 
 
-def test_units_that_are_far_out_are_named_as_the_reason():
+def test_units_that_are_far_out_are_named_as_the_reason_with_the_index_of_the_others():
     records = line(200, 1, planted=[("noise", "x", 50, 52, 12.0)])
     x, y, _ = line_of(records, NOISE).capability
-    assert ", by 2 units that are far out: p = " in x.why_not
+    others = line_of([one for k, one in enumerate(records) if k not in (50, 51)], NOISE).capability[0]
+    assert others.trusted
+    said = f"Ppk {others.ppk:.2f} ({others.ppk_low:.2f} to {others.ppk_high:.2f})"
+    assert x.why_not.endswith(f", by 2 units that are far out; of the others p = {others.normal:.2g}, {said}")
+    assert np.isnan(x.ppk)
     assert y.trusted
     heavy = line(200, 4, law="heavy")
     assert any(row.why_not and "far out" not in row.why_not for row in line_of(heavy, NOISE).capability)
+
+
+def test_an_index_of_a_line_with_a_trend_says_so():
+    drift = [("noise", "x", k, k + 1, 4 * k / 200) for k in range(200)]
+    found = line_of(line(200, 1, planted=drift), NOISE)
+    assert [row.trend for row in found.capability] == [True, False, False]
+    assert found.capability[0].as_json("rad/s", "0000")["trend"]
+    assert ("of a line with a trend" in found.sentences[-1]) == found.capability[0].trusted
 
 
 @pytest.mark.parametrize("count", [ENOUGH - 1, ENOUGH])

@@ -7,6 +7,7 @@ import pytest
 from lines import TYPICAL, record
 from scipy import stats
 
+from driftlab.spc import yields
 from driftlab.spc.yields import ALPHA, chance, reasons, yields_of
 
 
@@ -72,6 +73,14 @@ def test_groups_by_a_column_of_the_manifest_and_of_the_table():
     assert (said["units"], said["accepted"], said["judged"]) == (20, 14, True)
 
 
+def test_a_million_reasons_take_no_square_of_time():
+    units = [unit(k, error=f"{chr(97 + k % 26)}{chr(97 + k // 26)} is broken") for k in range(676)] * 20
+    found = yields_of(units)
+    assert len(found.whole.reasons) == 676
+    assert found.covered[:2] == (20, 40)
+    assert found.covered[-1] == len(units) == found.whole.units
+
+
 def test_many_numbers_are_told_in_quarters():
     units = [unit(k, "pass" if k < 60 else "fail", torque=f"{k / 10}") for k in range(80)]
     found = yields_of(units, by=["torque", "hours"])
@@ -80,6 +89,7 @@ def test_many_numbers_are_told_in_quarters():
     ]  # fmt: skip
     assert [one.units for one in found.by["hours"]] == [80]
     assert found.p["hours"] == 1.0
+    assert (found.titled("hours"), found.titled("torque")) == ("hours [h]", "torque")
     with_names = [unit(k, "pass", bench=f"{k}" if k else "none") for k in range(40)]
     assert len(yields_of(with_names, by=["bench"]).by["bench"]) == 40  # names, not numbers
 
@@ -100,6 +110,15 @@ def test_the_chance_of_a_difference_is_the_hypergeometric_one_for_two_groups(uni
     k = np.arange(max(0, a + b - m), min(n, a + b) + 1)
     far = np.abs(k - (a + b) * n / (n + m)) >= abs(a - (a + b) * n / (n + m)) - 1e-9
     assert chance(units, accepted) == pytest.approx(np.sum(law.pmf(k)[far]), abs=0.015)
+
+
+def test_of_many_groups_there_are_fewer_draws_in_parts(monkeypatch):
+    units = np.full(60, 20)
+    accepted = np.random.default_rng(1).binomial(20, 0.9, size=60)
+    whole = chance(units, accepted)
+    monkeypatch.setattr(yields, "CELLS", 30_000)  # as of 20,000 groups
+    assert chance(units, accepted) == pytest.approx(whole, abs=0.05)
+    assert chance(units, np.where(np.arange(60) < 6, 0, 20)) == pytest.approx(1e-3)  # of 999
 
 
 def test_lines_without_a_difference_say_one_in_twenty_times():
