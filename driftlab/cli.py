@@ -93,7 +93,7 @@ COMMANDS = (
         "init",
         "reading",
         metavars={"out": "CONFIG"},
-        options={"go": Option("--go", "Run fit-map with it at once, and show its page."), "json": JSON},
+        options={"go": Option("--go", "Fit its map at once, name the map there, show its page."), "json": JSON},
     ),
     Command("export", "exporting", metavars={"out": "PATH"}),
     Command("vehicle", "fitting", defaults={"out": NEEDED}),

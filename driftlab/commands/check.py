@@ -54,6 +54,8 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
     if first is not None and understood.filter is not None:
         check_channels(understood.filter, first.chunk)
     remarks = [*_map_remarks(understood), *(() if first is None else first.lines)]
+    if understood.source is None:
+        remarks.append("source: is missing, so no recording can be read; `driftlab init FILE` writes that of a file")
     return CheckResult(understood, dict(quantities(understood)), tuple(remarks))
 
 

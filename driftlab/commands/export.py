@@ -198,7 +198,8 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             if exporter.folder:
                 written.mkdir()
             loss = exporter.export(what, written)
-            loss = replace(loss, left_out=(*loss.left_out, *_matrices(exporter.kind, what)))
+            if not exporter.holds_matrix:
+                loss = replace(loss, left_out=(*loss.left_out, *_matrices(exporter.kind, what)))
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
@@ -220,9 +221,9 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
 
 
 def _matrices(kind: str, what: Export) -> Iterator[str]:
-    """Yield the size of scale factor and misalignment over temperature, which no form of export holds."""
+    """Yield the size of scale factor and misalignment over temperature, which a form of export does not hold."""
     for sensor in what.sensors:
-        matrix = None if sensor.map is None else sensor.map.record.matrix
+        matrix = sensor.matrix
         if matrix is not None:
             M = np.max(np.abs(matrix.at(np.linspace(matrix.T[0], matrix.T[-1], 100))), axis=0)
             yield (

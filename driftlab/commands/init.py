@@ -314,19 +314,27 @@ def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
         return
     if given.get("go"):
         say(f"written to {result.path}; look at what is guessed. Now: driftlab fit-map {result.path}\n")
-        _fit(result.path or Path())
+        _fit(result)
     else:
         say(f"written to {result.path}; look at what is guessed, then: driftlab fit-map {result.path}\n")
 
 
-def _fit(path: Path) -> None:
-    """Fit the map of a config, print how good it is, and show its page."""
+def _fit(first: FirstConfig) -> None:
+    """Fit the map of a config, write it there, print how good it is, and show its page."""
     from driftlab.commands import fit_map  # with all that fits, which a first config does not need
 
-    options = {"select": False, "enforce_limits": False}
+    path, options = first.path or Path(), {"select": False, "enforce_limits": False}
     arguments = fit_map.arguments_of({"config": load(path), "compare": False, "certificate": False}, options)
     result = fit_map.fit_map(**arguments)
+    place = os.path.relpath(result.written[0], path.parent)
+    bare = first.text.rpartition("# ")[0]  # without its SHA-256
+    text = config_text.with_map(bare, result.map.record.kind, place)
+    if text != bare:
+        write_text(path, f"{text}# {seal_of(COMMAND)}\n", COMMAND)
+        result.config = load(path)
     fit_map.show(result, arguments)
+    if text != bare:
+        say(f"{path} names the map now; next: driftlab run {path}\n")
     page = result.written[1].resolve()
     say(f"the page: {page}\n")
     if sys.stdout.isatty():

@@ -41,11 +41,10 @@ FLAGS = {
 }  # fmt: skip  # where the name differs
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
-    "after": RECORDING, "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
+    "after": RECORDING, "by": "COLUMN", "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
     "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME",
-    "export": "px4|ardupilot", "family": "FAMILY.json",
-    "fit_map": "MAP", "heading": "ANGLE", "holdout": RECORDING, "hours": "H", "interval": "TIME", "lag": "TIME",
-    "latitude": "ANGLE", "out": "DIR",
+    "export": "px4|ardupilot", "family": "FAMILY.json", "fit_map": "MAP", "heading": "ANGLE", "holdout": RECORDING,
+    "hours": "H", "interval": "TIME", "lag": "TIME", "latitude": "ANGLE", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
     "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",

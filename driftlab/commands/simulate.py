@@ -187,7 +187,7 @@ def simulate(
     Returns
     -------
     SimulateResult
-        `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` for the other functions.
+        `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` is that of `run`.
 
     Raises
     ------

@@ -110,7 +110,11 @@ def fit_triad_map(
     wanted = np.zeros(len(TERMS), dtype=bool)
     for name in ("bias", *names):
         wanted[list(GROUPS[name])] = True
-    fit = fit_triad(gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted)
+    walk = (gathered.sensor.bias.as_random_walk() or {}).get("walk")
+    fit = fit_triad(
+        gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,
+        None if walk is None else float(np.max(walk)),
+    )  # fmt: skip
     fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
     result = TriadMapResult(own, gathered, fit, fitted, faults)
     if out is not None:

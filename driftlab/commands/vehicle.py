@@ -7,7 +7,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,7 +96,7 @@ class VehicleSensor:
         return f"{self.channel}{self.number}.map.json"
 
     def lines(self) -> list[str]:
-        """Return how good its map is, a sentence each, or why it has none."""
+        """Return the verdict on its map, a sentence each, or the reason why it has none."""
         of = f"{self.name}, device id {self.device}" if self.device else self.name
         sentences = self.result.verdict.sentences(self.result.unit) if self.result else [f"no map: {self.problem}"]
         return [f"{of}: {sentence}" for sentence in sentences]
@@ -221,26 +221,18 @@ def vehicle(
     exporter = exporter_of(form, {name: str(value) for name, value in (settings or {}).items()})
     site = {name: value for name, value in (("latitude", latitude), ("heading", heading)) if value is not None}
 
-    def made(folder: Path | None) -> VehicleResult:
-        found = _sensors(product, names, site)
-        sensors = tuple(_fitted(product, one, found, site, kind, progress) for one in found)
-        loss, problem = _exported(exporter, sensors, folder)
-        result = VehicleResult(product, sensors, loss, problem)
-        if folder is not None:
-            for one in sensors:
-                if one.result is not None:
-                    save(one.result.map, folder / one.file, COMMAND)
-            write_json(folder / "vehicle.json", result.summary)
-        return result
-
+    found = _sensors(product, names, site)
+    sensors = tuple(_fitted(product, one, found, site, kind, progress) for one in found)
     if out is None:
-        return made(None)
+        return VehicleResult(product, sensors, *_exported(exporter, sensors, None))
     with output_folder(Path(out), COMMAND, paths_of(names)) as folder:
-        result = made(folder)
+        result = VehicleResult(product, sensors, *_exported(exporter, sensors, folder))
+        for one in sensors:
+            if one.result is not None:
+                save(one.result.map, folder / one.file, COMMAND)
+        write_json(folder / "vehicle.json", result.summary)
         files = sorted(path.name for path in folder.iterdir() if path.suffix in (".json", exporter.suffix))
-    return VehicleResult(
-        result.product, result.sensors, result.loss, result.problem, tuple(Path(out) / name for name in files)
-    )
+    return replace(result, written=tuple(Path(out) / name for name in files))
 
 
 def _product(recordings: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +26,7 @@ from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import alarms
+from driftlab.spc.yields import Yield, yields_of
 from fusion_core.errors import ConfigError, DataError, quote
 from fusion_core.host.provenance import participants
 
@@ -48,6 +49,7 @@ def fleet(
     certificate: bool = False,
     family: Place | None = None,
     rules: str | None = None,
+    by: Sequence[str] = (),
     force: bool = False,
     channel: str | None = None,
     progress: FleetProgress | None = None,
@@ -83,6 +85,10 @@ def fleet(
     rules : str, optional
         Run rules of the control charts, beside three sigma.
         `western-electric` or `nelson`; they alarm more often, also of a line in control.
+    by : sequence of str
+        Column by which yield and reasons are told, e.g. lot; may be repeated.
+        `lot`, `date`, `channel`, `driftlab`, `T_low`, `T_high`, `hours` or one of the manifest's own; numbers of which
+        there are many are told in quarters. Without it by lot, where the units have lots.
     force : bool
         Do every unit again.
     channel : as that of `run`
@@ -105,13 +111,14 @@ def fleet(
     known = None if family is None else Path(family)
     if rules not in (None, *RULES):
         raise ConfigError(f"--rules {quote(rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out")
-    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, rules, force)
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, rules, tuple(by), force)
     if wanted.scheduler is not None and wanted.workers is not None:
         raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
     manifest = read_manifest(str(units))
     # which refuses a source of no files
     with_recording(understood, next(iter(manifest.units[0].recordings.values()))[0])
     wanted.check_pages(manifest)
+    wanted.check_columns(manifest)
     with fleet_folder(Path(out), [] if wanted.family is None else [wanted.family]) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
         jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), wanted, report)
@@ -150,6 +157,7 @@ class _Command:
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage
     status: FleetStatus = field(default_factory=FleetStatus)
     failed: list[str] = field(default_factory=list)  # of the certificates
+    yields: Yield | None = None  # once the odd units are known
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
@@ -164,6 +172,7 @@ class _Command:
         as_it_was = before.get("key") == key and before.get("complete")
         as_it_was = as_it_was and all((folder.path / name).is_file() for name in files)
         if as_it_was and not jobs.pages_missing(before["pages"]):
+            self._tell(before["family"].get("odd", {}))
             return self._mark(**{name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark()
         units = UnitStore(folder.path, [(record.unit, record.lot) for record in status.done])
@@ -173,15 +182,27 @@ class _Command:
             learned = partial(analyse, units, status, self.config, options.family, progress, each, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
+            self._tell(odd)
             pages = self._timed("pages", partial(jobs.make_pages, odd))
-            written = partial(write_fleet, folder, status, self.config, analysis, pages, progress, each)
+            written = partial(write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, each)
             self._timed("tables", written)
         family = FamilySummary(
             units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
             line=analysis.line.sentences, judged=analysis.judged,
             alarms={analysis.line.units[k]: why for k, why in alarms(analysis.line).items()},
+            capability=[
+                row.as_json(analysis.line.shown(row.quantity).si, analysis.line.units[row.since])
+                for row in analysis.line.capability
+            ],
+            charts=[chart.as_json(analysis.line) for chart in analysis.line.controls],
         )  # fmt: skip
         return self._mark(complete=True, key=key, family=family, pages=pages)
+
+    def _tell(self, odd: Collection[str]) -> None:
+        """Count the yield by the columns that were asked for, or by lot."""
+        records = self.status.records
+        usual = ("lot",) if any(record.lot for record in records) else ()
+        self.yields = yields_of(records, odd, self.jobs.options.by or usual)
 
     def _timed(self, name: str, stage: Callable[[], T]) -> T:
         begun = time.monotonic()
@@ -193,7 +214,7 @@ class _Command:
         """Return the key of family, tables and report: a hash of all that they are made of."""
         jobs, options = self.jobs, self.jobs.options
         family = "" if options.family is None else sha256(options.family)
-        parts = (self.status.key, jobs.config, jobs.versions, family, options.rules)
+        parts = (self.status.key, jobs.config, jobs.versions, family, options.rules, options.by)
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def _mark(self, **more: Any) -> dict[str, Any]:
@@ -210,6 +231,7 @@ class _Command:
             limits=status.limits,
             acceptance=status.acceptance,
             pass_with_hysteresis=status.beside,
+            yields=self.yields,
             replaced=jobs.again,
             kept_without_recordings=jobs.without_recordings,
             left=left,

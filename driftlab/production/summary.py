@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 
 from driftlab import __version__
 from driftlab.commands.console import session, terminal
+from driftlab.spc.yields import Yield
 from driftlab.units import duration
 from fusion_core.escaping import line
 
@@ -95,7 +96,8 @@ MAX_PAGES = 20  # pages of units that stand out and were not asked for
 class FamilySummary(BaseModel):
     """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
 
-    `alarms` are why units are out of control, by frozen limits and run rules.
+    `alarms` are why units are out of control, by frozen limits and run rules; `capability` has the indices, `charts`
+    limits, changes and lots of each chart.
     """
 
     units: int
@@ -104,6 +106,8 @@ class FamilySummary(BaseModel):
     lines: list[str] = []
     line: list[str] = []
     alarms: dict[str, list[str]] = {}
+    capability: list[dict[str, Any]] = []
+    charts: list[dict[str, Any]] = []
     judged: bool = True
 
     def sentences(self) -> list[str]:
@@ -134,6 +138,7 @@ class FleetSummary(BaseModel):
     limits: dict[str, int] = {}
     acceptance: Annotated[str, Field(exclude=True)] = ""
     pass_with_hysteresis: int = 0
+    yields: Annotated[Yield | None, Field(exclude=True)] = None
     replaced: list[str] = []
     kept_without_recordings: list[str] = []
     left: list[str] = []
@@ -149,7 +154,8 @@ class FleetSummary(BaseModel):
         """Return the content of the file, with its summary in sentences."""
         content = self.model_dump(by_alias=True, exclude_none=True)
         config = content.pop("config")
-        return {**content, "lines": self.sentences(), "config": config}
+        found = {} if self.yields is None else {"yield": self.yields.as_json()}
+        return {**content, **found, "lines": self.sentences(), "config": config}
 
     def sentences(self) -> list[str]:
         """Return the summary in sentences, most important first."""
@@ -166,6 +172,7 @@ class FleetSummary(BaseModel):
             more = f"and {failed - len(self.failed):,} more; " if failed > len(self.failed) else ""
             lines.append(f"{more}why each failed is in the column `error` of units.parquet")
         lines += [self.acceptance] if self.acceptance else []
+        lines += [] if self.yields is None else self.yields.sentences()
         if count := self.pass_with_hysteresis:
             lines.append(f"of those that pass a hysteresis or lag is seen in {units(count)}; no limit is set for it")
         return lines

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -36,6 +36,7 @@ from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow
+from driftlab.spc.yields import Yield, reasons
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
@@ -51,6 +52,7 @@ def write_fleet(
     status: FleetStatus,
     config: Config,
     analysis: FamilyAnalysis,
+    yields: Yield | None,
     pages: Collection[str],
     progress: FleetProgress,
     each: ParallelMap = serial,
@@ -70,6 +72,7 @@ def write_fleet(
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
     overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
+    overview = replace(overview, yields=yields)
     write_fleet_report(folder.hidden(REPORT), overview)
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
@@ -147,7 +150,7 @@ def rows_of(record: UnitRecord, family: Sequence[Row] = (), odd: Sequence[str] |
     row |= {named(name): value for name, value in record.more.items()}
     texts = ("lot", "date", "error", "channel", "bias_unit", "driftlab", "key")
     row |= {name: getattr(record, name) or None for name in texts}
-    row |= {"plugins": [_plugin(item) for item in record.plugins]}
+    row |= {"plugins": [_plugin(item) for item in record.plugins], "reasons": reasons(record)}
     if record.state == "failed":
         yield row
         return
@@ -256,6 +259,7 @@ COLUMNS: dict[str, UnitColumn] = dict([
     ("limits", UnitColumn("text", "", "of the config: `pass`, `fail`, `undecided`, `not measured`; null: none")),
     ("limits_failed", UnitColumn("texts", "", "those that the unit does not keep")),
     ("limits_undecided", UnitColumn("texts", "", "those within whose guard the unit is")),
+    ("reasons", UnitColumn("texts", "", "for which the unit is not accepted; none where it is")),
     ("effects", UnitColumn("texts", "", "that the loop added to the unit's model, with --explain")),
     ("loop", UnitColumn("text", "", "verdict of the loop, or why there is none")),
     *_with_sigma("common_effect", "SI", "size of the family's common effect in this unit"),

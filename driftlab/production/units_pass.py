@@ -31,7 +31,8 @@ from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
 from driftlab.production.unit import Task, certificate_of, key_of, work
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
-from fusion_core.errors import ConfigError, FusionError
+from driftlab.spc.yields import COLUMNS
+from fusion_core.errors import ConfigError, FusionError, quote
 from fusion_core.host.provenance import participants
 
 MISSING = 10_000  # units without their recordings, over as many as have theirs
@@ -48,6 +49,7 @@ class FleetOptions:
     certificate: bool = False  # of each unit that is done
     family: Path | None = None  # one that is known already
     rules: str | None = None  # run rules of the charts
+    by: tuple[str, ...] = ()  # columns by which the yield is told
     force: bool = False
 
     def crew(self) -> Workers:
@@ -66,6 +68,13 @@ class FleetOptions:
                 raise ConfigError(
                     f"--pages {pattern}: no unit is called so; name one of {names[0]} to {names[-1]}, or all"
                 )
+
+    def check_columns(self, manifest: Manifest) -> None:
+        """Raise ConfigError where the yield is asked for by a column that there is not."""
+        known = dict.fromkeys([*COLUMNS, *(name for entry in manifest.units for name in entry.more)])
+        for name in self.by:
+            if name not in known:
+                raise ConfigError(f"--by {quote(name)}: no such column; choose {', '.join(known)}")
 
 
 @dataclass

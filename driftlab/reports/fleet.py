@@ -18,7 +18,8 @@ import numpy as np
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
-from driftlab.reports.fleet_charts import FleetOverview, control_charts, distributions, joint_charts, map_charts
+from driftlab.reports.fleet_charts import FleetOverview, map_charts
+from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
 from driftlab.spc.sentences import alarms, by_how_much, place
@@ -32,21 +33,19 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
     line, effects, records = overview.line, overview.effects, overview.records
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
-    failed = [record for record in records if record.state == "failed"]
-    done = [record for record in records if record.state == "done"]
+    failed, done = ([record for record in records if record.state == state] for state in ("failed", "done"))
     limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
-    units, out = f"{len(records):,} unit{'s' * (len(records) != 1)}", [*alarms(line).items()]
-    lead = [f"{units}: {len(records) - len(failed):,} done, {len(failed):,} failed", f"{odd:,} odd"]
-    lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
+    out = [*alarms(line).items()]
     write_page(
         path,
         "fleet",
         title=overview.title,
-        lead="; ".join(lead),
+        lead=_lead(len(records), len(failed), odd, len(effects)),
         limits=verdict_of_units(limits).capitalize(),
         outcome=worst([row for of_unit in limits for row in of_unit]),
         verdict=_headline(line, odd, len(done)),
         use=_use(line, odd),
+        yields=overview.yields,
         called=figure_name,
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=_numbers(records),
@@ -54,21 +53,30 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
             overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
         ),
         lots=distributions(line),
+        lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
         charts=[*joint_charts(line), *control_charts(line)],
         alarms=[(line.units[k], overview.links.get(line.units[k], ""), "; ".join(why)) for k, why in out[:LISTED]],
         alarms_count=len(out),
         line=line,
+        against=limit_charts(line),
         changes=changes(line),
         effects=effects,
         odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
         odd_count=odd,
-        first=FIRST,
+        first=FIRST, listed=LISTED,
         failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
         failed_count=len(failed),
         left_out=len(records) - len(table["unit"]),
         names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
         table=embedded(table),
-    )
+    )  # fmt: skip
+
+
+def _lead(units: int, failed: int, odd: int, effects: int) -> str:
+    """Return the numbers of units and of effects that they share."""
+    parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    parts += [f"{effects} effect{'s' * (effects != 1)} that they share"] if effects else []
+    return "; ".join(parts)
 
 
 def _headline(line: LineReport, odd: int, done: int) -> str:

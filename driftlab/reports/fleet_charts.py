@@ -1,205 +1,26 @@
-"""The charts of a fleet: control charts of its line, distributions by lot, and the fan of its maps.
+"""The charts of a fleet: the fan of its maps, and the content of its page.
 
-A control chart has a panel an axis. A distribution has boxes on one scale. A fan shows between which curves how many of
-the units lie, and those that are odd. m values, U units, d axes, G temperatures.
+A fan shows between which curves how many of the units lie, and those that are odd. U units, d axes, G temperatures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.family.outliers import Outlier
-from driftlab.family.record import UnitRecord, figure_name
-from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series, without_spikes
-from driftlab.spc.charts import ControlChart, LineReport
-from driftlab.units import BiasUnit, number, rounded
+from driftlab.family.record import UnitRecord
+from driftlab.reports.charts import SERIES, Chart, Line, Panel, axis_panels, series
+from driftlab.reports.line_charts import SHARES
+from driftlab.spc.charts import LineReport
+from driftlab.spc.yields import Yield
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
-MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
-MAX_LOTS = 60  # lots that are drawn: the latest
-MANY = 0.05  # share of the units that may lie beyond an axis
-LIMITS = 300  # points of a limit that differs from unit to unit
-TITLES = {
-    "residual": "Residual of the map, rms of 30 s averages",
-    "noise": "White noise",
-    "walk": "Walk of the bias",
-    "swing": "Swing of the map",
-    "coast": "Prediction over 10 min without updates, rms of its error",
-    "level": "Level of the map, mean over the range",
-}
-CAPTION = (
-    "A point a unit; one far off stands at the edge, its value in the label. "
-    "Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
-    "well. Dotted: limits of the EWMA. Broad: what is usual between the changes; shaded: where a change is, by 95 %."
-)
-
-
-def control_charts(line: LineReport) -> list[Chart]:
-    """Return the chart of each quantity; x is the place of the unit in the line, from 1."""
-    result: list[Chart] = []
-    for name, charts in _by_quantity(line).items():
-        panels = tuple(_panel(line, chart) for chart in charts)
-        caption = "" if result else CAPTION  # once on a page
-        result.append(Chart(panels, "unit", TITLES.get(name, name), caption, named="units-of-the-line"))
-    return result
-
-
-def joint_charts(line: LineReport) -> list[Chart]:
-    """Return the chart of T-squared, a panel an axis; none where no limits are frozen."""
-    panels = []
-    for joint in line.multivariate:
-        place, out = (joint.at + 1).astype(np.float64), joint.beyond
-        drawn = np.union1d(np.linspace(0, len(place) - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(out))
-        value, few = np.array([rounded(v, 4) for v in joint.value.tolist()]), np.unique([0, len(place) - 1])
-        span = (0.0, 1.1 * float(max(np.percentile(joint.value, 100 * (1 - MANY)), 2 * np.max(joint.limit))))
-        shown = np.minimum(value, span[1])
-        lines = (
-            Line(place[drawn], shown[drawn], "unit", "data", style="points"),
-            Line(place[out], shown[out], "beyond the limit", "alarm", style="points"),
-            Line(place[few], joint.limit[few], "limit", "limit", style="dashed"),
-        )
-        panels.append(Panel(lines, f"T-squared {joint.axis}", span=span))
-    if not panels:
-        return []
-    names = ", ".join(map(figure_name, line.multivariate[0].quantities))
-    caption = f"{names} of an axis together, by their frozen covariance: units that are unusual in what goes with what."
-    return [Chart(tuple(panels), "unit", "T-squared", caption, named="units-of-the-line")]
-
-
-def _by_quantity(line: LineReport) -> dict[str, list[ControlChart]]:
-    """Return the charts of each quantity."""
-    quantities = dict.fromkeys(chart.quantity for chart in line.controls)
-    return {name: [chart for chart in line.controls if chart.quantity == name] for name in quantities}
-
-
-def _panel(line: LineReport, chart: ControlChart) -> Panel:
-    unit = line.shown(chart.quantity)
-
-    def shown(values: Array) -> Array:
-        return np.array([rounded(v, 4) for v in (np.asarray(values) * unit.factor).tolist()], dtype=np.float64)
-
-    drawn = _drawn(chart)
-    place = (chart.at + 1).astype(np.float64)
-    few = np.unique(np.linspace(0, len(place) - 1, LIMITS).astype(int))
-    out = np.flatnonzero(chart.beyond)
-    value = chart.value[np.isfinite(chart.value)]
-    low, high = without_spikes(value, MANY)
-    cut = np.flatnonzero((chart.value < low) | (chart.value > high))
-    wide = not len(cut) and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
-    drawn_at = np.clip(chart.value, low, high)
-    lines = [
-        *_usual(chart, shown),
-        Line(place[drawn], shown(drawn_at[drawn]), "unit", "data", style="points"),
-        Line(place[out], shown(drawn_at[out]), "beyond three sigma", "alarm", style="points"),
-        Line(place[drawn], shown(chart.ewma[drawn]), "EWMA", "estimate"),
-        *_limits(place, few, (chart.low, chart.high), shown, ewma=False),
-        *_limits(place, few, (chart.ewma_low, chart.ewma_high), shown, ewma=True),
-    ]
-    shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
-    span = None if wide else _span(chart, (low, high), unit.factor)
-    names = ", ".join(f"{line.units[chart.at[k]]} at {chart.value[k] * unit.factor:.3g}" for k in cut[:NAMED])
-    names += f" and {len(cut) - NAMED} more" if len(cut) > NAMED else ""
-    label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"
-    return Panel(tuple(lines), label, shades, log=wide, span=span)
-
-
-def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tuple[float, float]:
-    """Return from where to where y is drawn: values between `ends`, and the limits of most units.
-
-    A unit that is measured badly has limits so wide that nothing else could be distinguished.
-    """
-    all_of = np.concatenate([ends, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]])
-    low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
-    room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
-    return low - room, high + room
-
-
-def _drawn(chart: ControlChart) -> NDArray[np.intp]:
-    """Return the values that are drawn: all, or the alarms and an even sample."""
-    m = len(chart.at)
-    if m <= MAX_POINTS:
-        return np.arange(m)
-    return np.union1d(np.linspace(0, m - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(chart.beyond))
-
-
-def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:
-    """Return the usual level of each stretch; of a line without a change, the middle that the limits stand on."""
-    starts = [float(chart.at[0] + 1), *(change.at + 1.0 for change in chart.changes)]
-    stops = [*(start - 1.0 for start in starts[1:]), float(chart.at[-1] + 1)]
-    first = chart.changes[0].before if chart.changes else chart.centre
-    levels = [first, *(change.after for change in chart.changes)]
-    return [
-        Line(np.array([start, stop]), shown(np.full(2, level)), "usual", "reference")
-        for start, stop, level in zip(starts, stops, levels, strict=True)
-    ]
-
-
-def _limits(
-    place: Array, few: NDArray[np.intp], both: tuple[Array, Array], shown: Callable[[Array], Array], *, ewma: bool
-) -> list[Line]:
-    """Return two limits, of the values or of the EWMA; one that is the same all along has two points."""
-    name = "limits of the EWMA" if ewma else "three sigma"
-    style: LineStyle = "dotted" if ewma else "dashed"
-    steady = all(np.ptp(values) <= 0.02 * abs(both[1] - both[0]).max() for values in both)
-    at = few[[0, -1]] if steady else few
-    return [Line(place[at], shown(values[at]), name, "limit", style=style) for values in both]
-
-
-def distributions(line: LineReport) -> list[dict[str, Any]]:
-    """Return the distribution of each quantity, a row a lot, a column an axis; none where the units have no lots.
-
-    Each has `title`, `unit`, `axes`, the values at either end of the boxes of each axis (`scale`), the number of lots
-    that are not drawn (`left_out`), and `rows` of a lot and its boxes, None where it has no value on an axis.
-    """
-    lots = list(dict.fromkeys(lot for lot in line.lots if lot))
-    if not lots:
-        return []
-    result = []
-    for name, charts in _by_quantity(line).items():
-        spans, unit = [_lot_span(chart) for chart in charts], line.shown(name)
-        boxes = [_boxes(line, chart, span) for chart, span in zip(charts, spans, strict=True)]
-        result.append(
-            {
-                "title": TITLES.get(name, name),
-                "unit": unit.shown,
-                "axes": [chart.axis for chart in charts],
-                "scale": [[number(end * unit.factor, zeros=True) for end in span] for span in spans],
-                "rows": [(lot, [by_lot.get(lot) for by_lot in boxes]) for lot in lots[-MAX_LOTS:]],
-                "left_out": max(len(lots) - MAX_LOTS, 0),
-            }
-        )
-    return result
-
-
-def _lot_span(chart: ControlChart) -> tuple[float, float]:
-    low, high = (float(v) for v in np.percentile(chart.value, (1, 99)))
-    room = 0.05 * (high - low) or abs(high) or 1.0
-    return low - room, high + room
-
-
-def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> dict[str, dict[str, Any]]:
-    """Return the units of each lot on one axis: how many, the median as a text, and places in per cent of the scale.
-
-    `out` is where the lot's mean is beyond the limits of the line.
-    """
-    low, high = span
-    factor, names = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at]
-    boxes = {}
-    for lot in chart.lots:
-        values = np.percentile(chart.value[names == lot.name], SHARES)
-        places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
-        places = dict(zip(("low", "quarter", "half", "most", "high"), places, strict=True))
-        boxes[lot.name] = {"n": lot.n, "text": number(values[2] * factor, zeros=True), "out": lot.out, **places}
-    return boxes
-
-
 LABEL = "temperature [°C]"
-SHARES = (5, 25, 50, 75, 95)
 NAMED = SERIES - 1  # odd units with a colour of their own; the first colour is the fan's
 EACH = 20  # units of which each is drawn: percentiles of so few say little
 DRAWN = 40  # odd units on an axis at most
@@ -267,6 +88,7 @@ class FleetOverview:
         Units' pages, relative to this one.
     remarks : sequence of str
         What else should be known.
+    yields : Yield or None
     """
 
     title: str
@@ -281,6 +103,7 @@ class FleetOverview:
     effects: Sequence[SharedEffectRow] = ()
     links: Mapping[str, str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
+    yields: Yield | None = None
 
 
 def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:

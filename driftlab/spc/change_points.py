@@ -13,23 +13,39 @@ y, the share of the squares that a level of their own takes is::
 
 with the likelihood ratio L log(1 / (1 - r)). Its probability by chance is that of Student's t, times the number of
 places looked at (Bonferroni): at the few parts in a thousand that a chart may err this is nearly exact, and the search
-is correlated enough that it is never too low. n values in all, L in a piece, P parts.
+is correlated enough that it is never too low.
+
+Whether what was found is steps, a trend, or units that resemble those before them, is a comparison of likelihoods, the
+residuals e of each model about its fit being AR(1)::
+
+    n log sum (e_i - phi e_{i-1})^2 + p log n,    p = 0 (a level), 1 (a straight line), 2 (a step: its size, its place)
+
+The likeliest has phi (a step costs 3 there, since its place was looked for); where that is more than chance, steps are
+searched again in z_i - phi z_{i-1}, in which the noise is white again, at the same price. Steps that are found are a
+trend where a line is likelier. n values in all, L in a piece, P parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.spc.charts import huber
 from fusion_core.chunk import Array
 
 SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
 DECAY = np.sqrt(0.5)  # of the length from one layer of parts to the next
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
+
+RESEMBLING = 2.0  # deviations (1 / sqrt(n)) of an autocorrelation beyond which it is not chance
+MOST = 0.95  # autocorrelation: what is nearer to 1 is a wandering line
+FAR = 3.0  # sigmas to which a residual counts
+PLACES = 50  # of a step, that are compared
+PHI = np.linspace(0.0, MOST, 96)
 
 Index = NDArray[np.intp]
 
@@ -52,6 +68,100 @@ class LevelStep:
     low: int
     high: int
     p: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course of a line.
+
+    Attributes
+    ----------
+    steps : tuple of LevelStep
+    slope : (2,) array or None
+        Level in the middle, and half of the rise from the first to the last value, where it is a trend; then there are
+        no steps.
+    phi : float
+        Autocorrelation of neighbouring values about it, 0 where it may be chance.
+    """
+
+    steps: tuple[LevelStep, ...] = ()
+    slope: Array | None = None
+    phi: float = 0.0
+
+
+def course_of(x: Array, sigma: Array, alpha: float, blocks: Iterable[tuple[int, int]] = ()) -> Course:
+    """Return steps, or a trend, or neither, of values x (n,) with deviations sigma (n,).
+
+    With probability alpha at most there is either of values that have neither, whether or not neighbours resemble one
+    another. `blocks` are those of `steps`.
+    """
+    if not np.all(sigma > 0) or len(x) < 2 * SHORTEST:
+        return Course()
+    z, a, known = (x - np.median(x)) / sigma, np.median(sigma) / sigma, list(blocks)
+    found = steps(z, a, alpha, known)
+    line = _line(x, sigma)
+    models = [_residuals(x, sigma, np.full(len(x), np.median(x))), _residuals(x, sigma, line)]
+    models += [_residuals(x, sigma, _levels(x, sigma, found))] if found else []
+    costs = [_cost(e, p) for e, p in zip(models, (0, 1, 3 * len(found)), strict=False)]
+    phi = min(costs)[1]
+    phi = min(phi + (1 + 3 * phi) / len(x), MOST)  # which few values show as less (Kendall, Biometrika 41 (1954) 403)
+    if phi < RESEMBLING / np.sqrt(len(x)):
+        phi = 0.0
+    if found and phi:
+        shifted = [(max(i - 1, 0), j - 1) for i, j in known]
+        again = steps(z[1:] - phi * z[:-1], a[1:], alpha, shifted)
+        found = [LevelStep(step.at + 1, step.low + 1, step.high + 1, step.p) for step in again]
+    if not found:
+        return Course(phi=phi)
+    of_line, of_steps = (
+        _cost(_residuals(x, sigma, fit), p)[0] for fit, p in ((line, 1), (_levels(x, sigma, found), 2 * len(found)))
+    )
+    if of_line < of_steps:
+        return Course((), np.array([np.mean(line), (line[-1] - line[0]) / 2]), phi)
+    return Course(tuple(found), None, phi)
+
+
+def _line(x: Array, sigma: Array) -> Array:
+    """Return the straight line (n,) through values x (n,) that no single odd one moves."""
+    X = np.column_stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))])
+    return X @ huber(X, x, sigma, np.array([np.median(x), 0.0]))
+
+
+def _levels(x: Array, sigma: Array, found: Sequence[LevelStep]) -> Array:
+    """Return the levels (n,) between steps, each step where it is likeliest within its interval."""
+    edges = [0, *(step.at for step in found), len(x)]
+    for k, step in enumerate(found, 1):
+        start, stop = edges[k - 1], edges[k + 1]
+        ends = max(step.low, start + SHORTEST), min(step.high, stop - SHORTEST)
+        some = sorted({*np.linspace(*ends, PLACES).astype(int).tolist(), step.at}) if ends[0] <= ends[1] else []
+        fits = {at: np.concatenate([_level(x[start:at]), _level(x[at:stop])]) for at in some}
+        part = slice(start, stop)
+        edges[k] = min(
+            fits, key=lambda at: float(np.sum(_residuals(x[part], sigma[part], fits[at]) ** 2)), default=edges[k]
+        )
+    return np.concatenate([_level(x[i:j]) for i, j in pairwise(edges)])
+
+
+def _level(x: Array) -> Array:
+    middle = np.median(x)
+    reach = FAR * 1.4826 * float(np.median(np.abs(x - middle)))
+    return np.full(len(x), middle + np.mean(np.clip(x - middle, -reach, reach)))
+
+
+def _residuals(x: Array, sigma: Array, fit: Array) -> Array:
+    e = (x - fit) / sigma
+    reach = FAR * 1.4826 * float(np.median(np.abs(e)))
+    return np.clip(e, -reach, reach) if reach > 0 else e
+
+
+def _cost(e: Array, p: int) -> tuple[float, float]:
+    """Return the price of residuals e (n,) of a model with p parameters beside its level, and their phi."""
+    n, own, cross = len(e), float(e @ e), float(e[1:] @ e[:-1])
+    middle = own - float(e[0] ** 2 + e[-1] ** 2)
+    left = own + PHI**2 * middle - 2 * PHI * cross  # sum of squares of e_i - phi e_{i-1}, e_0 by its own law
+    likely = n * np.log(np.maximum(left, 1e-300)) - np.log(1 - PHI**2)
+    best = int(np.argmin(likely))
+    return float(likely[best]) + p * float(np.log(n)), float(PHI[best])
 
 
 def steps(z: Array, a: Array, alpha: float, blocks: Iterable[tuple[int, int]] = ()) -> list[LevelStep]:

@@ -1,4 +1,4 @@
-"""Report of a line: control charts, changes, capability; and the statistics of each. All values in SI.
+"""Report of a line, and its control charts: their statistics. All values in SI.
 
 Control charts are of single units: Shewhart's (individuals, moving ranges) and the EWMA. Values are in a scale in which
 they are about normal, in the order in which the units were made. Of value i with the deviation
@@ -15,77 +15,27 @@ The scale is the logarithm of a quantity, its root, or as it is. A size (a densi
 so its logarithm is tried first and stays unless another scale is clearly more normal, by the correlation of the ordered
 values with normal scores (Filliben).
 
-Capability indices are of a limit U, in such a scale, mean m of n values::
-
-    Ppk = (U - m) / (3 s)  with s the deviation of all of them,  Cpk the same with that from one unit to the next
-
-Interval of Ppk by the noncentral t distribution, of which 3 sqrt(n) Ppk is a draw, as a normal one (Abramowitz and
-Stegun 26.7.10); of the share beyond the limit by Clopper and Pearson, which needs no law of the values. m values of a
-chart, n values in general.
+m values of a chart, n values in general.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.baseline import Baseline, ScaleName
 from driftlab.family.record import PER
+from driftlab.spc.capability import D2, Capability
+from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
-MIN_UNITS = 10  # for a chart, or an index
+MIN_UNITS = 10  # for a chart
 LEVEL = "level"
-
-
-@dataclass(frozen=True)
-class Capability:
-    """Capability of a line for one limit on one axis.
-
-    Attributes
-    ----------
-    quantity, axis : str
-    limit : float
-        At most, SI.
-    n : int
-        Units.
-    since : int
-        Place of the first of them in the line: 0, or that of the last change of the line.
-    cpk, ppk : float
-    ppk_low, ppk_high : float
-        95 % interval.
-    beyond : int
-        Units above the limit.
-    share_low, share_high : float
-        95 % interval of the share of units above the limit.
-    scale : str
-        In which the indices are: `log`, `sqrt`, `as it is`.
-    normal : float
-        Probability of values as little normal in that scale, if they were (Shapiro and Wilk).
-    """
-
-    quantity: str
-    axis: str
-    limit: float
-    n: int
-    since: int
-    cpk: float
-    ppk: float
-    ppk_low: float
-    ppk_high: float
-    beyond: int
-    share_low: float
-    share_high: float
-    scale: str
-    normal: float
-
-    @property
-    def trusted(self) -> bool:
-        """True if the indices hold; where not, the share of units above the limit does."""
-        return self.normal >= 0.01
 
 
 @dataclass(frozen=True)
@@ -124,18 +74,6 @@ class Trend:
     after: float
 
 
-@dataclass(frozen=True)
-class LotPoint:
-    """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
-
-    name: str
-    n: int
-    mean: float
-    low: float
-    high: float
-    out: bool
-
-
 @dataclass(frozen=True, eq=False)
 class ControlChart:
     """The control chart of one quantity of one axis; m units have it.
@@ -172,6 +110,8 @@ class ControlChart:
         Where a straight line fits better than steps; then there are no changes.
     patterns : mapping of str to (m,) bool array
         Alarms of the run rules that were asked for, by rule.
+    phi : float
+        Autocorrelation of neighbouring units about the line's course, 0 where it may be chance.
     of_family : bool
         Whether centre and limits are those of a family that was known.
     """
@@ -198,7 +138,32 @@ class ControlChart:
     law: InControl
     trend: Trend | None = None
     patterns: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    phi: float = 0.0
     of_family: bool = False
+
+    @property
+    def ranges(self) -> Array:
+        """Moving ranges (m - 1,) of each unit and the one before it, in sigmas: D2 is usual, D4 the limit."""
+        return np.abs(np.diff(self.z))
+
+    def as_json(self, line: LineReport) -> dict[str, Any]:
+        """Return limits, alarms, changes and lots as `fleet.json` has them; in SI, ranges in sigmas."""
+        names, usual = line.units, (float(np.median(self.low)), float(np.median(self.high)))
+        changes = [
+            {
+                "unit": names[step.at], "unit_95": [names[step.low], names[step.high]], "before": step.before,
+                "after": step.after, "p": step.p, "lot": step.of_lot or None,
+            }
+            for step in self.changes
+        ]  # fmt: skip
+        return {
+            "quantity": self.quantity, "axis": self.axis, "unit": self.unit, "units": len(self.at),
+            "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre, "low": usual[0],
+            "high": usual[1], "beyond": int(np.sum(self.beyond)), "ewma_beyond": int(np.sum(self.drifting)),
+            "moving_range": {"usual": D2, "limit": D4, "beyond": int(np.sum(self.ranges > D4))},
+            "autocorrelation": self.phi, "changes": changes, "trend": None if self.trend is None else vars(self.trend),
+            "lots": [lot.as_json() for lot in self.lots if lot.name],
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +245,6 @@ class LineReport:
 
 SIGMAS = 3.0
 LAMBDA, L = 0.2, 2.962
-D2 = float(2 / np.sqrt(np.pi))  # mean moving range of normal values over their deviation: 1.128
 MEDIAN_RANGE = 0.9539  # and their median: sqrt(2) times the third quartile of a normal value
 D4 = 3.686  # deviations that a moving range may have: D4 d2 = 3.267 * 1.128
 WITHIN = 0.9754  # mean of the moving ranges that are below D4 deviations, over that of all
@@ -435,27 +399,12 @@ def _straightness(x: Array) -> float:
 
 
 def _core(x: Array) -> Array:
-    """Return the values in order without those beyond five robust deviations: odd units say nothing of the law."""
-    ordered = np.sort(x)
-    middle = np.median(ordered)
-    reach = 5 * 1.4826 * np.median(np.abs(ordered - middle))
-    return ordered[np.abs(ordered - middle) <= reach] if reach > 0 else ordered
+    """Return the values in order without those that are far out: odd units say nothing of the law."""
+    return np.sort(x[~far_out(x)])
 
 
-def indices(x: Array, limit: float, short_term: float) -> tuple[float, float, float, float]:
-    """Return Cpk, Ppk, and the 95 % interval of Ppk, of values x (n,) and the deviation from one to the next."""
-    n, room, sd = len(x), limit - float(np.mean(x)), float(np.std(x, ddof=1))
-    if not sd > 0 or not short_term > 0:
-        return (np.inf if room >= 0 else -np.inf,) * 4
-    ppk = room / (3 * sd)
-    middle = ppk * (1 - 1 / (4 * (n - 1)))
-    half = 1.96 * float(np.sqrt(1 / (9 * n) + ppk**2 / (2 * (n - 1))))
-    return room / (3 * short_term), ppk, middle - half, middle + half
-
-
-def share_beyond(beyond: int, n: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share of which `beyond` of n were seen."""
-    from scipy.stats import binomtest
-
-    interval = binomtest(beyond, n).proportion_ci(method="exact")
-    return float(interval.low), float(interval.high)
+def far_out(x: Array) -> NDArray[np.bool_]:
+    """Return True of the values (n,) beyond five robust deviations; of none where most are the same."""
+    about = np.abs(x - np.median(x))
+    reach = 5 * 1.4826 * np.median(about)
+    return np.asarray((about > reach) & (reach > 0))

@@ -24,31 +24,29 @@ from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.family.tail_law import TailLaw
-from driftlab.spc.change_points import LevelStep, steps
+from driftlab.spc.capability import Capability, indices, share_beyond, why_no_index
+from driftlab.spc.change_points import Course, LevelStep, course_of
 from driftlab.spc.charts import (
     LEVEL,
     MIN_UNITS,
     SIGMAS,
-    Capability,
     ChartScale,
     ControlChart,
     InControl,
     LineReport,
-    LotPoint,
     StepChange,
     Trend,
     TSquaredChart,
     ewma,
     ewma_limit,
-    huber,
+    far_out,
     in_control,
-    indices,
     normality,
     scale_of,
-    share_beyond,
 )
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import sentences
+from driftlab.spc.subgroups import LotPoint, lots_of
 from driftlab.units import BiasUnit, default_unit
 from fusion_core.chunk import Array
 
@@ -113,15 +111,14 @@ def _control(
     """Return the chart of values and deviations (2, n) of a quantity of axis k."""
     values, sigmas = figures
     at = np.flatnonzero(np.isfinite(values))
-    value = values[at]
+    value, lots = values[at], np.array(line.lots, dtype=np.str_)[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
     usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at], usual)
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
-    level_steps = _steps(x, whole, alpha, _runs([line.lots[place] for place in at]))
-    trend = _trend(x, whole, level_steps, scale)
-    level_steps = level_steps if trend is None else []
+    course = course_of(x, whole, alpha, _runs(lots.tolist()))
+    level_steps, trend = course.steps, _trend(course, scale)
     edges = [0, *(step.at for step in level_steps), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
@@ -136,15 +133,15 @@ def _control(
         return scale.back(law.centre + sigma * (z if known is None else known.deviations(z)))
 
     three = np.full(len(z), SIGMAS)
-
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
         centre=float(scale.back(np.array(law.centre))), low=back(-three, sigma), high=back(three, sigma),
         ewma=back(w, middle), ewma_low=back(-reach, middle), ewma_high=back(reach, middle),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
-        changes=_changes(level_steps, stretches, x, sigma, scale, at), lots=_lots(line, at, x, sigma, law, scale),
-        trend=trend, z=z, law=law, patterns={rule: alarms(z) for rule, alarms in rules.items()},
+        changes=_changes(level_steps, stretches, x, sigma, scale, at),
+        lots=_lots(lots, x, sigma, law, scale, known=known is not None),
+        trend=trend, z=z, law=law, phi=course.phi, patterns={rule: alarms(z) for rule, alarms in rules.items()},
         of_family=known is not None,
     )  # fmt: skip
 
@@ -242,28 +239,11 @@ def _of_the_usual(scale: ChartScale, value: Array, sigma: Array, usual: float) -
     return np.maximum(own, np.median(own))
 
 
-def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) -> list[LevelStep]:
-    if not np.all(sigma > 0):
-        return []
-    return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha, blocks)
-
-
-def _trend(x: Array, sigma: Array, level_steps: list[LevelStep], scale: ChartScale) -> Trend | None:
-    """Return the trend of a line in which steps were found, if a straight line fits better.
-
-    By the Bayesian information criterion, a step having a size and a place; a value counts to SIGMAS.
-    """
-    if not level_steps:
+def _trend(course: Course, scale: ChartScale) -> Trend | None:
+    if course.slope is None:
         return None
-    n, u = len(x), np.linspace(-1.0, 1.0, len(x))
-    X = np.column_stack([np.ones(n), u])
-    line = huber(X, x, sigma, np.array([np.median(x), 0.0]))
-    edges = [0, *(step.at for step in level_steps), n]
-    steps_of = np.concatenate([np.full(j - i, np.median(x[i:j])) for i, j in pairwise(edges)])
-    cost = [float(np.sum(np.minimum(((x - model) / sigma) ** 2, SIGMAS**2))) for model in (X @ line, steps_of)]
-    if cost[0] + 2 * np.log(n) >= cost[1] + (2 * len(level_steps) + 1) * np.log(n):
-        return None
-    before, after = scale.back(line @ np.array([[1.0, 1.0], [-1.0, 1.0]])).tolist()
+    middle, half = course.slope.tolist()
+    before, after = scale.back(np.array([middle - half, middle + half])).tolist()
     return Trend(before, after)
 
 
@@ -274,7 +254,7 @@ def _runs(lots: list[str]) -> list[tuple[int, int]]:
 
 
 def _changes(
-    level_steps: list[LevelStep], stretches: list[tuple[int, int]], x: Array, sigma: Array, scale: ChartScale,
+    level_steps: Sequence[LevelStep], stretches: list[tuple[int, int]], x: Array, sigma: Array, scale: ChartScale,
     at: NDArray[np.intp],
 ) -> tuple[StepChange, ...]:  # fmt: skip
     laws = [(float(np.median(x[i:j])), 1.2533 * float(np.median(sigma[i:j])) / np.sqrt(j - i)) for i, j in stretches]
@@ -287,18 +267,13 @@ def _changes(
 
 
 def _lots(
-    line: LineReport, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: ChartScale
+    names: NDArray[np.str_], x: Array, sigma: Array, law: InControl, scale: ChartScale, *, known: bool
 ) -> tuple[LotPoint, ...]:
-    names = np.array(line.lots)[at]
     points = []
-    for name in dict.fromkeys(names.tolist()):
-        own = names == name
-        weight = 1 / sigma[own] ** 2
-        z = np.clip((x[own] - np.median(x[own])) / sigma[own], -SIGMAS, SIGMAS)
-        mean = float(np.median(x[own]) + np.sum(weight * z * sigma[own]) / np.sum(weight))
-        reach = SIGMAS / float(np.sqrt(np.sum(weight)))
-        value, low, high = scale.back(np.array([mean, law.centre - reach, law.centre + reach])).tolist()
-        points.append(LotPoint(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
+    for name, of_lot in lots_of(names, x - law.centre, sigma, float(np.median(sigma)) if known else None):
+        mean, low, high = scale.back(law.centre + of_lot[1:4]).tolist()
+        out = bool(not of_lot[2] <= of_lot[1] <= of_lot[3])
+        points.append(LotPoint(name, int(of_lot[0]), mean, low, high, out, *of_lot[4:].tolist()))
     return tuple(points)
 
 
@@ -316,12 +291,13 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
                 continue
             x = chart.scale.to(chart.value[part])
             n, beyond = len(x), int(np.sum(chart.value[part] > limit))
-            spread = in_control(x, np.zeros(n)).spread
-            cpk_ppk = indices(x, float(chart.scale.to(np.array(limit))), spread)
+            limit_x = float(chart.scale.to(np.array(limit)))
+            normal, why_not = why_no_index(x, far_out(x), limit_x)
+            found = (np.nan,) * 6 if why_not else indices(x, limit_x)
             rows.append(
                 Capability(
-                    chart.quantity, chart.axis, limit, n, since, *cpk_ppk, beyond, *share_beyond(beyond, n),
-                    chart.scale.name, normality(x),
+                    chart.quantity, chart.axis, limit, n, since, *found, beyond, *share_beyond(beyond, n),
+                    chart.scale.name, normal, why_not, chart.trend is not None,
                 )
             )  # fmt: skip
     return tuple(rows)

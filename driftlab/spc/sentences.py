@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import FIGURES, figure_name
+from driftlab.spc.capability import WORTH
 from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
 
 if TYPE_CHECKING:
     from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
-
-
-WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
 
 
 def sentences(line: LineReport) -> list[str]:
@@ -44,6 +42,7 @@ def sentences(line: LineReport) -> list[str]:
 
 MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
 NAMED = 5  # units that a sentence names
+ALIKE = 0.3  # autocorrelation from which on limits by neighbours are too narrow by a fifth
 
 
 def alarms(line: LineReport) -> dict[int, list[str]]:
@@ -174,6 +173,13 @@ def _now(line: LineReport) -> list[str]:
     lines.append(
         f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
     )
+    alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
+    if alike:
+        more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
+        lines.append(
+            f"Units resemble those before them (autocorrelation: {', '.join(alike[:NAMED])}{more}): changes are told "
+            "beyond that, and limits by neighbours alarm more often than they say."
+        )
     if line.too_few:
         lines.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
     return lines
@@ -194,13 +200,26 @@ def _limits(line: LineReport) -> list[str]:
     for name in dict.fromkeys(row.quantity for row in line.capability):
         rows = [row for row in line.capability if row.quantity == name]
         latest = {row.axis: row for row in sorted(rows, key=lambda row: row.since)}
-        worst = min(latest.values(), key=lambda row: row.ppk)
-        unit = line.shown(name)
+        unit, why = line.shown(name), {row.axis: row.why_not for row in latest.values() if row.why_not}
+        most = max(latest.values(), key=lambda row: (row.beyond / row.n, not row.trusted))
+        known = [row for row in latest.values() if row.trusted]
+        worst = min(known, key=lambda row: row.ppk) if known and most.trusted else most
         since = f" since unit {line.units[worst.since]}" if worst.since else ""
-        text = (
-            f"{figure_name(name)}, limit {worst.limit * unit.factor:.6g} {unit.shown}: {worst.axis} is worst{since}, "
-            f"Ppk {worst.ppk:.2f} (95 %: {worst.ppk_low:.2f} to {worst.ppk_high:.2f}), {worst.beyond:,} of {worst.n:,} "
-            "units above"
+        limit = f"{figure_name(name)}, limit {worst.limit * unit.factor:.6g} {unit.shown}"
+        if worst.trusted:
+            indices = (
+                f"Cpk {worst.cpk:.2f} (95 %: {worst.cpk_low:.2f} to {worst.cpk_high:.2f}), "
+                f"Ppk {worst.ppk:.2f} ({worst.ppk_low:.2f} to {worst.ppk_high:.2f})"
+            )
+            text = f"{limit}: {worst.axis} is worst{since}, {indices}, {worst.beyond:,} of {worst.n:,} units above"
+        else:
+            share = f"{100 * worst.share_low:.2g} to {100 * worst.share_high:.2g} %"
+            above = f"{worst.beyond:,} of {worst.n:,} units above (95 %: {share})"
+            text = f"{limit}: {worst.axis} is worst{since}, {above}"
+        reasons = "; ".join(
+            f"no index of {', '.join(axis for axis in why if why[axis] == reason)}: {reason}"
+            for reason in dict.fromkeys(why.values())
         )
-        lines.append(text + ("." if worst.trusted else "; not normal, so the units above say more than the index."))
+        text += ", of a line with a trend" * (worst.trend and worst.trusted)
+        lines.append(f"{text}{'; ' * bool(reasons)}{reasons}.")
     return lines

@@ -89,6 +89,13 @@ def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
     return _starter(lines)
 
 
+def with_map(text: str, kind: str, path: str) -> str:
+    """Return the config with the map that it has a comment for; one without that comment stays as it is."""
+    calibration = f"calibration: {{kind: {kind}, path: {yaml_text(path)}}}"
+    text = re.sub(r"(?m)^( +)# calibration: \{kind: .*", lambda found: found[1] + calibration, text)
+    return re.sub(r"(?m)^# filter: .*\n#   gyro: .*", lambda _: f"filter:\n  gyro: {{{calibration}}}", text)
+
+
 def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | None, map_name: str) -> Starter:
     """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]

@@ -13,9 +13,17 @@ The curve of each term is chosen forward, by the largest fall of::
 
 with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
 Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
-noise and walk are means over their restricted likelihood, all densities of the walk alike before: one that hardly shows
-may be there. A term that the equations do not tell is zero, and its usual size counts in the error of the others.
-m equations, n coefficients.
+noise and walk are means over their restricted likelihood; the prior of the density of the walk is half-Cauchy (Gelman,
+Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. A term that the
+equations do not tell is zero, and its usual size counts in the error of the others.
+
+What was decided counts in the error too. A term that stays constant may move by b, sigma s, all the same; it does with
+the probability that follows from the two models' evidence (Schwarz, Annals of Statistics 6 (1978) 461)::
+
+    p = 1 / (1 + sqrt(m) exp(-b^2 / 2 s^2)),    E[b^2] = p (s^2 + b^2)
+
+and the scatter of the terms over the walks that are likely is a part of their error. As many equations as there are
+leave the size of the noise unsure: the error is that of Student's t. m equations, n coefficients.
 """
 
 from __future__ import annotations
@@ -173,7 +181,11 @@ class TriadFit:
 
 
 def fit_triad(
-    stimulus: Stimulus, settings: ThermalMap, bias_size: float, wanted: NDArray[np.bool_] | None = None
+    stimulus: Stimulus,
+    settings: ThermalMap,
+    bias_size: float,
+    wanted: NDArray[np.bool_] | None = None,
+    walk: float | None = None,
 ) -> TriadFit:
     """Fit the terms of a triad to a stimulus.
 
@@ -186,6 +198,9 @@ def fit_triad(
         Bias of a usual unit, in its unit; its other terms are 1 % and 10 mrad.
     wanted : (12,) array of bool, optional
         Terms that may differ from zero, beside the bias; by default all that the stimulus leaves free.
+    walk : float, optional
+        Declared density of the random walk of the bias, its unit/sqrt(s); without it the scale of the prior is a walk
+        that ends as large as the noise of an equation.
 
     Raises
     ------
@@ -198,7 +213,7 @@ def fit_triad(
     domain = float(T.min()), float(T.max())
     usual = np.array([bias_size] * 3 + [0.01] * 9)
     free = stimulus.free if wanted is None else stimulus.free & wanted
-    search = _Search(stimulus, curves_of(settings, domain), usual, free)
+    search = _Search(stimulus, curves_of(settings, domain), usual, free, walk)
     search.check()
     if not search.converge():
         search.drop_untold()
@@ -222,12 +237,20 @@ def fit_triad(
 class _Search:
     """The state of a fit: the curve of each term, its coefficients, and the noise of each group."""
 
-    def __init__(self, stimulus: Stimulus, curves: list[TermCurve], usual: Array, free: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        stimulus: Stimulus,
+        curves: list[TermCurve],
+        usual: Array,
+        free: NDArray[np.bool_],
+        declared: float | None = None,
+    ) -> None:
         self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
         self.told = free.copy()
         self.chosen = [0] * len(TERMS)
         self.x: list[Array] = [np.zeros(1) for _ in TERMS]
-        self.s, self.walk = np.ones(2), 0.0
+        self.s, self.walk, self.declared = np.ones(2), 0.0, declared
+        self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of told terms
         self.linearise()
 
     def check(self) -> None:
@@ -254,11 +277,15 @@ class _Search:
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
 
+    def _walked(self) -> Array:
+        """Return the covariance (m, m) of the equations over their white noise that a walk of density one leaves."""
+        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
+        return np.asarray((J @ J.T) * np.minimum.outer(t, t))
+
     def _covariance_of_noise(self, walk: float) -> Array:
         """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
-        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
-        walked = (J @ J.T) * np.minimum.outer(t, t)
-        return np.asarray(np.eye(len(J)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
+        walked = self._walked()
+        return np.asarray(np.eye(len(walked)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
 
     def column(self, j: int, curve: TermCurve) -> Array:
         """Return the whitened columns (m, q) of a term's curve."""
@@ -322,21 +349,25 @@ class _Search:
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
-        prices, squares, z, J = [], [], self.e.left, self._J
+        prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
         z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
         curves = self._curves(self.chosen)
         X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.told[j]])
+        usual = 1.0 if not self.declared else self.declared**2 * float(np.max(np.diag(self._walked()))) + TINY
         for walk in WALKS:
             root = np.linalg.cholesky(self._covariance_of_noise(walk))
             A, y = np.linalg.solve(root, X), np.linalg.solve(root, z)
             N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
-            left = y - A @ np.linalg.solve(N, A.T @ y)
+            solutions.append(np.linalg.solve(N, A.T @ y))
+            left = y - A @ solutions[-1]
             spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
             squares.append(float(left @ left) / max(len(z) - A.shape[1], 1) + TINY)
             prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(squares[-1])))
-        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS)
-        white = float(likely @ squares / np.sum(likely))
-        self.walk = float(likely @ (np.array(squares) * WALKS) / np.sum(likely)) / white
+        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS) / (1 + np.array(WALKS) / usual)
+        likely /= np.sum(likely)
+        white = float(likely @ squares)
+        self.walk = float(likely @ (np.array(squares) * WALKS)) / white
+        self.by_walk = list(zip(likely.tolist(), solutions, strict=True))
         self.s = self.s * np.sqrt(white)
 
     def _take(self, solution: Array) -> None:
@@ -398,10 +429,11 @@ class _Search:
         design = [
             polynomial(1, domain) if line else c for line, c in zip(straight, self._curves(self.chosen), strict=True)
         ]
-        N, _ = self._system(design, self.free, wide=1.0)
+        N, A = self._system(design, self.free, wide=1.0)
         starts = np.cumsum([0, *(curve.q for curve in design)])
-        sigma = np.sqrt(np.diag(np.linalg.inv(N)))
-        untold = np.zeros(len(TERMS), dtype=bool)
+        whole = np.linalg.inv(N)
+        sigma, moved = np.sqrt(np.diag(whole)), whole @ (A.T @ self.z)
+        untold, pinned = np.zeros(len(TERMS), dtype=bool), []
         for j, start in enumerate(starts[:-1]):
             own = range(start, starts[j + 1])
             if self.told[j] and straight[j]:
@@ -409,12 +441,29 @@ class _Search:
             # no change was seen where one would have been: there is none; and terms that are not free are known
             known = own[1:] if self.told[j] and straight[j] and not untold[j] else own[:0] if self.free[j] else own
             N[known, known] += 1 / TINY
+            pinned += list(known) if self.free[j] else []
         length = np.zeros((len(N), 1))  # an input whose size is unsure: all scale factors go with it
         for j in SCALE:
             flat = np.any(design[j].penalty)  # curves of a kind add up to one, of a polynomial the first is one
             length[starts[j] : starts[j + 1] if flat else starts[j] + 1] = self.stimulus.unsure
-        root = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, length])
+        b, s = moved[pinned], sigma[pinned]
+        share = 1 / (1 + np.sqrt(len(self.z)) * np.exp(-((b / s) ** 2) / 2))
+        others = np.linalg.solve(whole[np.ix_(pinned, pinned)], whole[pinned]).T  # by which the others go with a change
+        doubt = others * np.sqrt(share * (s**2 + b**2))
+        freedom = max(len(self.z) - len(N) + len(pinned), 3)
+        inside = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, doubt]) * np.sqrt(freedom / (freedom - 2))
+        root = np.hstack([inside, self._scatter_over_walks(starts), length])
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
             tuple(self.s.tolist()),
         )  # fmt: skip
+
+    def _scatter_over_walks(self, starts: Array) -> Array:
+        """Return the modes (n, walks) of the coefficients' scatter over the walks that are likely."""
+        sizes = [curve.q if told else 0 for curve, told in zip(self._curves(self.chosen), self.told, strict=True)]
+        places = np.concatenate([start + np.arange(q) for start, q in zip(starts[:-1], sizes, strict=True)])
+        modes = np.zeros((int(starts[-1]), len(self.by_walk)))
+        if all(len(x) == len(places) for _, x in self.by_walk):
+            mean = sum((p * x for p, x in self.by_walk), np.zeros(len(places)))
+            modes[places.astype(np.int64)] = np.stack([np.sqrt(p) * (x - mean) for p, x in self.by_walk], axis=1)
+        return modes

@@ -16,6 +16,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.effect import Effect
 from fusion_core.errors import ConfigError
 from fusion_core.thermal.fitted_map import FittedMap
+from fusion_core.thermal.triad_matrix import TriadMatrix
 from fusion_core.units import convert
 
 TEMPERATURES = 2001  # over a domain, at which a map is looked at
@@ -68,6 +69,11 @@ class Calibrated:
                 f"{self.channel}: has no thermal map; name one with its path in the config, or give a map's file"
             )
         return self.map
+
+    @property
+    def matrix(self) -> TriadMatrix | None:
+        """Scale factor and misalignment over temperature; None where the map has none."""
+        return None if self.map is None else self.map.record.matrix
 
     def without(self, *effects: Effect) -> Calibrated:
         """Return the same without some of its effects."""

@@ -64,6 +64,11 @@ class Exporter(Plugin):
     suffix: ClassVar[str] = ""  # of the file; empty where it is a folder
     folder: ClassVar[bool] = False  # whether it writes several files, into a folder
 
+    @property
+    def holds_matrix(self) -> bool:
+        """True where the file has scale factor and misalignment too; `Loss` says then what of them is lost."""
+        return False
+
     @abstractmethod
     def export(self, what: Export, path: Path) -> Loss:
         """Write what the target can hold to the file `path` (into it, where `folder`), and return what is lost.

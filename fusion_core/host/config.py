@@ -167,7 +167,10 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
         case "union_tag_invalid":
             return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
-            return "needs a `kind:`; write which plugin is meant"
+            known = "`driftlab plugins` lists those known"
+            return f"needs a `kind:`; {known}" + (
+                ", and `driftlab init FILE` writes it" if "source" in item["loc"] else ""
+            )
         case "model_type" | "model_attributes_type":
             return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":

@@ -55,8 +55,12 @@ class ImuNoise(Exporter):
     """Time over which the program goes by a bias before it sees it anew: the walk covers what the bias does in it."""
 
     @abstractmethod
-    def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
+    def text(self, what: Export, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the lines of the file, but for the comments, from the noise of `gyro` and `accel`."""
+
+    def notes(self, what: Export) -> Iterator[str]:
+        """Yield notes beside those on the noise."""
+        yield from ()
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write the largest density of each sensor's axes."""
@@ -66,8 +70,9 @@ class ImuNoise(Exporter):
         noise = {channel: self._noise(what, channel) for channel in SENSORS}
         maps = [sensor for sensor in what.sensors if sensor.map is not None]
         left_out = tuple(f"the {sensor.channel}'s thermal map and effects" for sensor in maps)
-        loss = Loss((), left_out, tuple(note for sensor in noise.values() for note in sensor.notes))
-        first, *rest = self.text(rate, noise)
+        notes = (note for sensor in noise.values() for note in sensor.notes)
+        loss = Loss((), left_out, (*notes, *self.notes(what)))
+        first, *rest = self.text(what, rate, noise)
         head = [first] if first.startswith("%") else []
         comments = [comment(line) for line in self._comments(what, noise, loss)]
         path.write_text("\n".join([*head, *comments, *([] if head else [first]), *rest]) + "\n", encoding="utf-8")

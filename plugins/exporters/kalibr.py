@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fusion_core.contracts import Exporter
+from fusion_core.contracts import Export, Exporter
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise
 
@@ -30,7 +30,7 @@ class Kalibr(ImuNoise):
 
     kind: Literal["kalibr"] = "kalibr"
 
-    def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
+    def text(self, what: Export, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the six keys that Kalibr reads."""
         return [*densities(noise), f'rostopic: "{self.topic}"', f"update_rate: {float(rate)!r}  # Hz"]
 

@@ -11,6 +11,7 @@ from driftlab.errors import FusionError
 FUNCTIONS = [getattr(driftlab, name) for name in driftlab.__all__ if inspect.isfunction(getattr(driftlab, name))]
 STRANGE = [object(), b"x", 3.5j, [object()], {1: 2}, (None,), np.zeros(3), "\0", lambda: 1, -1, 10**5000]
 GIVEN = {"config": "map.yaml", "configs": ["a.yaml", "b.yaml"], "what": "map.yaml", "file": "a.h5", "kind": "px4"}
+GIVEN["logs"] = ["a.ulg"]
 GIVEN |= dict.fromkeys(("out", "units", "calibration", "train", "holdout"), "none")
 
 

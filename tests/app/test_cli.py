@@ -173,6 +173,9 @@ def test_plugins_schema_and_check(bench):
     checked = driftlab("check", "unfitted.yaml", "--input", "ramp.h5", cwd=bench)
     assert checked.returncode == 0, checked.stderr
     assert "# map polynomial: has no path; `run` needs one" in checked.stdout
+    (bench / "no_source.yaml").write_text("filter: {gyro: {noise: 1 deg/h/sqrt(Hz), bias: {kind: constant}}}\n")
+    checked = driftlab("check", "no_source.yaml", cwd=bench)
+    assert "# source: is missing, so no recording can be read; `driftlab init FILE` writes that" in checked.stdout
 
 
 @pytest.mark.parametrize(
@@ -199,10 +202,16 @@ def test_plugins_schema_and_check(bench):
         (("check", "no_gyro.yaml", "--input", "ramp.h5"), 1, "name it under source.channels, as 'gyros' is"),
         (("run", "no_g.yaml", "--input", "si.h5"), 1, "accel: shows 1.003 m/s^2 at rest, 9.803 was expected"),
         (("fit-map", "no_g.yaml", "--input", "si.h5"), 1, "correct the unit and path of source.channels.accel"),
+        (
+            ("check", "no_kind.yaml"),
+            2,
+            "no_kind.yaml:1: source: needs a `kind:`; `driftlab plugins` lists those known, and",
+        ),
         (("check", "extend.yaml"), 2, "extend: unknown key; did you mean 'extends'?"),
     ],
 )
 def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message):
+    (bench / "no_kind.yaml").write_text("source: {path: log.ulg}\n")
     (bench / "wrong.yaml").write_text(
         CONFIG.replace("  gyro:\n    bias", "  gyro:\n    noise: 3.18\n    bias").lstrip()
     )

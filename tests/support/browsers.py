@@ -87,6 +87,9 @@ def assert_drawn_everywhere(opened, where: Path, figures: int) -> None:
         assert overflow(shown) == 0
         assert_nothing_is_cut_in_silence(shown)
         assert shown.locator("figure.chart").count() == figures
+        shown.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
+        shown.wait_for_function("driftlab.charts.every((c) => c.plots.every((p) => p.width === c.width()))")
+        assert overflow(shown) == 0
         assert all(colours(shown, k) > 5 for k in range(figures))
         ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (ground == "rgb(255, 255, 255)") is not dark

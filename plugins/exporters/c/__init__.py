@@ -4,6 +4,7 @@
 
     gyro_bias(T)         the map, as straight lines between knots; beyond its domain its value there
     gyro_bias_step(...)  the same with what effects add, their memories in a struct
+    gyro_input(...)      a reading less its bias, scale factor and misalignment, where the map has them
 
 The loss is measured in the code's own arithmetic, bit for bit: `emulation`.
 """
@@ -19,11 +20,12 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, SensorLoss
+from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.contracts.exporter import Deviation, warm_up
 from fusion_core.errors import ConfigError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension
-from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, program_of, why_not
+from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, inverse_of, program_of, why_not
 
 _OF_KNOWN = 0.1  # of what the map itself is good to: the loss where none is set
 _OF_SWING = 1e-4  # at least
@@ -41,6 +43,11 @@ class C99(Exporter):
 
     knots: Literal["smallest", "float"] = "smallest"
     """As what knots are kept: 16-bit integers with a scale where these are fine enough for the loss, or float."""
+
+    @property
+    def holds_matrix(self) -> bool:
+        """True: as a table beside that of the bias."""
+        return True
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write header, source and self-test of each sensor that has a map."""
@@ -71,11 +78,11 @@ class C99(Exporter):
         loss = Loss(
             (self._measured(sensor, held, program),),
             tuple(f"{sensor.channel}: {effect.kind}: {reason}" for effect, reason in left),
-            tuple(self._notes(held)),
+            (*self._notes(held), *_matrix_notes(held, program)),
         )
-        size = sum(table.size for table in program.tables)
+        size = sum(table.size for table in program.lookups)
         effects = [f"{effect.kind} of {effect.subject}" for effect in held.effects]
-        knots = " and ".join(str(len(table.knots)) for table in program.tables)
+        knots = " and ".join(str(len(table.knots)) for table in program.lookups)
         comment = [
             *([f"Unit {serial}."] if serial else []),
             f"A {sensor.fitted.record.kind} map as straight lines between {knots} knots, {size} bytes.",
@@ -137,6 +144,17 @@ class C99(Exporter):
             channels = " and ".join(sorted(channels_of(effect)))
             if channels:
                 yield f"{sensor.channel}: {effect.kind} of {channels} is in the code; the warm-up has no such channel"
+
+
+def _matrix_notes(sensor: Calibrated, program: Program) -> Iterator[str]:
+    """Yield the loss of scale factor and misalignment in the code's own arithmetic."""
+    from fusion_plugins.exporters.c.emulation import look_up
+
+    if program.matrix is not None:
+        T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
+        error = np.abs(look_up(program.matrix, T.astype(np.float32)) - inverse_of(sensor)(T))
+        largest = 1e6 * np.max(error.reshape(-1, 3, 3).sum(axis=2))
+        yield f"{sensor.channel}: scale factor and misalignment lose {largest:.2g} ppm of the input at most"
 
 
 def usual_loss(sensor: Calibrated) -> Array:

@@ -37,6 +37,16 @@ def at_rest(program: Program, T: Single) -> Single:
     return bias
 
 
+def inputs(program: Program, T: Single, bias: Single, reading: Single) -> Single:
+    """Return the inputs (N, 3) of readings (N, 3) with a bias (N, 3) at temperatures T (N,)."""
+    assert program.matrix is not None
+    terms, less = look_up(program.matrix, T), reading - bias
+    out = less
+    for k in range(3):
+        out = out + terms[:, k::3] * less[:, k, None]
+    return out
+
+
 def run(program: Program, dt: Single, channels: Mapping[str, Single]) -> Single:
     """Return the bias (N, d) over a sequence; at its first sample the state is begun, and dt (N,) is zero there.
 

@@ -3,8 +3,10 @@
 ::
 
     bias = table_1(u_1) + table_2(u_2) + ... + weights s
+    input = r + N(T) r,    r = reading - bias,    N = (I + M)^-1 - I
 
-A signal that is asked for twice is computed once. d axes, q signals s with weights.
+The second is of a map with scale factor and misalignment, and N a table of nine columns. A signal that is asked for
+twice is computed once. d axes, q signals s with weights.
 
 Knots of straight lines that follow a curve: as few as a given loss allows, in as few bytes.
 
@@ -46,16 +48,24 @@ class Program:
     signals : tuple of q Signal
         With weights of their own.
     weights : (d, q) array of float32
+    matrix : LookupTable or None
+        N, row by row.
     """
 
     tables: tuple[LookupTable, ...]
     signals: tuple[Signal, ...]
     weights: Single
+    matrix: LookupTable | None = None
 
     @property
     def d(self) -> int:
         """Number of axes."""
         return len(self.weights)
+
+    @property
+    def lookups(self) -> tuple[LookupTable, ...]:
+        """All tables: those of the bias, then the matrix."""
+        return self.tables if self.matrix is None else (*self.tables, self.matrix)
 
     @cached_property
     def nodes(self) -> tuple[Signal, ...]:
@@ -135,7 +145,27 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
             return None
         tables.append(table)
     weights = np.stack(list(signals.values()), axis=1) if signals else np.zeros((len(sensor.axes), 0))
-    return Program(tuple(tables), tuple(signals), weights.astype(np.float32))
+    matrix = None
+    if sensor.matrix is not None:
+        matrix = fewest(TEMPERATURE, inverse_of(sensor), (low, high), _matrix_loss(sensor), floats=floats)
+        if matrix is None:
+            return None
+    return Program(tuple(tables), tuple(signals), weights.astype(np.float32), matrix)
+
+
+def inverse_of(sensor: Calibrated) -> Curve:
+    """Return the function of T (N,) -> (N, 9), N = (I + M)^-1 - I row by row, of a map with a matrix."""
+    matrix, one = sensor.matrix, np.eye(3)
+    assert matrix is not None
+    return lambda T: (np.linalg.inv(one + matrix.at(T)) - one).reshape(-1, 9)
+
+
+def _matrix_loss(sensor: Calibrated) -> Array:
+    """Return a tenth (9,) of what the terms are known to, 0.1 to 10 ppm."""
+    matrix = sensor.matrix
+    assert matrix is not None
+    known = matrix.sigma(np.linspace(*sensor.fitted.domain, MATRIX_PLACES))
+    return np.asarray(np.clip(0.1 * np.sqrt(np.mean(known**2, axis=0)), 1e-7, 1e-5))
 
 
 def why_not(effect: Effect) -> str | None:
@@ -161,6 +191,7 @@ Curve = Callable[[Array], Array]
 MAX_KNOTS = 1000  # knots
 _BETWEEN = 12  # places an interval at which the error is looked at
 _KEPT = 0.99  # of the loss: the rest is for the curve between those places, and for single precision
+MATRIX_PLACES = 200  # temperatures at which the matrix is looked at
 _RESOLVED = 0.1  # of the loss: the largest error of rounding to integers
 
 
@@ -192,9 +223,14 @@ class LookupTable:
     scale: Single
 
     @property
+    def d(self) -> int:
+        """Number of columns."""
+        return int(self.knots.shape[1])
+
+    @property
     def size(self) -> int:
         """Bytes of the constants."""
-        return self.knots.size * 2 + 8 * self.knots.shape[1] if self.whole else self.knots.size * 4
+        return self.knots.size * 2 + 8 * self.d if self.whole else self.knots.size * 4
 
 
 def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *, floats: bool) -> LookupTable | None:

@@ -15,13 +15,14 @@ from fusion_core.contracts import Calibrated, effect
 from fusion_core.contracts.exporter import HOUR, warm_up
 from fusion_core.errors import ConfigError, quote
 from fusion_core.escaping import c_comment
-from fusion_plugins.exporters.c.emulation import LONGEST, UPDATES, at_rest, run
+from fusion_plugins.exporters.c.emulation import LONGEST, UPDATES, at_rest, inputs, run
 from fusion_plugins.exporters.c.program import Program, Single
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
 PAIRS = 32  # of the self-test
+READING = np.array([1.0, -2.0, 0.5], dtype=np.float32)  # of the self-test
 _FAR = 1e30  # degC: outside of every thermometer
 _ULPS = 8  # by which other rounding may differ
 _TAKEN = (
@@ -85,6 +86,7 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
     )
     content = {
         "name": stem,
+        "input": f"{identifier(sensor.channel)}_input",
         "NAME": stem.upper(),
         "what": c_comment(f"the {sensor.channel}"),
         "unit": c_comment(sensor.unit),
@@ -144,6 +146,10 @@ def _answers(sensor: Calibrated, program: Program) -> dict[str, Any]:
     T = np.concatenate([[-_FAR, low, high, _FAR], inside]).astype(np.float32)
     expected = at_rest(program, T)
     answers: dict[str, Any] = {"count": PAIRS, "temperatures": T, "expected": expected}
+    if program.matrix is not None:
+        turned = inputs(program, T, expected, np.broadcast_to(READING, expected.shape))
+        answers |= {"reading": READING, "expected_input": turned}
+        answers["input_tolerance"] = _ULPS * float(np.spacing(np.max(np.abs(turned))))
     largest = np.max(np.abs(expected))
     if program.remembers:
         step, recording = HOUR / PAIRS, warm_up((low, high))

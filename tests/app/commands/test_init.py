@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import polars as pl
 import pytest
+import yaml
 from bags import FIELDS, unit
 from bags import write as bag
 from bench import FRAMING, frame
@@ -28,6 +29,7 @@ from driftlab.commands.allan import allan
 from driftlab.commands.init import init
 from driftlab.commands.simulate import simulate
 from driftlab.config import load_config
+from driftlab.starter.config_text import with_map
 from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -419,7 +421,21 @@ def test_go_fits_the_map_at_once(tmp_path, monkeypatch):
     done = driftlab("init", "rec.csv", "--go")
     assert done.exit_code == 0, done.output
     assert f"the page: {tmp_path / 'rec.map.report.html'}" in done.output
-    assert (tmp_path / "rec.map.json").is_file()
+    assert "    calibration: {kind: spline, path: rec.map.json}\n" in (tmp_path / "rec.yaml").read_text()
+    assert "to use it" not in done.output
+    assert "rec.yaml names the map now; next: driftlab run rec.yaml" in done.output
+    assert driftlab("run", "rec.yaml").exit_code == 0
+    again = driftlab("init", "rec.csv", "--go")  # both files are as they were written
+    assert again.exit_code == 0, again.output
+
+
+def test_the_map_takes_the_place_of_its_comment(tmp_path):
+    """A column that is called calibration is none; nor is a config without the comment touched."""
+    write_log(tmp_path / "vehicle.bin", UNIT.t + 1, [(UNIT.gyro, UNIT.accel, UNIT.temperature)])
+    config = with_map(init(tmp_path / "vehicle.bin").text, "spline", "a \\1.json")
+    assert yaml.safe_load(config)["filter"] == {"gyro": {"calibration": {"kind": "spline", "path": "a \\1.json"}}}
+    other = "    # calibration: {path: calibration}\n"
+    assert with_map(other, "spline", "a.json") == other
 
 
 def test_allan_measures_the_noise_that_a_config_lacks(tmp_path):

@@ -155,6 +155,7 @@ def test_what_it_cannot_use_is_said(folder, tmp_path):
 @pytest.mark.recordings
 def test_a_measured_log_of_three_units_that_is_too_short_says_so_of_each():
     logs = sorted((Path(os.environ["DRIFTLAB_DATA"]) / "data" / "px4_ulog").glob("*.ulg"))
+    assert logs
     for log in logs:
         result = driftlab.vehicle(log)
         assert [one.name for one in result.sensors] == [f"{name} {k}" for name in ("gyro", "accel") for k in range(3)]

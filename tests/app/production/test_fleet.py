@@ -367,3 +367,26 @@ def test_a_map_that_was_changed_is_not_certified(fleet):
     result, _ = fleet(certificate=True)
     assert sorted(certificates()) == ["0000", "0002"]
     assert any(line.startswith("unit 0001 has no certificate: ") for line in result.lines())
+
+
+def test_the_yield_is_told_by_the_columns_that_are_asked_for(fleet):
+    result, asked = fleet()
+    whole, rows = result.summary["yield"], table().unique("unit").sort("unit")
+    assert asked == []
+    passed = rows["limits"].to_list().count("pass")
+    assert (whole["units"], whole["accepted"]) == (COUNT, passed)
+    assert [*whole["by"]] == ["lot"]
+    again, asked = fleet(by=["chamber", "T_low"])
+    told = again.summary["yield"]["by"]
+    assert asked == []  # the units stay as they are
+    assert [(one["chamber"], one["units"]) for one in told["chamber"]["groups"]] == [("K0", 2), ("K1", 2)]
+    assert told["T_low"]["groups"][-1]["T_low"] == "not known"  # of the unit that failed
+    assert any(line.startswith(f"yield: {passed} of {COUNT} units, ") for line in again.lines())
+    assert "By chamber" in (Path("made") / "report.html").read_text()
+    assert sum(len(why) > 0 for why in rows["reasons"]) == COUNT - passed
+    assert rows["reasons"].to_list()[3][0].startswith("not calibrated: ")
+    assert {reason for why in rows["reasons"] for reason in why} == set(whole["reasons"])
+    same, _ = fleet(by=["chamber", "T_low"])  # nothing is made again, and it says the same
+    assert same.summary["yield"] == again.summary["yield"]
+    with pytest.raises(ConfigError, match=r"--by colour: no such column; choose lot, .*chamber"):
+        fleet(by=["colour"])

@@ -14,8 +14,10 @@ from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES, figure_name
 from driftlab.reports import fleet as fleet_rows
 from driftlab.reports.fleet import write_fleet_report
-from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, control_charts, percentiles
+from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, percentiles
+from driftlab.reports.line_charts import control_charts
 from driftlab.spc.line import line_of
+from driftlab.spc.yields import yields_of
 from driftlab.units import RATE
 
 LIMITS = Limits.model_validate({"noise": "2.6 deg/h/sqrt(Hz)"})
@@ -87,18 +89,21 @@ def test_it_says_what_the_fleet_is(path, overview, opened):
         assert said in text
     assert shown.locator(".verdict.fail").inner_text().startswith("Limits: ")
     assert shown.title() == "line"  # no text of a file is taken for a part of the page
-    noise = next(row for row in overview.line.capability if (row.quantity, row.axis) == ("noise", "x"))
-    assert f"{noise.ppk_low:.2f} to {noise.ppk_high:.2f}" in text
+    rows = [row for row in overview.line.capability if row.quantity == "noise"]
+    assert {row.trusted for row in rows} == {True, False}  # x, which has changed, is not normal over the whole line
+    for row in rows:
+        said = f"({row.cpk_low:.2f} to {row.cpk_high:.2f})\t{row.ppk:.2f} (" if row.trusted else f"none: {row.why_not}"
+        assert said in text
 
 
 def test_all_of_it_is_drawn_on_a_desk_and_on_a_phone(path, opened):
-    assert_drawn_everywhere(opened, path, figures=2 + 5)
+    assert_drawn_everywhere(opened, path, figures=2 + 5 + 1 + 5)
 
 
 def test_every_panel_and_every_figure_has_its_unit(path, opened):
     shown = opened(path)
-    labels = shown.locator(".panels .label").all_inner_texts()
-    assert len(labels) == 7 + 15
+    labels = shown.locator(".panels .label").all_text_contents()
+    assert len(labels) == 7 + 2 * 15 + 6 + 5 * 6  # values and moving ranges, against the limit, lots
     assert all("[" in label for label in labels if label != "units measured")
     shown.select_option("#columns", "all")
     heads = shown.locator(".rows th button").all_inner_texts()
@@ -209,8 +214,33 @@ def test_few_units_have_a_page(opened, tmp_path, count):
     path = tmp_path / "report.html"
     write_fleet_report(path, fleet(count))
     shown = opened(path)
-    assert shown.locator("figure.chart").count() == (7 if count == 10 else 1)  # of one unit no differences
+    assert shown.locator("figure.chart").count() == (13 if count == 10 else 1)  # of one unit no differences
     assert shown.locator("#count").inner_text() == f"{count} of {count} units"
+
+
+def test_yield_reasons_and_groups_are_on_the_page_and_fit_a_phone(opened, tmp_path):
+    found = fleet(300, failed=(7, 30), odd=(11, 45))
+    told = yields_of(found.records, found.odd, ["chamber", "lot", "date"])
+    path = tmp_path / "report.html"
+    write_fleet_report(path, replace(found, yields=told))
+    for width in (1100, 390):
+        shown = opened(path, width=width)
+        text = shown.locator("body").inner_text()
+        assert overflow(shown) == 0
+        assert f"{told.whole.accepted} of 300 units are accepted: {100 * told.whole.share:.3g} % (" in text
+        assert "noise above limit" in shown.locator(".pareto").inner_text()
+        counts = shown.eval_on_selector_all(".pareto tbody tr", "rows => rows.map((row) => row.cells[1].textContent)")
+        assert counts == [str(count) for count in told.whole.reasons.values()]
+        rows = shown.locator(".yields").first.locator("tbody tr").all_inner_texts()
+        assert [row.split()[:4] for row in rows] == [
+            [one.name, str(one.accepted), "of", str(one.units)] for one in told.by["chamber"]
+        ]
+        assert "The yield differs by lot (p ≤ 0.0001 by chance)" in text  # the noise has changed
+        assert "No difference by chamber is seen" in text
+        bar, stroke = (shown.locator(f".yields .track {tag}").first.bounding_box() for tag in "bu")
+        assert bar["x"] < stroke["x"] + 2 <= bar["x"] + bar["width"] + 4
+        assert shown.locator(".yields").last.locator("tbody tr").count() == 180  # of 300 days, 20 before them
+        assert "100 more are in fleet.json" in shown.locator("body").text_content()
 
 
 def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):
@@ -245,7 +275,7 @@ def test_a_unit_far_off_leaves_the_scale_to_the_others_and_its_value_in_the_labe
     records[20] = records[20].model_copy(update={"figures": {**records[20].figures, "noise": far}})
     (chart,) = [chart for chart in control_charts(line_of(records, LIMITS)) if chart.title.startswith("White noise")]
     values = np.array([one.figures["noise"].value for k, one in enumerate(records) if k != 20]) * RATE.factor
-    for k, panel in enumerate(chart.panels):
+    for k, panel in enumerate(chart.panels[::2]):  # between them the moving ranges
         assert panel.span[1] < 2 * values[:, k].max()
         assert panel.label.endswith(f"beyond the axis: {records[20].unit} at {far.value[k] * RATE.factor:.3g}")
         (beyond,) = [one for one in panel.lines if one.name == "beyond three sigma"]
@@ -302,7 +332,8 @@ def test_long_names_are_told_apart_on_a_phone_and_under_the_charts(opened, tmp_p
     assert overflow(shown) == 0
     reason = shown.locator(".reasons td").first
     assert reason.bounding_box()["x"] + reason.bounding_box()["width"] <= 390
-    said = shown.evaluate("driftlab.charts.at(-1).label(18).split('\\n')[0]")
+    said = shown.evaluate("driftlab.charts.find((one) => one.content.named === 'units-of-the-line').label(18)")
+    said = said.split("\n")[0]
     assert said == "…l-2026-0017"  # the unit at place 18, by what no other unit has
     lefts = shown.eval_on_selector_all(
         ".rows td.left:first-child", "(all) => all.map((a) => getComputedStyle(a).position)"

@@ -20,7 +20,7 @@ from fusion_core.host.registry import registry
         ("latitude", "latitud", r":2: latitud: unknown key; did you mean 'latitude'\?"),
         (", walk", ", wlak", r":4: filter\.gyro\.bias\.wlak: unknown key; did you mean 'walk'\?"),
         ("kind: random_walk", "kind: random_wlk", r"kind 'random_wlk' is not installed; did you mean random_walk\?"),
-        ("kind: random_walk, ", "", r"filter\.gyro\.bias: needs a `kind:`"),
+        ("kind: random_walk, ", "", r"gyro\.bias: needs a `kind:`; `driftlab plugins` lists those known$"),
         ("noise: 3.18 deg/h/sqrt(Hz), ", "", r"filter\.gyro\.noise: is required and missing"),
         ("5e-4 deg/s/sqrt(s)", "5e-4 m/s^2/sqrt(s)", r"bias\.walk: '5e-4 m/s\^2/sqrt\(s\)' cannot be converted"),
         ("filter:", "filter: [", r"config\.yaml:\d: is not YAML \(expected"),

@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from driftlab.errors import ConfigError
-from fusion_core.contracts import Factor, Inflation, Lag
+from fusion_core.contracts import CurveError, Factor, Inflation, Lag, TriadMatrix
 from fusion_core.testing.exporters import unit
 from fusion_core.units import Quantity
 from fusion_plugins.exporters.kalibr import Kalibr
@@ -69,6 +69,43 @@ def test_openvins_has_what_its_reader_wants(tmp_path):
     }.items():
         np.testing.assert_array_equal(read[key], value)
     np.testing.assert_array_equal(read["Tg"], np.zeros((3, 3)))
+
+
+def test_openvins_takes_off_scale_factor_and_misalignment_at_a_temperature(tmp_path):
+    """By its own arithmetic: R_GYROtoIMU Dw (reading - bias), Dw lower triangular, R the inverse of the file's."""
+    rng, T = np.random.default_rng(4), np.array([-20.0, 5.0, 60.0])
+    error = CurveError(T=(-20.0, 60.0), modes=(((1e-4,) * 9, (2e-4,) * 9),), bend=(0.0,) * 9)
+    what, matrices = unit("gyro", "accel"), {}
+    sensors = []
+    for sensor in what.sensors:
+        values, slopes = rng.normal(0, 0.02, (3, 9)), rng.normal(0, 1e-4, (3, 9))
+        matrix = TriadMatrix(
+            T=T.tolist(), values=values.tolist(), slopes=slopes.tolist(), frame="given", kinds=("order 3",) * 9,
+            told=(True,) * 9, error=error,
+        )  # fmt: skip
+        matrices[sensor.channel] = matrix
+        sensors.append(replace(sensor, map=sensor.map.noting(matrix=matrix, domain=(-20.0, 60.0))))
+    exporter, what = OpenVins(at=Quantity(5.0, "5 degC")), replace(what, sensors=tuple(sensors))
+    text, loss = written(exporter, what, tmp_path)
+    read, u = yaml.safe_load(text.split("\n", 1)[1])["imu0"], rng.normal(size=3)
+    for channel, names in (("gyro", ("Tw", "R_IMUtoGYRO")), ("accel", ("Ta", "R_IMUtoACC"))):
+        triangle, rotation = (np.array(read[name]) for name in names)
+        D = np.linalg.inv(triangle)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-8)
+        assert np.linalg.det(rotation) > 0
+        np.testing.assert_allclose(triangle[np.triu_indices(3, 1)], 0.0, atol=1e-9)
+        y = u + matrices[channel].at(np.array([5.0]))[0] @ u
+        np.testing.assert_allclose(rotation.T @ np.tril(D) @ y, u, atol=1e-8)
+        change = matrices[channel].at(np.linspace(-20, 60, 2001)) - matrices[channel].at(np.array([5.0]))
+        ppm = 1e6 * np.max(np.abs(change).sum(axis=2))
+        assert f"{channel}: scale factor and misalignment are those of 5 degC" in text
+        assert f"they lose {ppm:.3g} ppm of the input at most" in "\n".join(loss.notes)
+    with pytest.raises(ConfigError, match="at 80 degC is beyond the map of gyro, -20 to 60 degC; give one within"):
+        written(OpenVins(at=Quantity(80.0, "80 degC")), what, tmp_path)
+    vins = OpenVins(form="vins")
+    assert exporter.holds_matrix
+    assert not vins.holds_matrix
+    assert not any("misalignment" in note for note in written(vins, what, tmp_path)[1].notes)
 
 
 def test_vins_integrates_to_the_same_variances(tmp_path):

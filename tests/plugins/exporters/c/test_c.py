@@ -11,13 +11,13 @@ from firmware import AT_REST, M0, M4, RUNNING, STRICT, answers, bits, built
 from tools import tool
 
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import Calibrated, Effect, Export, MapRecord
+from fusion_core.contracts import Calibrated, CurveError, Effect, Export, MapRecord, TriadMatrix
 from fusion_core.contracts.effect import Domain, Function
 from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_plugins.exporters.c import C99
-from fusion_plugins.exporters.c.emulation import at_rest, run
+from fusion_plugins.exporters.c.emulation import at_rest, inputs, run
 from fusion_plugins.exporters.c.program import program_of
 
 DEG_H = np.pi / 180 / 3600
@@ -410,3 +410,60 @@ def test_a_loss_of_another_unit_and_one_that_is_too_small_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"export c: 1000 knots leave more of gyro than .* deg/h; set a larger loss"):
         exported(tmp_path, sensor(), loss="1e-4 deg/h")
     assert not list(tmp_path.iterdir())
+
+
+INPUT = """
+#include "gyro_bias.h"
+int main(void)
+{
+    float input[3];
+    while (filled()) { gyro_input(in[0], in + 1, in + 4, input); put(input, sizeof input); }
+    return 0;
+}
+"""
+
+
+def turned():
+    """A sensor whose map has scale factors and misalignments that bend over temperature by a per cent."""
+    T, rng = np.linspace(LOW, HIGH, 5), np.random.default_rng(3)
+    error = CurveError(T=(LOW, HIGH), modes=(((1e-4,) * 9, (2e-4,) * 9),), bend=(0.0,) * 9)
+    matrix = TriadMatrix(
+        T=T.tolist(), values=rng.normal(0, 5e-3, (5, 9)).tolist(), slopes=rng.normal(0, 1e-4, (5, 9)).tolist(),
+        frame="given", kinds=("order 3",) * 9, told=(True,) * 9, error=error,
+    )  # fmt: skip
+    known = sensor(*EFFECTS[:1])
+    return replace(known, map=known.map.noting(matrix=matrix))
+
+
+@compiled
+@pytest.mark.parametrize("knots", ["smallest", "float"])
+def test_scale_factor_and_misalignment_are_those_of_the_emulation(tmp_path, flags, arm, knots):
+    known, rng = turned(), np.random.default_rng(2)
+    loss = exported(tmp_path, known, knots=knots)
+    own = program_of(known, np.full(3, DEG_H), floats=knots == "float")
+    assert own.matrix.whole is (knots == "smallest")
+    T = temperatures()[::5]
+    bias, reading = (rng.normal(0, size, (len(T), 3)).astype(np.float32) for size in (1e-3, 3.0))
+    given = np.column_stack([T, bias, reading])
+    found = answers(built(tmp_path, INPUT, 7, flags, arm=arm), given)
+    np.testing.assert_array_equal(bits(found), bits(inputs(own, T, bias, reading)))
+
+    inside = np.isfinite(T) & (T > LOW) & (T < HIGH)  # and it is the map's own inverse, within what is said
+    less = reading[inside].astype(float) - bias[inside]
+    exact = less - known.map.record.matrix.distortion(less, T[inside].astype(float))
+    ppm = float(next(note for note in loss.notes if "misalignment lose" in note).split(" ppm")[0].split()[-1])
+    off = np.max(np.abs(found[inside] - exact), axis=1) / np.max(np.abs(less), axis=1)
+    assert 0.3 * ppm < 1e6 * np.max(off) < 1.05 * ppm + 1
+    assert ppm < 3 * 10
+    assert not any("misalignment" in what for what in loss.left_out)
+
+
+def test_the_self_test_sees_a_wrong_matrix(tmp_path):
+    exported(tmp_path, turned(), knots="float")
+    command = [tool("gcc"), *STRICT, "-DTOLERANCE=0.0f", "gyro_bias.c", "gyro_bias_test.c", "-o", "selftest"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "selftest"]).returncode == 0
+    source = tmp_path / "gyro_bias.c"
+    source.write_text(source.read_text().replace("terms[(3u * axis) + k]", "terms[axis + (3u * k)]"))
+    subprocess.run(["gcc", "-std=c99", "gyro_bias.c", "gyro_bias_test.c", "-o", "selftest"], cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "selftest"]).returncode == 32

@@ -1,0 +1,223 @@
+"""Yield of a line and the reasons of what is not accepted (Pareto), as a whole and by a column of the units' table.
+
+A unit is accepted where it was calibrated and keeps every limit of the config (`driftlab.evaluation.limits`). The 95 %
+interval of a share is Clopper and Pearson's. Whether the yield differs between the groups of a column is Pearson's
+chi-squared, by the permutation law of the accepted units over the groups: right for few units and rare reasons alike.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+
+from driftlab.evaluation.limits import worst
+from driftlab.family.record import UnitRecord, figure_name
+from driftlab.spc.capability import share_beyond
+from fusion_core.chunk import Array
+
+COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
+    "lot": lambda record: record.lot,
+    "date": lambda record: record.date[:10],
+    "channel": lambda record: record.channel,
+    "driftlab": lambda record: record.driftlab,
+    "T_low": lambda record: f"{record.domain[0]:g}" if record.domain else "",
+    "T_high": lambda record: f"{record.domain[1]:g}" if record.domain else "",
+    "hours": lambda record: f"{record.hours:g}" if record.hours else "",
+}
+"""Columns of the units' table by which a line is told, beside those of the manifest itself."""
+UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
+SAID = {"fail": "above limit", "undecided": "undecided", "not measured": "not measured"}
+NO_VALUE = "not known"
+CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
+DRAWS = 9999  # permutations
+CELLS = 10_000_000  # groups of all draws
+ALPHA = 0.05  # chance, over all columns, that a yield is said to differ where it does not
+
+
+@dataclass(frozen=True)
+class YieldGroup:
+    """Units of a group, those of them that were accepted, that stand out (`odd`), and the units by reason."""
+
+    name: str
+    units: int
+    accepted: int
+    odd: int = 0
+    reasons: Mapping[str, int] = field(default_factory=dict)  # of what was not accepted, most units first
+
+    @property
+    def share(self) -> float:
+        """The share that was accepted, 1."""
+        return self.accepted / self.units
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 95 % interval."""
+        return share_beyond(self.accepted, self.units)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `fleet.json` has it."""
+        return {
+            "units": self.units, "accepted": self.accepted, "yield": self.share, "yield_95": [*self.interval],
+            "odd": self.odd, "reasons": dict(self.reasons),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Yield:
+    """Yield of all units, and by column.
+
+    Attributes
+    ----------
+    whole : YieldGroup
+    covered : tuple of int
+        Units that the first reasons of the whole explain together, one more reason each; a unit may have several.
+    by : mapping of str to tuple of YieldGroup
+        In the order of the groups' first units.
+    p : mapping of str to float
+        Probability of yields that differ so much between the groups of a column by chance.
+    judged : bool
+        Whether the config has limits; else every unit that was calibrated is accepted.
+    """
+
+    whole: YieldGroup
+    covered: tuple[int, ...] = ()
+    by: Mapping[str, tuple[YieldGroup, ...]] = field(default_factory=dict)
+    p: Mapping[str, float] = field(default_factory=dict)
+    judged: bool = False
+
+    def differs(self, column: str) -> bool:
+        """Return True if the yield differs between the groups of a column by more than chance."""
+        return self.p[column] < ALPHA / len(self.p)
+
+    def titled(self, column: str) -> str:
+        """Return the name of a column with its unit."""
+        return f"{column} [{UNITS[column]}]" if column in UNITS else column
+
+    def said(self, column: str) -> str:
+        """Return the probability in words: `p = 0.02`."""
+        return "p ≤ 0.0001" if self.p[column] <= 1e-4 else f"p = {self.p[column]:.2g}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `fleet.json` has it."""
+        by = {
+            column: {"p": self.p[column], "groups": [{column: one.name, **one.as_json()} for one in groups]}
+            for column, groups in self.by.items()
+        }
+        return {**self.whole.as_json(), "judged": self.judged, "covered": list(self.covered), "by": by}
+
+    def sentences(self) -> list[str]:
+        """Return the yield and its reasons, and the columns by whose groups it differs."""
+        whole = self.whole
+        if not whole.reasons:
+            return []
+        first = ", ".join(f"{reason} {count:,}" for reason, count in [*whole.reasons.items()][:3])
+        more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
+        lines = [f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}; not accepted: {first}{more}"]
+        for column, groups in self.by.items():
+            if self.differs(column):
+                least, most = (f(groups, key=lambda one: one.share) for f in (min, max))
+                lines.append(
+                    f"yield differs by {column} ({self.said(column)}): "
+                    f"{least.name} {_per_cent(least)}, {most.name} {_per_cent(most)}"
+                )
+        return lines
+
+
+def _per_cent(group: YieldGroup) -> str:
+    low, high = group.interval
+    return f"{100 * group.share:.3g} % (95 %: {100 * low:.3g} to {100 * high:.3g} %)"
+
+
+def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iterable[str] = ()) -> Yield:
+    """Return the yield of units, of which `odd` stand out, and by the columns `by`: COLUMNS, or the manifest's own."""
+    why = [reasons(record) for record in records]
+    stands_out = {record.unit for record in records}.intersection(odd)
+    whole = _group("", [*zip(records, why, strict=True)], stands_out)
+    place = {reason: k for k, reason in enumerate(whole.reasons)}
+    first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
+    covered = tuple(accumulate(first[k] for k in place.values()))
+    groups: dict[str, tuple[YieldGroup, ...]] = {}
+    for column in dict.fromkeys(by):
+        parts: dict[str, list[tuple[UnitRecord, list[str]]]] = {}
+        for name, record, of_unit in zip(_names(records, column), records, why, strict=True):
+            parts.setdefault(name, []).append((record, of_unit))
+        groups[column] = tuple(_group(name, part, stands_out) for name, part in parts.items())
+    p = {
+        column: chance([one.units for one in parts], [one.accepted for one in parts])
+        for column, parts in groups.items()
+    }
+    return Yield(whole, covered, groups, p, any(record.limits for record in records))
+
+
+def reasons(record: UnitRecord) -> list[str]:
+    """Return the reasons for which a unit is not accepted; none where it is.
+
+    Errors that differ in a name of a file or a number are one reason.
+    """
+    if record.state == "failed":
+        text = re.sub(r"[^\s:;,]*[/\\][^\s:;,]*", "…", record.error.partition(";")[0].replace(record.unit, "…"))
+        text = re.sub(r"[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?", "…", text)
+        return [f"not calibrated: {re.sub('(… ?)+', '… ', text).strip() or 'no reason given'}"]
+    if worst(record.limits) in (None, "pass"):
+        return []
+    rows = ((figure_name(str(row["name"])).replace("_", " "), str(row["verdict"])) for row in record.limits)
+    return [f"{name} {SAID[verdict]}" for name, verdict in rows if verdict in SAID]
+
+
+def _group(name: str, part: Sequence[tuple[UnitRecord, list[str]]], odd: Collection[str]) -> YieldGroup:
+    counts = Counter(reason for _, why in part for reason in why)
+    accepted, stands_out = sum(not why for _, why in part), sum(record.unit in odd for record, _ in part)
+    return YieldGroup(name, len(part), accepted, stands_out, dict(counts.most_common()))
+
+
+def _names(records: Sequence[UnitRecord], column: str) -> list[str]:
+    """Return the group of each unit: its text in the column, or a quarter of many numbers."""
+    own = COLUMNS.get(column)
+    texts = [(record.more.get(column, "") if own is None else own(record)).strip() for record in records]
+    numbers = np.array([_number(text) for text in texts])
+    known = np.isfinite(numbers)
+    if len(set(texts)) <= CLASSES or not np.all(known | np.array([not text for text in texts])):
+        return [text or NO_VALUE for text in texts]
+    return _quarters(numbers, known)
+
+
+def _quarters(numbers: Array, known: Any) -> list[str]:
+    edges = np.quantile(numbers[known], [0.25, 0.5, 0.75])
+    quarter = np.searchsorted(edges, numbers, side="left")
+    spans = {
+        k: f"{np.min(numbers[known & (quarter == k)]):.4g} to {np.max(numbers[known & (quarter == k)]):.4g}"
+        for k in set(quarter[known].tolist())
+    }
+    return [spans[k] if one else NO_VALUE for k, one in zip(quarter.tolist(), known.tolist(), strict=True)]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def chance(units: Sequence[int], accepted: Sequence[int]) -> float:
+    """Return the probability of shares that differ so much between groups, were those accepted dealt out by chance.
+
+    By 9,999 draws of them, so at least 1e-4; of more than a thousand groups by fewer, at least 999.
+    """
+    n, got = np.array(units, dtype=np.int64), np.array(accepted, dtype=np.int64)
+    share = np.sum(got) / np.sum(n)
+    if len(n) < 2 or share in (0.0, 1.0):
+        return 1.0
+    rng, left, draws, above = np.random.default_rng(0), max(min(DRAWS, CELLS // len(n)), 999), 0, 0
+    seen = np.sum((got - n * share) ** 2 / n) * (1 - 1e-9)
+    while draws < left:
+        size = min(left - draws, max(CELLS // (10 * len(n)), 1))
+        dealt = rng.multivariate_hypergeometric(n, int(np.sum(got)), size=size, method="marginals")
+        above += int(np.sum(np.sum((dealt - n * share) ** 2 / n, axis=-1) >= seen))
+        draws += size
+    return (1 + above) / (1 + draws)
