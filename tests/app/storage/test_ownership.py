@@ -19,6 +19,7 @@ import yaml
 from bench import FRAMING, Device, frame, paced
 from flying_units import fitted
 from typer.testing import CliRunner
+from ulog_writer import sensor, write_ulog
 from units_at_rest import UNITS, unit_at_rest
 
 from driftlab.cli import COMMANDS, app
@@ -69,6 +70,7 @@ ROWS = {
     "fit-map": Row("fit-map {}/map.yaml", "map.json", ("map.report.html",)),
     "fit-map --select": Row("fit-map {}/network.yaml --select --neurons-max 2 --report why", "map.onnx",
                             ("why/report.html", "why/select.json", "why/select.svg")),
+    "vehicle": Row("vehicle {}/soak.ulg --kind polynomial"),
     "simulate": Row("simulate {}/twin.yaml", "twin.h5"),
     "simulate CSV": Row("simulate {}/twin.yaml", "twin.csv"),
     "live": Row("live {}/live.yaml --record raw.h5 --fit-map map.json --kind polynomial --duration 4s", "out",
@@ -120,6 +122,10 @@ def inputs(tmp_path_factory):
     assert (
         CliRunner().invoke(app, ["export", "mat", f"{folder}/unit.json", "--out", f"{folder}/unit.mat"]).exit_code == 0
     )
+    soak = unit_at_rest(seconds=400, rate=10, temperature=lambda t: 15 + t / 13)
+    axes = (("gyro", soak.gyro, 2490378), ("accel", soak.accel, 2490386))
+    topics = [sensor(f"sensor_{name}", 0, soak.t + 1, values, soak.temperature, at) for name, values, at in axes]
+    write_ulog(folder / "soak.ulg", topics)
     (folder / "line").mkdir()
     fleets.write_fleet(folder / "line", 2)
     live = {"kind": "serial", "port": str(folder / "ttyDEVICE"), "interval": "1 s", "framing": FRAMING}
