@@ -23,11 +23,17 @@ AHEAD = 2  # items a thread of a worker: one in work, one that waits beside it
 LOOK = 2.0  # s between looks at who is there
 
 
+class Blamed(WorkerLost):
+    """The place of a result that was in work or waited each time that a worker died, until Dask gave up."""
+
+
 class Scheduler(Workers):
     """The workers of a Dask cluster; see `driftlab.production.workers.Workers`.
 
-    An item whose worker is killed goes to another one, as often as the scheduler's `allowed-failures` says, and is then
-    `WorkerLost`. Workers may come and go; each says its versions before it is asked for anything else.
+    An item whose worker is killed goes to another one, as often as the scheduler's `allowed-failures` says. Dask blames
+    an item that waited on the same workers as well; where it blames several, each is tried once more, alone, and only
+    an item that kills its workers then is `WorkerLost`. Workers may come and go; each says its versions before it is
+    asked for anything else.
 
     Parameters
     ----------
@@ -71,6 +77,20 @@ class Scheduler(Workers):
 
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
         """Yield each item with the function's result of it, as they are done; see `Workers.map`."""
+        blamed: list[tuple[T, Blamed]] = []
+        for item, result in self._map(function, items):
+            if isinstance(result, Blamed):
+                blamed.append((item, result))
+            else:
+                yield item, result
+        if len(blamed) == 1:
+            yield from blamed
+            return
+        for item, _ in blamed:
+            yield from self._map(function, [item])
+
+    def _map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
+        """Yield each item with the function's result of it; those that Dask gives up are `Blamed`."""
         left, done = iter(items), SimpleQueue[Any]()
         flying: dict[str, tuple[Any, T]] = {}
         room = AHEAD * self._threads()
@@ -101,7 +121,7 @@ class Scheduler(Workers):
         try:
             return future.result()
         except KilledWorker as error:
-            return WorkerLost(
+            return Blamed(
                 f"{error.allowed_failures + 1} workers died one after the other while they had it (the last one at "
                 f"{error.last_worker.address}): they were killed, crashed, or met their --memory-limit"
             )

@@ -90,7 +90,9 @@ class Worker:
         return True
 
     def end(self, patience: float = 0.0) -> None:
-        """Kill the process, if it still runs after so many seconds, and note how it ended."""
+        """Kill the process, if it still runs after so many seconds, and note how it ended; once is enough."""
+        if not self.alive:
+            return
         self.alive = False
         self.process.join(patience)
         self.process.kill()

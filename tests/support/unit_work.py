@@ -4,6 +4,7 @@ import ctypes
 import os
 import signal
 import time
+from pathlib import Path
 
 
 def burn(seconds):
@@ -42,6 +43,15 @@ def misbehave(how):
     elif how == "hang":
         time.sleep(1e6)
     return how
+
+
+def killed_so_often(path):
+    """Count in a file whose name begins with a number, kill the process so often, and then return the path."""
+    with Path(path).open("a") as file:
+        file.write("x")
+    if len(Path(path).read_text()) <= int(Path(path).name.split()[0]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path
 
 
 def square(number):

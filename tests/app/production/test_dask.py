@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -47,6 +47,17 @@ def worker(tmp_path, address, **environment):
     )  # fmt: skip
 
 
+@contextmanager
+def supervised(tmp_path, address):
+    """Start a worker that Dask begins again when it is killed, as it does unless asked not to."""
+    with started(
+        tmp_path, "distributed.cli.dask_worker", address, "--nanny", "--no-dashboard", "--nthreads", "1",
+    ) as (part, log):  # fmt: skip
+        yield part, log
+        part.terminate()  # it ends its worker, which would outlive it
+        part.wait(20)
+
+
 def said(path, text, patience=30.0):
     """Return the line of a file that has the text, as soon as there is one."""
     end = time.monotonic() + patience
@@ -82,14 +93,21 @@ def test_all_items_come_back_though_a_worker_is_killed(address, two):
     assert sorted(back) == items
 
 
-def test_an_item_that_kills_its_workers_is_lost_and_no_other(tmp_path, address, two):
-    with ExitStack() as stack, Scheduler(address) as workers:
-        for _ in range(3):
-            stack.enter_context(worker(tmp_path, address))
-        found = dict(workers.map(unit_work.misbehave, ["a", "killed", "b", "raise", "c", "d"]))
+def test_an_item_that_kills_its_workers_is_lost_and_no_other(tmp_path, address):
+    """One worker, begun again each time, so that others wait beside the item that kills it."""
+    with supervised(tmp_path, address), Scheduler(address) as workers:
+        found = dict(workers.map(unit_work.misbehave, ["a", "killed", "raise", "b", "c", "d"]))
     assert found.pop("killed").why.startswith("4 workers died one after the other while they had it")
     assert found.pop("raise").why.startswith("KeyError: 'heading' (support/unit_work.py, line")
     assert found == {name: name for name in "abcd"}
+
+
+def test_an_item_that_is_blamed_beside_another_is_tried_alone(tmp_path, address):
+    innocent, killer = str(tmp_path / "4 times"), str(tmp_path / "1000 times")
+    with supervised(tmp_path, address), Scheduler(address) as workers:
+        found = dict(workers.map(unit_work.killed_so_often, [innocent, killer]))
+    assert found[innocent] == innocent
+    assert found[killer].why.startswith("4 workers died one after the other while they had it")
 
 
 def test_an_item_whose_worker_was_killed_once_comes_back(tmp_path, address, two):

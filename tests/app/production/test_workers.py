@@ -181,6 +181,13 @@ def test_workers_that_cannot_begin_are_said(monkeypatch):
         list(pool.map(unit_work.square, range(5)))
 
 
+def test_workers_that_end_at_once_before_they_begin_are_said(monkeypatch):
+    monkeypatch.setattr(workers, "_serve", unit_work.gone)
+    monkeypatch.setattr(workers, "_ended", lambda busy: [worker for worker in busy if worker.hear()])  # of all
+    with Pool(4) as pool, pytest.raises(WorkersError, match="3 worker processes in a row ended before they began"):
+        list(pool.map(unit_work.square, range(5)))
+
+
 def test_processors_are_those_that_may_be_used():
     code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
     code += "from driftlab.production.workers import *; "
