@@ -3,7 +3,7 @@
     bias = level + curve(T) + memory(history of T) + drift t + noise      [rad/s]
 
 T is a body of some minutes behind its chamber. The size of a memory is the greatest difference between warming and
-cooling at the same temperature in this soak (`opening`). `truth_gain` is what the likelihood that is told the truth
+cooling at the same temperature in this soak (`opening`). `truth_gain` is what the likelihood that knows the truth
 has for it: the log-likelihood [nats] of the true shape, its coefficient unknown on each axis, three axes together,
 over none, beside a free curve of T, a level and a drift, under the noise that made the soak.
 Sigmas and sizes are in rad/s: write `24 * DEG_H`.
@@ -355,7 +355,7 @@ def _means(x: np.ndarray, rows: int) -> np.ndarray:
     return x[: count * rows].reshape(count, rows, *x.shape[1:]).mean(axis=1) if rows > 1 else x
 
 
-# --- the likelihood that is told the truth
+# --- the likelihood that knows the truth
 
 
 def truth_gain(soak: Soak, piece: float = 5.0, *, fitted: bool = False) -> float:

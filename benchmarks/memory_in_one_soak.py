@@ -24,7 +24,7 @@ from driftlab.soak.blocks import brief
 
 HOURS = (2.0, 4.0, 6.0, 8.0, 12.0)
 SLOW = ("walk", "flicker", "gauss_markov")
-TOLD = 15.0  # nats of the likelihood that is told the truth
+TOLD = 15.0  # nats of the likelihood that knows the truth
 ROWS = 5.0  # s
 
 

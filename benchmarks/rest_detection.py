@@ -57,7 +57,7 @@ def unit(gyro, slope, rate, kind, thermometer, seed):
     t = np.arange(1, SECONDS / DT + 1) * DT
     T, N = profile(kind, rate, t), int(SECONDS / DT)
     noise, vrw = GYROS[gyro]
-    # a curve whose slope goes from half to all of what is said, within 12 K
+    # a curve whose slope goes from half to all of the stated one, within 12 K
     curve = slope * DEG_H * (0.75 * T + 0.25 * 12 * np.log(np.cosh((T - 5) / 12)))
     signs = np.array([1.0, -0.6, 0.3])
     walk = np.cumsum(rng.normal(size=(N, 3)), axis=0) * noise * 0.02 * np.sqrt(DT)

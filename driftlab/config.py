@@ -41,7 +41,7 @@ def _default_kind(value: Any) -> Any:
 
 def _of_the_tracked_sensor(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
     """Read the limits in the unit of the sensor whose bias is tracked; of a gyro where there is no filter."""
-    if "filter" not in info.data:  # it is wrong, and that has been said
+    if "filter" not in info.data:  # it is wrong, and that has been reported
         return handler(value)
     model: MeasurementModel | None = info.data["filter"]
     unit, shown = ("rad/s", "deg/h") if model is None else (model.tracked.unit, model.tracked.shown)

@@ -87,7 +87,7 @@ def _explain(prepared: Prepared, folder: Path, timeout: float) -> tuple[float, s
 
 def _last(text: str) -> str:
     lines = [line.strip(" │╭╰─╮╯") for line in text.splitlines()]
-    return next((line for line in reversed(lines) if line), "nothing was said")
+    return next((line for line in reversed(lines) if line), "no output")
 
 
 def judged(prepared: Prepared, out: Path) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Prepared:
     truths: tuple[Truth, ...] = ()
     tolerated: tuple[Pattern, ...] = ()  # additions that are neither right nor false
     bias: tuple[Array, Array] | None = None  # the holdout's true bias: t (N,) s, (N, d) rad/s; None: its reference
-    oracle: float | None = None  # error of a model told the truth, norm over the axes, rad/s
+    oracle: float | None = None  # error of a model that knows the truth, norm over the axes, rad/s
 
 
 @dataclass(frozen=True)

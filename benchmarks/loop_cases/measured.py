@@ -67,7 +67,7 @@ def _oven(which: str, order: Sequence[int], folder: Path) -> Prepared:
 
 
 def _told_of_lag(path: Path, order: Sequence[int], tau: float) -> float:
-    """Return the error of a model that is told of the lag, in equilibrium at 25 degC when the oven was switched on."""
+    """Return the error of a model that knows the lag, in equilibrium at 25 degC when the oven was switched on."""
     with h5py.File(path) as file:
         t, z, T = (file[name][()] for name in ("time", "gyro", "temperature"))
     told = Told(z, T, (T - late(T, tau))[:, None])
@@ -113,7 +113,7 @@ def _cats(holdout: int, declared: bool, folder: Path) -> Prepared:
 
 BLIND = {"a": (), "b": ("voltage", "pressure"), "c": ("voltage", "pressure", "temperature_case", "magnetic")}
 BLIND_UNITS = {"voltage": "V", "pressure": "hPa", "temperature_case": "degC", "magnetic": "uT"}
-BLIND_TOLD = 8e-6 * np.sqrt(3)  # rad/s: the error of a model that is told, as the recordings' README says
+BLIND_TOLD = 8e-6 * np.sqrt(3)  # rad/s: the error of a model that knows them, as the recordings' README says
 
 
 def _blind(unit: str, folder: Path) -> Prepared:

@@ -39,9 +39,7 @@ def print_rows(title: str, results: Sequence[Result]) -> None:
     """Print a table in Markdown; errors in 1e-6 rad/s."""
     by_name = {result.name: result for result in results}
     print(f"\n### {title}\n\nErrors in 1e-6 rad/s (of the ovens: ppm), the constant removed. Yardstick: the same with")
-    print(
-        "nothing planted, or with the map declared, or an oracle that is told the truth. ~: named by a relative (right"
-    )
+    print("nothing planted, or with the map declared, or an oracle that knows the truth. ~: named by a relative (right")
     print("channel and physics, another shape).\n")
     heads = ("group", "case", "in it", "verdict", "added", "named", "false", "before", "after", "after/before",
              "after/yardstick", "s")  # fmt: skip

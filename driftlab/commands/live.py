@@ -155,7 +155,7 @@ class Live:
         self._report()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
-        self.status.faults, self.status.noted = journal.faults, Faults()  # each is said once
+        self.status.faults, self.status.noted = journal.faults, Faults()  # each is reported once
         return finish(estimates, run, out, self.record)
 
     @contextmanager

@@ -2,7 +2,7 @@
 
 Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an estimate is the centred 30 s average
 of the sensor that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
-added to every axis of the bias at the end of the alignment, and the filter is not told of it: the paper's 15 deg/h of a
+added to every axis of the bias at the end of the alignment, unknown to the filter: the paper's 15 deg/h of a
 gyro, of another sensor about five deviations of what it reads on average over one second.
 
 Ranking: the bias wanders from one recording to the next by about the sigma that a prediction states, and all configs
@@ -45,7 +45,7 @@ THRESHOLD = 1e-5  # rad/s: converged, in table 12
 SPREAD = 5.0  # of the noise at 1 Hz: the initial error of another sensor than a gyro; the paper's is 4.7 of its own
 SEGMENTS = 5  # tables 8 to 11
 TO_THE_END = LONGEST_FIRST[0]
-OFTEN = "10 min"  # said beside the longest, where there is more
+OFTEN = "10 min"  # reported beside the longest, where there are more
 REFUTED = 2.0  # sigma: what is off by more says too little of itself
 
 Columns = dict[str, NDArray[Any]]

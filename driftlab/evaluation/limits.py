@@ -33,7 +33,7 @@ RULE = (
     f"{100 * (1 - RISK):.0f} %: at most {100 * RISK:.0f} % of the units that are beyond a limit pass."
 )
 EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
-VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit
+VERDICTS = ("fail", "not measured", "undecided", "pass")  # the first of these among a unit's rows is the unit's
 NAMES = {
     "bias_instability": "bias instability",
     "residual": "residual of the map",

@@ -184,7 +184,7 @@ def explained_config(config: Config, unit: BiasUnit, fit: Joint, map_path: Path 
     """Return the config with the map of the joint fit, the effects, and the walk that is left with them.
 
     Where an effect begins at an unknown start, also the level of earlier switch-ons: the start is estimated as a
-    unit is aligned, and is told from the bias by that alone.
+    unit is aligned, and is separable from the bias by that alone.
     """
     values: dict[str, Any] = {
         "effects": tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects),

@@ -22,7 +22,7 @@ WINDOWS = 20  # in which the rows are looked at
 STILL = 2.0  # times the scatter of the quietest window: more is motion
 GAP = 1.5  # usual steps
 MIN_IN_MEAN = 8  # samples, of which the scatter about a line tells motion
-MEANS = 1500  # of which the walk is told, at most
+MEANS = 1500  # from which the walk is estimated, at most
 COLUMNS = 16  # of curves over the temperature, at most
 BEND = 4.0  # K: in less, no curve bends
 LAG = 300.0  # s, of what follows the temperature
@@ -49,7 +49,7 @@ class QuickNoise:
 def noise_of(t: Array, values: Array, temperature: Array | None = None) -> QuickNoise | None:
     """Return the noise of values (N, d) at times t (N,), s; None where there is too little, or nothing moves.
 
-    `temperature` (N,) is that of the sensor, in any unit; without one its drift cannot be told from a walk.
+    `temperature` (N,) is that of the sensor, in any unit; without one its drift cannot be separated from a walk.
     """
     rows = _quietest(t, values)
     if rows is None:

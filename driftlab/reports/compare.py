@@ -219,7 +219,7 @@ def _clock(runs: Runs) -> Clock:
 def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
     """Return the spans in which the unit moved, or a config's filter refused one that stood still.
 
-    Motion is told from the sensors alone: it is shown once where all configs have the same.
+    Motion is detected by the sensors alone: it is shown once where all configs have the same.
     """
     shades: list[Shade] = []
     alike = len({tuple(run.journal.moving.spans) for run in runs.values()}) == 1

@@ -5,9 +5,9 @@ An accelerometer at rest in P placements, u_p the direction of the specific forc
     f = L_p + c(T) + g u_p h(T) + noise        on each axis, with levels L_p = g (1 + s) u_p + b
 
 c(T) is the change of the bias from its mean over all samples, one curve for all placements; h(T) that of the scale
-factor, which is told from c where placements show the axis in different parts of the force. All are estimated at once,
-so a placement need not see all temperatures. Bias b and scale factor s follow from the levels: the part of b that these
-do not determine stays zero, where it is one with the tilt of the unit. N samples in K blocks, d axes.
+factor, which is separable from c where placements show the axis in different parts of the force. All are estimated
+at once, so a placement need not see all temperatures. Bias b and scale factor s follow from the levels: the part of b
+that these do not determine stays zero, where it is one with the tilt of the unit. N samples in K blocks, d axes.
 
 Bias and scale factor of a triad from its mean readings in P placements under an input of known length::
 

@@ -26,7 +26,7 @@ from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
 from fusion_core.faults import Faults
 from fusion_core.thermal.rate_estimators import with_rate
 
-NOTED = 0.05  # of a soak, not used: more is said first
+NOTED = 0.05  # of a soak, not used: more is the first line
 SHORTEST = 10.0  # s of rest about a motion, at least
 BEFORE = 30.0  # s before a window that show the level, at most
 LATELY = 600.0  # s over which a rate of the temperature is forgotten

@@ -1,7 +1,7 @@
 """Problems of a recording, found in its first rows before a config of it is vouched for.
 
 A gyro at rest, averaged over 1 s, is still to some hundredths of a degree a second, whatever its noise in a sample: a
-hand, a vehicle or a turntable is not. So rest is told without the noise, which motion would be taken for.
+hand, a vehicle or a turntable is not. So rest is detected without the noise, for which motion would be taken.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fusion_core.contracts import Source
 from fusion_core.errors import EmptyRecording
 from fusion_core.faults import Faults
 
-LOST = 0.05  # of the rows, without a number: more is said
+LOST = 0.05  # of the rows, without a number: more is reported
 WINDOW = 10  # s in which a unit has to be at rest once
 DAY = 86_400.0  # s
 MOVING = np.deg2rad(0.3)  # rad/s, deviation of means over 1 s: more is no unit at rest

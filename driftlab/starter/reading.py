@@ -33,7 +33,7 @@ FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
 
 
 class Doubt(NamedTuple):
-    """The reason why a setting is a guess, and the ways in which it can be said, the guess first."""
+    """The reason why a setting is a guess, and its possible values, the guess first."""
 
     why: str
     ways: tuple[str, ...]
@@ -212,7 +212,7 @@ def framing_of(path: Path) -> FoundFraming | None:
 def samples_of(path: Path, frames: FoundFraming, interval: str | None) -> tuple[FoundFraming, Chunk | None]:
     """Return the framing with its interval, and the first samples in SI; None without clock and interval.
 
-    A framing whose values are those of an interval, as angles are, has that of the clock, or the one that is said.
+    A framing whose values are those of an interval, as angles are, has that of the clock, or the given one.
     """
     timed, framing = {} if interval is None else {"interval": interval}, frames.framing
     for known in ({}, timed):

@@ -93,7 +93,7 @@ class Held(contracts.MeasurementModel):
     def _fits_together(self) -> Self:
         quantities.check_axes("noise", self.noise, len(self.bias.axes))
         if _unit_of(self.noise)[0] is None:
-            raise ValueError("noise has no unit, and that of the sensor is told by it; write e.g. '0.06 ppm/sqrt(Hz)'")
+            raise ValueError("noise has no unit, and the sensor's unit follows from it; write e.g. '0.06 ppm/sqrt(Hz)'")
         if isinstance(self.reference, tuple):
             quantities.check_axes("reference", self.reference, len(self.bias.axes))
         if self.calibration is not None and isinstance(self.bias, contracts.ThermalBias) and self.bias.map is not None:

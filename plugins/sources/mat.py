@@ -6,7 +6,7 @@
     gyro                     a variable: (N, 1), (1, N), (N, axes) or (axes, N)
     imu.gyro                 a field of a struct, or of a struct in a struct
 
-N is the number of values of the time channel, so that (axes, N) is told from (N, axes). Version 7.3 is HDF5 with its
+N is the number of values of the time channel, which separates (axes, N) from (N, axes). Version 7.3 is HDF5 with its
 dimensions the other way round. Rows are read in blocks; of a compressed file, the variables that are named are loaded.
 """
 

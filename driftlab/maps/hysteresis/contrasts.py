@@ -31,7 +31,7 @@ from fusion_core.chunk import Array
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about
-MIN_CONTRASTS = 24  # with which slow noise can be told from white noise
+MIN_CONTRASTS = 24  # that separate slow noise from white noise, at least
 KNOTS = (8, 16, 32, 64)  # of the curve, as many as it needs
 GROUP = 3  # blocks to each at least
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 4, 22)])  # of slow to white noise, in a mean contrast

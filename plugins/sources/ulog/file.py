@@ -105,7 +105,7 @@ class Instance:
 
     @property
     def rate(self) -> float:
-        """Rows a second [Hz]; NaN where that cannot be told."""
+        """Rows a second [Hz]; NaN where it is unknown."""
         t = 1e-6 * np.asarray(self.samples.get("timestamp", np.zeros(0)), dtype=np.float64)
         n = sampled(self.rows)[: len(t)]
         return float((n[-1] - n[0]) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else np.nan
@@ -355,7 +355,7 @@ def _walk(data, p, halt, lengths, out, least, most, defining):  # type: ignore[n
             if kind == _D and lengths[0, data[p + 3] + 256 * data[p + 4]] >= 0:
                 out[n] = p
                 n += 1
-            elif kind == _D:  # of a row of what is not known, nothing can be told
+            elif kind == _D:  # data of a message that was never declared has no meaning
                 lost, first = lost + size, p if first < 0 else first
             p += size
             continue

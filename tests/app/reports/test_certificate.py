@@ -155,7 +155,7 @@ def test_a_map_that_does_not_say_how_sure_it_is_has_no_u(tmp_path, opened):
     text = page.locator("body").inner_text()
     assert "U not known" in text
     assert "The uncertainty is not known" in text
-    assert "No limits are set: nothing is said about conformity." in text
+    assert "No limits are set: no statement of conformity is made." in text
     assert "±" not in text
 
 
