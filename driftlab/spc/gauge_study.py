@@ -229,9 +229,8 @@ def gauge_study(
                 share = 3 * found.grr / room if room > 0 else None
                 rows.append(GaugeRow(name, axis, si + PER.get(name, ""), found, share))
     if not rows:
-        return GaugeStudy(
-            appraiser=appraiser, why_not=f"too few soaks are repeated under the same conditions; {RECORD}"
-        )
+        few = "too few soaks are repeated on one appraiser" if appraiser else "no figure differs between soaks"
+        return GaugeStudy(appraiser=appraiser, why_not=f"{few}; {RECORD}")
     return GaugeStudy(tuple(rows), appraiser, remark=_remark(rows, appraiser, used, len(units)))
 
 
