@@ -67,7 +67,8 @@ class Database:
             import sqlalchemy
         except ImportError:
             raise ConfigError(
-                "--to: the package sqlalchemy is not installed, it was expected for databases; install driftlab[sql]"
+                "--to: the package sqlalchemy is not installed, it was expected for databases; pip install "
+                "'driftlab[sql]'"
             ) from None
         try:
             parsed = sqlalchemy.make_url(url)
@@ -80,13 +81,18 @@ class Database:
             self._engine: Engine = sqlalchemy.create_engine(parsed, hide_parameters=True)
         except sqlalchemy.exc.NoSuchModuleError:
             raise ConfigError(
-                f"--to {self.name}: no package for {quote(parsed.drivername)} is installed; of duckdb it is "
-                "driftlab[sql], of others SQLAlchemy's pages name it"
+                f"--to {self.name}: no package for {quote(parsed.drivername)} is installed; pip install "
+                "'driftlab[sql]' has duckdb's, SQLAlchemy's pages name others"
             ) from None
         except ImportError as error:
             raise ConfigError(f"--to {self.name}: needs the package {error.name}; install it") from None
-        with self._errors():
-            self._engine.connect().close()
+        try:
+            with self._errors():
+                self._engine.connect().close()
+        except TypeError:  # of a driver whose call has no such argument
+            raise ConfigError(
+                f"--to {self.name}: {quote(parsed.drivername)} takes no such user, password or options; leave them out"
+            ) from None
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

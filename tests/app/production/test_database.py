@@ -122,6 +122,7 @@ def test_columns_of_another_manifest_are_added(place, tmp_path):
         ("nosuch://user:secret@host/line", "--to nosuch://host/line: no package for nosuch is installed"),
         ("postgresql+pg8000://user:secret@host/line", "--to postgresql+pg8000://host/line: needs the package pg8000"),
         ("sqlite:////no/such/folder/line.db?timeout=7", "--to sqlite:////no/such/folder/line.db: cannot be"),
+        ("duckdb://user:secret@/line.duckdb", "--to duckdb:///line.duckdb: duckdb takes no such user, password or"),
         ("duckdb:////no/such/folder/secret%2Fline?token=secret", "--to duckdb:////no/such/folder/"),
     ],
 )
