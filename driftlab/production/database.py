@@ -76,7 +76,7 @@ class Database:
             raise ConfigError(
                 "--to: is no URL of a database; write KIND://USER@HOST/NAME, or sqlite:///FILE.db"
             ) from None
-        self.name, self._secrets = shown(parsed), _secrets(parsed)
+        self.name, self._secrets = place_of(parsed), _secrets(parsed)
         try:
             self._engine: Engine = sqlalchemy.create_engine(parsed, hide_parameters=True)
         except sqlalchemy.exc.NoSuchModuleError:
@@ -121,7 +121,7 @@ class Database:
         self._engine.dispose()
 
 
-def shown(url: URL) -> str:
+def place_of(url: URL) -> str:
     """Return a URL without user, password and options."""
     host = f"{url.host or ''}{f':{url.port}' if url.port else ''}"
     return quote(f"{url.drivername}://{host}/{url.database or ''}", 200)

@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +18,7 @@ from driftlab.config import Config, with_recording
 from driftlab.family.parallel import serial
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
-from driftlab.production.manifest import read_manifest
+from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
 from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, UnitStore, fleet_folder
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
@@ -138,25 +138,15 @@ def fleet(
         If folder or database cannot be written.
     """
     understood, report = config_of(config).tracking(channel), progress or (lambda stage: None)
-    known = None if family is None else Path(family)
-    if rules not in (None, *RULES):
-        raise ConfigError(f"--rules {quote(rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out")
-    notes = dict(acknowledge or {})
-    if scheduler is not None and workers is not None:
-        raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
-    manifest = read_manifest(str(units))
-    author = checked(notes, operator, [entry.unit for entry in manifest.units])
-    wanted = FleetOptions(
-        workers, scheduler, explain, tuple(pages), certificate, known, rules, tuple(by), appraiser or "", notes, author,
-        force,
+    options = FleetOptions(
+        workers, scheduler, explain, tuple(pages), certificate, None if family is None else Path(family), rules,
+        tuple(by), appraiser or "", dict(acknowledge or {}), operator, force,
     )  # fmt: skip
-    # which refuses a source of no files
-    with_recording(understood, next(iter(manifest.units[0].recordings.values()))[0])
-    wanted.check_pages(manifest)
-    wanted.check_columns(manifest)
-    with _database(to) as database, fleet_folder(Path(out), [] if known is None else [known]) as folder:
+    manifest, options = _checked(understood, str(units), options)
+    read = [] if options.family is None else [options.family]
+    with _database(to) as database, fleet_folder(Path(out), read) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
-        jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), wanted, report)
+        jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), options, report)
         command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
         summary = command.all()
         if database is not None:
@@ -167,6 +157,23 @@ def fleet(
             first = command.status.failed[0]
             raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
         return FleetResult(Path(out), summary)
+
+
+def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifest, FleetOptions]:
+    """Return the manifest, and the options with the name of who acknowledges; raises ConfigError."""
+    if options.rules not in (None, *RULES):
+        raise ConfigError(
+            f"--rules {quote(options.rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out"
+        )
+    if options.scheduler is not None and options.workers is not None:
+        raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
+    manifest = read_manifest(units)
+    # which refuses a source of no files
+    with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])
+    options.check_pages(manifest)
+    options.check_columns(manifest)
+    author = checked(options.notes, options.operator, [entry.unit for entry in manifest.units])
+    return manifest, replace(options, operator=author)
 
 
 @contextmanager
@@ -241,20 +248,26 @@ class _Command:
             beside = {"yields": self.yields, "gauge": self.gauge, "acknowledged": acknowledged, "notes": self.notes}
             written = partial(write_fleet, folder, status, self.config, analysis, beside, pages, progress, each)
             self._timed("tables", written)
+        family = self._family(analysis, acknowledged, about)
+        return self._mark(complete=True, key=key, family=family, pages=pages)
+
+    def _family(
+        self, analysis: FamilyAnalysis, acknowledged: Mapping[str, Acknowledgement], about: Collection[str]
+    ) -> FamilySummary:
+        """Return the family's part of the summary; `about` are the units with an alarm."""
         line = analysis.line
-        family = FamilySummary(
-            units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
+        return FamilySummary(
+            units=len(self.status.done), fitted=analysis.family is not None, odd=analysis.reasons, lines=analysis.lines,
             line=line.sentences, judged=analysis.judged,
             alarms={line.units[k]: [one.text for one in why] for k, why in alarms(line).items()},
             acknowledged={unit: note.brief() for unit, note in acknowledged.items()},
             open=[unit for unit in about if unit not in acknowledged],
-            without_alarm=[unit for unit in options.notes if unit not in about],
+            without_alarm=[unit for unit in self.jobs.options.notes if unit not in about],
             capability=[
                 row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability
             ],
             charts=[chart.as_json(line) for chart in line.controls],
         )  # fmt: skip
-        return self._mark(complete=True, key=key, family=family, pages=pages)
 
     def _acknowledged(self, analysis: FamilyAnalysis) -> tuple[dict[str, Acknowledgement], dict[str, list[Alarm]]]:
         """Add the new notes to those that are known; return those in force, and the alarms, by unit."""
@@ -266,7 +279,7 @@ class _Command:
         about = {unit: why for unit, why in about.items() if why}
         frozen = "" if options.family is None else sha256(options.family)
         basis = {record.unit: basis_of(record, frozen) for record in self.status.done if record.unit in about}
-        self.notes += new_notes(options.notes, options.operator, about, basis)
+        self.notes += new_notes(options.notes, options.operator or "", about, basis)
         return in_force(self.notes, about, basis), about
 
     def _tell(self, odd: Collection[str]) -> None:

@@ -52,7 +52,7 @@ class FleetOptions:
     by: tuple[str, ...] = ()  # columns by which the yield is told
     appraiser: str = ""  # column of the gauge study
     notes: Mapping[str, str] = field(default_factory=dict)  # on alarms, by unit
-    operator: str = ""  # who wrote them
+    operator: str | None = None  # who wrote them; None: the account
     force: bool = False
 
     def crew(self) -> Workers:

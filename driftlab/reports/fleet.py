@@ -22,7 +22,7 @@ from driftlab.reports.fleet_charts import FleetOverview, map_charts
 from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
-from driftlab.spc.sentences import alarms, by_how_much, place
+from driftlab.spc.sentences import alarms, by_how_much, in_tables, place
 from driftlab.units import rounded
 
 FIRST = 20  # of them that are to be seen without opening the list
@@ -47,7 +47,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         use=_use(line, len(lists["odd"]), len(lists["alarms"])),
         yields=overview.yields,
         called=figure_name,
-        remarks=[*line.sentences[1:], *overview.remarks],
+        remarks=[*(one for one in line.sentences[1:] if one not in in_tables(line)), *overview.remarks],
         numbers=_numbers(records),
         maps=map_charts(
             overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)

@@ -235,7 +235,7 @@ def gauge_study(
 
 
 def _remark(rows: Sequence[GaugeRow], appraiser: str, used: int, soaks: int) -> str:
-    """Return what is left out, or cannot be told."""
+    """Return the soaks that are left out, and the part that is not known."""
     remarks = []
     if appraiser and rows[0].found.appraisers == 1:
         remarks.append(f"no reproducibility: too few units were soaked on two of {appraiser}, {RECORD}")

@@ -22,8 +22,7 @@ def sentences(line: LineReport) -> list[str]:
     if not line.controls:
         return ["Too few units for charts of the line."]
     judged = _against_baseline(line)
-    lines = [_change(line, group) for group in _together(line.controls)]
-    lines += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
+    lines = _changes(line)
     if all(len(chart.at) < MIN_UNITS for chart in line.controls):
         lines = ["Too few units to look for changes of the line."]
     elif not lines:
@@ -38,7 +37,18 @@ def sentences(line: LineReport) -> list[str]:
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
         lines.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
-    return [*judged, *lines, *_now(line), *_limits(line)]
+    return [*judged, *lines, *_now(line, counted=not judged), *_limits(line)]
+
+
+def in_tables(line: LineReport) -> set[str]:
+    """Return the sentences whose figures the tables of changes and of capability have."""
+    return {*_changes(line), *_limits(line)}
+
+
+def _changes(line: LineReport) -> list[str]:
+    """Return the changes in their order, then the trends."""
+    lines = [_change(line, group) for group in _together(line.controls)]
+    return lines + [_trend(line, chart) for chart in line.controls if chart.trend is not None]
 
 
 MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
@@ -168,14 +178,16 @@ def _called(chart: ControlChart) -> str:
     return f"{chart.axis} {figure_name(chart.quantity)}"
 
 
-def _now(line: LineReport) -> list[str]:
+def _now(line: LineReport, *, counted: bool) -> list[str]:
+    """Return the present state; `counted`: with the number of values beyond three sigma."""
     out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
-    lines.append(
-        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
-    )
+    if counted:  # else the units beyond frozen limits are
+        lines.append(
+            f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
+        )
     alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
     if alike:
         more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
