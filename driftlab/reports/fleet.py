@@ -181,7 +181,8 @@ def changes(line: LineReport) -> list[dict[str, Any]]:
     for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
         alone = f", of lot {change.of_lot} alone" if change.of_lot else ""
         result.append({
-            "chart": chart, "change": change, "text": by_how_much(line, chart, change) + alone, "where": place(line, change.at),
+            "chart": chart, "change": change, "text": by_how_much(line, chart, change) + alone,
+            "where": place(line, change.at),
             "ends": (line.units[change.low], line.units[change.high]),
             "p": "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
         })  # fmt: skip
