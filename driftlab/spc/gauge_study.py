@@ -116,6 +116,13 @@ class GaugeRow:
         between = "acceptable for some uses" if low >= GOOD and high <= POOR else ""
         return "acceptable" if high < GOOD else "not acceptable" if low > POOR else between
 
+    def shares(self, about: str = "") -> str:
+        """Return GRR of TV with its interval, in words: `34 % (24 to 55 %)`."""
+        share, low, high = (
+            f"{100 * v:.0f}" if v >= 0.0995 else f"{100 * v:.2g}" for v in (self.found.share, *self.found.share_95)
+        )
+        return f"{share} % ({about}{low} to {high} %)"
+
     def as_json(self) -> dict[str, Any]:
         """Return it as `fleet.json` has it."""
         one = self.found
@@ -164,10 +171,8 @@ class GaugeStudy:
                 worst[row.quantity] = row
         each = []
         for row in worst.values():
-            low, high = row.found.share_95
             tolerance = "" if row.tolerance is None else f", {100 * row.tolerance:.3g} % of the tolerance"
-            text = f"{row.name} {100 * row.found.share:.2g} % (95 %: {100 * low:.2g} to {100 * high:.2g} %)"
-            each.append(f"{text}, ndc {row.found.ndc}{tolerance}")
+            each.append(f"{row.name} {row.shares('95 %: ')}, ndc {row.found.ndc}{tolerance}")
         of = f"{self.rows[0].found.parts} units, {self.rows[0].found.soaks} soaks"
         of += f" by {self.appraiser}" if self.appraiser and self.rows[0].found.appraisers > 1 else ""
         rest = f"; {self.remark}" if self.remark else ""
