@@ -148,5 +148,5 @@ def test_without_the_package_the_extra_is_named():
     done = subprocess.run(
         [sys.executable, "-c", f"{code}Database('sqlite:///x.db')"], capture_output=True, text=True, check=False
     )
-    assert "--to: the package sqlalchemy is not installed, it was expected for databases; install" in done.stderr
-    assert "driftlab[sql]" in done.stderr
+    assert "--to: the package sqlalchemy is not installed, it was expected for databases; pip install" in done.stderr
+    assert "pip install 'driftlab[sql]'" in done.stderr
