@@ -41,20 +41,22 @@ FLAGS = {
 }  # fmt: skip  # where the name differs
 RECORDING = "PATH[::START:STOP]"
 METAVARS = {
-    "after": RECORDING, "by": "COLUMN", "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
+    "acknowledge": "UNIT=NOTE", "after": RECORDING, "appraiser": "COLUMN", "by": "COLUMN",
+    "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
     "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME",
     "export": "px4|ardupilot", "family": "FAMILY.json", "fit_map": "MAP", "heading": "ANGLE", "holdout": RECORDING,
-    "hours": "H", "interval": "TIME", "lag": "TIME", "latitude": "ANGLE", "out": "DIR",
+    "hours": "H", "interval": "TIME", "lag": "TIME", "latitude": "ANGLE", "operator": "NAME", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
     "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",
-    "terms": "TERM,...", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
+    "terms": "TERM,...", "to": "URL", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
     "web": "[PORT]", "without": "KIND",
 }  # fmt: skip
 PAIRS = {
     "settings": ("--set", "KEY=VALUE", "'step=0.5 K'"),
     "units": ("--unit", "CHANNEL=UNIT", "gyro=deg/s"),
     "columns": ("--column", "CHANNEL=NAME", "gyro=wx,wy,wz"),
+    "acknowledge": ("--acknowledge", "UNIT=NOTE", "'0021=cable replaced'"),
 }
 HELP = {"config": "The config, a YAML file.", "json": "Print JSON for programs instead of text."}
 

@@ -157,7 +157,7 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
 
 def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
     """Return the reasons of an odd unit, in a sentence."""
-    fine = odd[0].as_family
+    fine = [*map(figure_name, odd[0].as_family)]
     rest = f"; {', '.join(fine[:-1])}{' and ' if len(fine) > 1 else ''}{fine[-1]} as the family" if fine else ""
     return f"unit {unit}: {'; '.join(one.sentence for one in odd)}{rest}"
 

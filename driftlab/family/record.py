@@ -78,7 +78,29 @@ class Figure(BaseModel):
     sigma: tuple[float | None, ...]
 
 
-class UnitRecord(BaseModel):
+class Figures(BaseModel):
+    """Figures by name."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    figures: dict[str, Figure] = {}
+
+    def table(self, names: Sequence[str], d: int) -> Array:
+        """Return values and deviations (2, figures, d) of figures by their names, NaN where they are not known."""
+        rows = np.full((2, len(names), d), np.nan)
+        for k, name in enumerate(names):
+            if name in self.figures and len(self.figures[name].value) == d:
+                rows[:, k] = np.array([self.figures[name].value, self.figures[name].sigma], dtype=np.float64)
+        return np.where(np.isfinite(rows), rows, np.nan)
+
+
+class RepeatedSoak(Figures):
+    """One of the soaks of a unit by itself: the name of its recording, the figures of its own map, and its `level`."""
+
+    name: str
+
+
+class UnitRecord(Figures):
     """Record of one unit.
 
     Attributes
@@ -110,6 +132,8 @@ class UnitRecord(BaseModel):
         Which recording was predicted.
     coast_in_sample : bool
         Whether that is one that the map was fitted on.
+    repeats : list of RepeatedSoak
+        Where the unit was soaked twice or more over the same range: what each soak says by itself.
     map_sigma : (d,) floats
         Rms of the deviation of the own map over its domain.
     map_file : str
@@ -131,8 +155,6 @@ class UnitRecord(BaseModel):
         SHA-256 of each file of the unit's folder, by its name.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     key: str
     unit: str
@@ -148,9 +170,9 @@ class UnitRecord(BaseModel):
     domain: tuple[float, float] | None = None
     hours: float = 0.0
     samples: int = 0
-    figures: dict[str, Figure] = {}
     coast_of: str = ""
     coast_in_sample: bool = False
+    repeats: list[RepeatedSoak] = []
     map_sigma: tuple[float, ...] | None = None
     map_file: str = ""
     verdict: list[str] = []
@@ -161,11 +183,3 @@ class UnitRecord(BaseModel):
     driftlab: str = ""
     plugins: list[dict[str, Any]] = []
     written: dict[str, str] = {}
-
-    def table(self, names: Sequence[str], d: int) -> Array:
-        """Return values and deviations (2, figures, d) of figures by their names, NaN where they are not known."""
-        rows = np.full((2, len(names), d), np.nan)
-        for k, name in enumerate(names):
-            if name in self.figures and len(self.figures[name].value) == d:
-                rows[:, k] = np.array([self.figures[name].value, self.figures[name].sigma], dtype=np.float64)
-        return np.where(np.isfinite(rows), rows, np.nan)

@@ -5,25 +5,38 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
+from uuid import uuid4
 
 from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
 from driftlab.family.parallel import serial
-from driftlab.production.family import analyse
-from driftlab.production.manifest import read_manifest
+from driftlab.production.database import Database, tables_of
+from driftlab.production.family import FamilyAnalysis, analyse
+from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
 from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, UnitStore, fleet_folder
-from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, fleet_progress
+from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
+from driftlab.spc.acknowledgements import (
+    Acknowledgement,
+    Alarm,
+    basis_of,
+    checked,
+    in_force,
+    known_notes,
+    new_notes,
+    of_outlier,
+)
+from driftlab.spc.gauge_study import GaugeStudy, gauge_study
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import alarms
 from driftlab.spc.yields import Yield, yields_of
@@ -50,6 +63,10 @@ def fleet(
     family: Place | None = None,
     rules: str | None = None,
     by: Sequence[str] = (),
+    appraiser: str | None = None,
+    acknowledge: Mapping[str, str] | None = None,
+    operator: str | None = None,
+    to: str | None = None,
     force: bool = False,
     channel: str | None = None,
     progress: FleetProgress | None = None,
@@ -89,6 +106,17 @@ def fleet(
         Column by which yield and reasons are told, e.g. lot; may be repeated.
         `lot`, `date`, `channel`, `driftlab`, `T_low`, `T_high`, `hours` or one of the manifest's own; numbers of which
         there are many are told in quarters. Without it by lot, where the units have lots.
+    appraiser : str, optional
+        Column of the appraisers of the gauge R&R, e.g. chamber.
+        Of units that were soaked twice or more (`driftlab.spc.gauge_study`).
+    acknowledge : mapping of str to str, optional
+        Acknowledge the alarms of a unit with a note, e.g. '0021=cable replaced'; may be repeated.
+        It stays in the folder as long as the alarms are the same.
+    operator : str, optional
+        Name of who acknowledges; default: that of the account.
+    to : str, optional
+        SQL database that takes the results as tables, e.g. sqlite:///line.db.
+        A URL as SQLAlchemy has it (`driftlab.production.database`); needs driftlab[sql].
     force : bool
         Do every unit again.
     channel : as that of `run`
@@ -106,28 +134,56 @@ def fleet(
         If the config or the manifest is wrong, or `out` must not be written to.
     DataError
         If not one unit could be done.
+    Unwritable
+        If folder or database cannot be written.
     """
     understood, report = config_of(config).tracking(channel), progress or (lambda stage: None)
-    known = None if family is None else Path(family)
-    if rules not in (None, *RULES):
-        raise ConfigError(f"--rules {quote(rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out")
-    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), certificate, known, rules, tuple(by), force)
-    if wanted.scheduler is not None and wanted.workers is not None:
-        raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
-    manifest = read_manifest(str(units))
-    # which refuses a source of no files
-    with_recording(understood, next(iter(manifest.units[0].recordings.values()))[0])
-    wanted.check_pages(manifest)
-    wanted.check_columns(manifest)
-    with fleet_folder(Path(out), [] if wanted.family is None else [wanted.family]) as folder:
+    options = FleetOptions(
+        workers, scheduler, explain, tuple(pages), certificate, None if family is None else Path(family), rules,
+        tuple(by), appraiser or "", dict(acknowledge or {}), operator, force,
+    )  # fmt: skip
+    manifest, options = _checked(understood, str(units), options)
+    read = [] if options.family is None else [options.family]
+    with _database(to) as database, fleet_folder(Path(out), read) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
-        jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), wanted, report)
-        command = _Command(understood, jobs)
+        jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), options, report)
+        command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
         summary = command.all()
+        if database is not None:
+            report(Stage("database"))
+            records, name = command.status.records, folder.out.name or folder.path.name
+            database.replace(summary["id"], tables_of(name, summary, records, folder.path / TABLE))
         if not command.status.done:
             first = command.status.failed[0]
             raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
         return FleetResult(Path(out), summary)
+
+
+def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifest, FleetOptions]:
+    """Return the manifest, and the options with the name of who acknowledges; raises ConfigError."""
+    if options.rules not in (None, *RULES):
+        raise ConfigError(
+            f"--rules {quote(options.rules)}: no such rules; choose {' or '.join(RULES)}, or leave it out"
+        )
+    if options.scheduler is not None and options.workers is not None:
+        raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
+    manifest = read_manifest(units)
+    # which refuses a source of no files
+    with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])
+    options.check_pages(manifest)
+    options.check_columns(manifest)
+    author = checked(options.notes, options.operator, [entry.unit for entry in manifest.units])
+    return manifest, replace(options, operator=author)
+
+
+@contextmanager
+def _database(url: str | None) -> Iterator[Database | None]:
+    """Give the database that results go to, reached before anything is computed; None where none is asked for."""
+    if url is None:
+        yield None
+        return
+    with closing(Database(url)) as database:
+        yield database
 
 
 @contextmanager
@@ -154,22 +210,26 @@ class _Command:
 
     config: Config
     jobs: UnitJobs
+    id: str | None  # of the fleet in databases
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage
     status: FleetStatus = field(default_factory=FleetStatus)
     failed: list[str] = field(default_factory=list)  # of the certificates
     yields: Yield | None = None  # once the odd units are known
+    gauge: GaugeStudy | None = None
+    notes: list[Acknowledgement] = field(default_factory=list)  # all that were ever written here
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
+        self.notes = known_notes(folder.mark, f"--out {folder.out}")
         self._timed("units", jobs.do)
         status = self.status = self._timed("reading", jobs.status)
         self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done))
         key, before = self._key(), folder.mark
         files = (TABLE, REPORT, *([FAMILY] if before.get("family", {}).get("fitted", True) else ()))
-        as_it_was = before.get("key") == key and before.get("complete")
+        as_it_was = before.get("key") == key and before.get("complete") and not options.notes
         as_it_was = as_it_was and all((folder.path / name).is_file() for name in files)
         if as_it_was and not jobs.pages_missing(before["pages"]):
             self._tell(before["family"].get("odd", {}))
@@ -183,26 +243,52 @@ class _Command:
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
+            acknowledged, about = self._acknowledged(analysis)
             pages = self._timed("pages", partial(jobs.make_pages, odd))
-            written = partial(write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, each)
+            beside = {"yields": self.yields, "gauge": self.gauge, "acknowledged": acknowledged, "notes": self.notes}
+            written = partial(write_fleet, folder, status, self.config, analysis, beside, pages, progress, each)
             self._timed("tables", written)
-        family = FamilySummary(
-            units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
-            line=analysis.line.sentences, judged=analysis.judged,
-            alarms={analysis.line.units[k]: why for k, why in alarms(analysis.line).items()},
-            capability=[
-                row.as_json(analysis.line.shown(row.quantity).si, analysis.line.units[row.since])
-                for row in analysis.line.capability
-            ],
-            charts=[chart.as_json(analysis.line) for chart in analysis.line.controls],
-        )  # fmt: skip
+        family = self._family(analysis, acknowledged, about)
         return self._mark(complete=True, key=key, family=family, pages=pages)
 
+    def _family(
+        self, analysis: FamilyAnalysis, acknowledged: Mapping[str, Acknowledgement], about: Collection[str]
+    ) -> FamilySummary:
+        """Return the family's part of the summary; `about` are the units with an alarm."""
+        line = analysis.line
+        return FamilySummary(
+            units=len(self.status.done), fitted=analysis.family is not None, odd=analysis.reasons, lines=analysis.lines,
+            line=line.sentences, judged=analysis.judged,
+            alarms={line.units[k]: [one.text for one in why] for k, why in alarms(line).items()},
+            acknowledged={unit: note.brief() for unit, note in acknowledged.items()},
+            open=[unit for unit in about if unit not in acknowledged],
+            without_alarm=[unit for unit in self.jobs.options.notes if unit not in about],
+            capability=[
+                row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability
+            ],
+            charts=[chart.as_json(line) for chart in line.controls],
+        )  # fmt: skip
+
+    def _acknowledged(self, analysis: FamilyAnalysis) -> tuple[dict[str, Acknowledgement], dict[str, list[Alarm]]]:
+        """Add the new notes to those that are known; return those in force, and the alarms, by unit."""
+        options, about = self.jobs.options, dict[str, list[Alarm]]()
+        for unit, outliers in analysis.odd.items():
+            about.setdefault(unit, []).extend(map(of_outlier, outliers))
+        for k, why in alarms(analysis.line).items():
+            about.setdefault(analysis.line.units[k], []).extend(why)
+        about = {unit: why for unit, why in about.items() if why}
+        frozen = "" if options.family is None else sha256(options.family)
+        basis = {record.unit: basis_of(record, frozen) for record in self.status.done if record.unit in about}
+        self.notes += new_notes(options.notes, options.operator or "", about, basis)
+        return in_force(self.notes, about, basis), about
+
     def _tell(self, odd: Collection[str]) -> None:
-        """Count the yield by the columns that were asked for, or by lot."""
+        """Count the yield by the columns that were asked for, or by lot; study the gauge."""
         records = self.status.records
         usual = ("lot",) if any(record.lot for record in records) else ()
         self.yields = yields_of(records, odd, self.jobs.options.by or usual)
+        columns = {entry.unit: entry.of_soaks for entry in self.jobs.manifest.units if entry.of_soaks}
+        self.gauge = gauge_study(self.status.done, self.config.limits, self.jobs.options.appraiser, columns)
 
     def _timed(self, name: str, stage: Callable[[], T]) -> T:
         begun = time.monotonic()
@@ -214,7 +300,7 @@ class _Command:
         """Return the key of family, tables and report: a hash of all that they are made of."""
         jobs, options = self.jobs, self.jobs.options
         family = "" if options.family is None else sha256(options.family)
-        parts = (self.status.key, jobs.config, jobs.versions, family, options.rules, options.by)
+        parts = (self.status.key, jobs.config, jobs.versions, family, options.rules, options.by, options.appraiser)
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def _mark(self, **more: Any) -> dict[str, Any]:
@@ -232,6 +318,9 @@ class _Command:
             acceptance=status.acceptance,
             pass_with_hysteresis=status.beside,
             yields=self.yields,
+            gauge=self.gauge,
+            acknowledgements=self.notes,
+            id=self.id,
             replaced=jobs.again,
             kept_without_recordings=jobs.without_recordings,
             left=left,

@@ -16,6 +16,8 @@ from pydantic import BaseModel, Field
 
 from driftlab import __version__
 from driftlab.commands.console import session, terminal
+from driftlab.spc.acknowledgements import Acknowledgement
+from driftlab.spc.gauge_study import GaugeStudy
 from driftlab.spc.yields import Yield
 from driftlab.units import duration
 from fusion_core.escaping import line
@@ -96,8 +98,9 @@ MAX_PAGES = 20  # pages of units that stand out and were not asked for
 class FamilySummary(BaseModel):
     """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
 
-    `alarms` are why units are out of control, by frozen limits and run rules; `capability` has the indices, `charts`
-    limits, changes and lots of each chart.
+    `alarms` are why units are out of control, by frozen limits and run rules; `acknowledged` has the notes on units
+    whose alarms are all known, `open` the units with others, odd ones among both; `without_alarm` are units with a note
+    on nothing. `capability` has the indices, `charts` limits, changes and lots of each chart.
     """
 
     units: int
@@ -106,6 +109,9 @@ class FamilySummary(BaseModel):
     lines: list[str] = []
     line: list[str] = []
     alarms: dict[str, list[str]] = {}
+    acknowledged: dict[str, dict[str, str]] = {}
+    open: list[str] = []
+    without_alarm: Annotated[list[str], Field(exclude=True)] = []
     capability: list[dict[str, Any]] = []
     charts: list[dict[str, Any]] = []
     judged: bool = True
@@ -114,15 +120,26 @@ class FamilySummary(BaseModel):
         """Return the summary in sentences."""
         lines, count = list(self.lines), len(self.odd)
         if count:
-            lines.append(f"{units(count)} of {self.units:,} {'stands' if count == 1 else 'stand'} out:")
-            lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(self.odd.items())[:NAMED]]
-            if count > NAMED:
-                lines.append(f"  and {count - NAMED:,} more: the column `odd_why` of units.parquet")
+            still = [(unit, why) for unit, why in self.odd.items() if unit not in self.acknowledged]
+            known = f", {count - len(still):,} of them acknowledged" if len(still) < count else ""
+            end = ":" if still else ""
+            lines.append(f"{units(count)} of {self.units:,} {'stands' if count == 1 else 'stand'} out{known}{end}")
+            lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in still[:NAMED]]
+            if len(still) > NAMED:
+                lines.append(f"  and {len(still) - NAMED:,} more: the column `odd_why` of units.parquet")
             if count > MAX_PAGES:
                 lines.append(f"  pages are written of the first {MAX_PAGES}; --pages NAME writes others")
         elif self.fitted and self.judged:
             lines.append("no unit stands out")
-        return [*lines, *(f"the line: {sentence}" for sentence in self.line)]
+        lines += [f"the line: {sentence}" for sentence in self.line]
+        notes = list(self.acknowledged.items())
+        lines += [f"acknowledged: unit {unit}: {n['note']} ({n['by']}, {n['at'][:10]})" for unit, n in notes[:NAMED]]
+        if len(notes) > NAMED:
+            lines.append(f"and {len(notes) - NAMED:,} more units are acknowledged: `family.acknowledged` of fleet.json")
+        if none := self.without_alarm:
+            verb = "is neither" if len(none) == 1 else "are neither"
+            lines.append(f"not acknowledged: {some(none)} {verb} odd nor out of control")
+        return lines
 
 
 class FleetSummary(BaseModel):
@@ -139,6 +156,9 @@ class FleetSummary(BaseModel):
     acceptance: Annotated[str, Field(exclude=True)] = ""
     pass_with_hysteresis: int = 0
     yields: Annotated[Yield | None, Field(exclude=True)] = None
+    gauge: Annotated[GaugeStudy | None, Field(exclude=True)] = None
+    acknowledgements: list[Acknowledgement] = []
+    id: str | None = None
     replaced: list[str] = []
     kept_without_recordings: list[str] = []
     left: list[str] = []
@@ -155,12 +175,14 @@ class FleetSummary(BaseModel):
         content = self.model_dump(by_alias=True, exclude_none=True)
         config = content.pop("config")
         found = {} if self.yields is None else {"yield": self.yields.as_json()}
+        found |= {} if self.gauge is None else {"gauge": self.gauge.as_json()}
         return {**content, **found, "lines": self.sentences(), "config": config}
 
     def sentences(self) -> list[str]:
         """Return the summary in sentences, most important first."""
         family = [] if self.family is None else self.family.sentences()
-        return [*self._of_units(), *self._of_the_manifest(), *self.certificates_failed, *family]
+        gauge = [] if self.gauge is None else self.gauge.sentences()
+        return [*self._of_units(), *self._of_the_manifest(), *self.certificates_failed, *family, *gauge]
 
     def _of_units(self) -> list[str]:
         now, done, failed = (self.counts[name] for name in ("done_now", "done", "failed"))

@@ -36,7 +36,7 @@ from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow
-from driftlab.spc.yields import Yield, reasons
+from driftlab.spc.yields import reasons
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
@@ -52,12 +52,15 @@ def write_fleet(
     status: FleetStatus,
     config: Config,
     analysis: FamilyAnalysis,
-    yields: Yield | None,
+    beside: Mapping[str, Any],
     pages: Collection[str],
     progress: FleetProgress,
     each: ParallelMap = serial,
 ) -> None:
-    """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
+    """Write family, table and report, each whole or not at all.
+
+    `beside` are fields of the page's overview, `pages` the units that have one.
+    """
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
         common = analysis.common.model_dump(mode="json") if analysis.common.effects else None
@@ -72,8 +75,7 @@ def write_fleet(
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
     overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
-    overview = replace(overview, yields=yields)
-    write_fleet_report(folder.hidden(REPORT), overview)
+    write_fleet_report(folder.hidden(REPORT), replace(overview, **beside))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
 

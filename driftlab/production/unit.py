@@ -26,11 +26,11 @@ from driftlab.commands.explain import explain
 from driftlab.config import Config, part_of, paths_of, products, understood
 from driftlab.evaluation.limits import LimitResult, Measured
 from driftlab.evaluation.measurements import normal, of_map
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import RepeatedSoak, UnitRecord
 from driftlab.family.unit_noise import Densities, soaked_of
 from driftlab.production.manifest import ManifestEntry
 from driftlab.production.remote import local
-from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
+from driftlab.production.unit_map import coasted, figures_of, fit_unit_map, repeated
 from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.certificate import Certificate
 from driftlab.reports.provenance import map_facts, sheet_of
@@ -176,7 +176,10 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     soaked, densities = soaked_of(task.unit, unit.axes, rows)
     run = coasted(unit, recordings.get(HOLDOUT, ()), soaks, soaked.walk)
     files = {"unit.npz": soaked.to_bytes(), unit.file: unit.content()}
-    good = unit.verdict.good
+    good, repeats, notes = unit.verdict.good, list[RepeatedSoak](), list[str]()
+    if len(soaks) > 1:
+        names = dict(zip(task.recordings[CALIBRATION], soaks, strict=True))
+        repeats, notes = repeated(config, names, recordings.get(HOLDOUT, ()))
     record: dict[str, Any] = {
         "state": "done",
         "channel": fitted.record.channel,
@@ -190,11 +193,12 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         if isinstance(run.name, CopyName) or not run.name
         else os.path.relpath(run.name, task.folder),
         "coast_in_sample": run.in_sample,
+        "repeats": repeats,
         "map_sigma": None if good is None else tuple(good.tolist()),
         "map_file": unit.file,
         "verdict": unit.verdict.sentences(unit.bias_unit),
         "limits": run.limits,
-        "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes],
+        "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes, *notes],
         "plugins": participants(unit.config),
     }
     if task.page:

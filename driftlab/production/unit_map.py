@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,16 +31,19 @@ from driftlab.config import Config, with_recording
 from driftlab.evaluation.limits import SIDE
 from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
 from driftlab.evaluation.scores import HORIZONS
-from driftlab.family.record import Figure
+from driftlab.family.record import Figure, RepeatedSoak
 from driftlab.family.repeatability import hysteresis_of, soaks_of
+from driftlab.family.unit_noise import soaked_of
 from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, usual_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.soak.blocks import means, runs
+from driftlab.spc.charts import LEVEL
 from driftlab.storage.json import plain
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import FusionError
 from fusion_core.faults import Faults
 from fusion_core.units import bias_unit
 
@@ -183,6 +186,40 @@ def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities)
         "hysteresis": hysteresis_of(soaked.recordings, densities.white, densities.likely, soaked.knots.step),
         "soaks": soaks_of(soaked.recordings, soaked.knots.step),
     }
+
+
+SAME = 0.9  # of the range of the widest soak, that another must cover to repeat it
+
+
+def repeated(config: Config, soaks: Mapping[str, str], tests: Sequence[str]) -> tuple[list[RepeatedSoak], list[str]]:
+    """Return each soak of a unit by itself, where two or more are over the same range, and notes.
+
+    `soaks` are paths by name; a soak over another range repeats none. The level is over the range that they share.
+    """
+    units, notes = dict[str, UnitMap](), list[str]()
+    for name, soak in soaks.items():
+        try:
+            units[name] = fit_unit_map(config, [soak], Faults())
+        except FusionError as error:
+            notes.append(f"no figures of {name} by itself: {error}")
+    ranges = {name: unit.fitted.domain for name, unit in units.items()}
+    low, high = max(ranges.values(), key=lambda one: one[1] - one[0], default=(0.0, 0.0))
+    same = [n for n, (a, b) in ranges.items() if min(b, high) - max(a, low) >= SAME * (high - low)]
+    if len(same) < 2:
+        return [], notes
+    T = np.linspace(max(ranges[name][0] for name in same), min(ranges[name][1] for name in same), 25)
+    result = []
+    for name in same:
+        unit, soak = units[name], soaks[name]
+        soaked, densities = soaked_of(name, unit.axes, unit.soak.rows(unit.fitted.record.channel))
+        level = unit.fitted.bias(T).mean(axis=0)
+        own = {**figures_of(unit.fitted, soaked, densities), LEVEL: figure(level, np.full(len(level), np.nan))}
+        try:
+            own |= coasted(unit, tests, [soak], soaked.walk).figures
+        except FusionError as error:
+            notes.append(f"no prediction of {name} by itself: {error}")
+        result.append(RepeatedSoak(name=name, figures=own))
+    return result, notes
 
 
 def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> dict[str, Figure]:

@@ -50,6 +50,9 @@ class FleetOptions:
     family: Path | None = None  # one that is known already
     rules: str | None = None  # run rules of the charts
     by: tuple[str, ...] = ()  # columns by which the yield is told
+    appraiser: str = ""  # column of the gauge study
+    notes: Mapping[str, str] = field(default_factory=dict)  # on alarms, by unit
+    operator: str | None = None  # who wrote them; None: the account
     force: bool = False
 
     def crew(self) -> Workers:
@@ -70,11 +73,15 @@ class FleetOptions:
                 )
 
     def check_columns(self, manifest: Manifest) -> None:
-        """Raise ConfigError where the yield is asked for by a column that there is not."""
+        """Raise ConfigError where yield or gauge study are asked for by a column that there is not."""
         known = dict.fromkeys([*COLUMNS, *(name for entry in manifest.units for name in entry.more)])
         for name in self.by:
             if name not in known:
                 raise ConfigError(f"--by {quote(name)}: no such column; choose {', '.join(known)}")
+        own = [name for name in known if name not in COLUMNS]
+        if self.appraiser and self.appraiser not in own:
+            which = f"choose {', '.join(own)}" if own else "the manifest has none of its own"
+            raise ConfigError(f"--appraiser {quote(self.appraiser)}: no such column; {which}")
 
 
 @dataclass

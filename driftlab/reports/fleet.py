@@ -22,7 +22,7 @@ from driftlab.reports.fleet_charts import FleetOverview, map_charts
 from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
-from driftlab.spc.sentences import alarms, by_how_much, place
+from driftlab.spc.sentences import alarms, by_how_much, in_tables, place
 from driftlab.units import rounded
 
 FIRST = 20  # of them that are to be seen without opening the list
@@ -35,7 +35,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
     failed, done = ([record for record in records if record.state == state] for state in ("failed", "done"))
     limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
-    out = [*alarms(line).items()]
+    lists = _lists(overview, reasons)
     write_page(
         path,
         "fleet",
@@ -43,11 +43,11 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         lead=_lead(len(records), len(failed), odd, len(effects)),
         limits=verdict_of_units(limits).capitalize(),
         outcome=worst([row for of_unit in limits for row in of_unit]),
-        verdict=_headline(line, odd, len(done)),
-        use=_use(line, odd),
+        verdict=_headline(line, odd, len(done), odd - len(lists["odd"])),
+        use=_use(line, len(lists["odd"]), len(lists["alarms"])),
         yields=overview.yields,
         called=figure_name,
-        remarks=[*line.sentences[1:], *overview.remarks],
+        remarks=[*(one for one in line.sentences[1:] if one not in in_tables(line)), *overview.remarks],
         numbers=_numbers(records),
         maps=map_charts(
             overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
@@ -55,14 +55,13 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         lots=distributions(line),
         lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
         charts=[*joint_charts(line), *control_charts(line)],
-        alarms=[(line.units[k], overview.links.get(line.units[k], ""), "; ".join(why)) for k, why in out[:LISTED]],
-        alarms_count=len(out),
+        **{name: rows[:LISTED] for name, rows in lists.items()},
+        **{f"{name}_count": len(rows) for name, rows in lists.items()},
+        gauge=overview.gauge,
         line=line,
         against=limit_charts(line),
         changes=changes(line),
         effects=effects,
-        odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
-        odd_count=odd,
         first=FIRST, listed=LISTED,
         failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
         failed_count=len(failed),
@@ -72,6 +71,24 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     )  # fmt: skip
 
 
+def _lists(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, list[tuple[str, str, str]]]:
+    """Return unit, page and reasons of odd units, of those out of control, and of acknowledged ones, in lists apart.
+
+    A unit whose alarms are not those of its last note has that with them.
+    """
+    line, known = overview.line, overview.acknowledged
+    out = {line.units[k]: "; ".join(one.text for one in why) for k, why in alarms(line).items()}
+    noted = {note.unit: f" (noted before: {note.text()})" for note in overview.notes}
+
+    def rows(said: Mapping[str, str]) -> list[tuple[str, str, str]]:
+        still = {unit: why + noted.get(unit, "") for unit, why in said.items() if unit not in known}
+        return [(unit, overview.links.get(unit, ""), why) for unit, why in still.items()]
+
+    both = {unit: "; ".join(said[unit] for said in (reasons, out) if unit in said) for unit in known}
+    listed = [(unit, overview.links.get(unit, ""), f"{note.text()}: {both[unit]}") for unit, note in known.items()]
+    return {"odd": rows(reasons), "alarms": rows(out), "acknowledged": listed}
+
+
 def _lead(units: int, failed: int, odd: int, effects: int) -> str:
     """Return the numbers of units and of effects that they share."""
     parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
@@ -79,19 +96,20 @@ def _lead(units: int, failed: int, odd: int, effects: int) -> str:
     return "; ".join(parts)
 
 
-def _headline(line: LineReport, odd: int, done: int) -> str:
+def _headline(line: LineReport, odd: int, done: int, known: int) -> str:
     """Return the first sentence on the units and on their line: odd units are no quiet line."""
     if not odd:
         return line.sentences[0]
-    return f"{odd:,} of {done:,} units {'is' if odd == 1 else 'are'} odd. {line.sentences[0]}"
+    acknowledged = f", {known:,} of them acknowledged" if known else ""
+    return f"{odd:,} of {done:,} units {'is' if odd == 1 else 'are'} odd{acknowledged}. {line.sentences[0]}"
 
 
-def _use(line: LineReport, odd: int) -> str:
-    """Return the meaning of the headline for use."""
+def _use(line: LineReport, odd: int, out: int) -> str:
+    """Return the meaning of the headline for use, of units that are odd or out of control and not acknowledged."""
     parts = ["hold the odd units back until their reasons are known"] * bool(odd)
     if any(chart.changes or chart.trend for chart in line.controls):
         parts.append("judge units before and after a change apart, and find what was changed there")
-    if alarms(line) or any(np.any(chart.beyond) for chart in line.controls):
+    if out or any(np.any(chart.beyond) for chart in line.controls if not chart.of_family):
         parts.append("look at the units beyond the limits of the charts")
     seen = "no reason is seen to judge these units apart"
     quiet = seen if line.controls else "add units: nothing is known of the line yet"
@@ -161,8 +179,10 @@ def changes(line: LineReport) -> list[dict[str, Any]]:
     steps = [(chart, change) for chart in line.controls for change in chart.changes]
     result = []
     for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
+        alone = f", of lot {change.of_lot} alone" if change.of_lot else ""
         result.append({
-            "chart": chart, "change": change, "text": by_how_much(line, chart, change), "where": place(line, change.at),
+            "chart": chart, "change": change, "text": by_how_much(line, chart, change) + alone,
+            "where": place(line, change.at),
             "ends": (line.units[change.low], line.units[change.high]),
             "p": "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
         })  # fmt: skip

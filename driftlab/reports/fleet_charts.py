@@ -15,7 +15,9 @@ from driftlab.family.outliers import Outlier
 from driftlab.family.record import UnitRecord
 from driftlab.reports.charts import SERIES, Chart, Line, Panel, axis_panels, series
 from driftlab.reports.line_charts import SHARES
+from driftlab.spc.acknowledgements import Acknowledgement
 from driftlab.spc.charts import LineReport
+from driftlab.spc.gauge_study import GaugeStudy
 from driftlab.spc.yields import Yield
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
@@ -89,6 +91,11 @@ class FleetOverview:
     remarks : sequence of str
         What else should be known.
     yields : Yield or None
+    gauge : GaugeStudy or None
+    acknowledged : mapping of str to Acknowledgement
+        By unit, of those whose alarms are all known.
+    notes : sequence of Acknowledgement
+        All notes, the latest last.
     """
 
     title: str
@@ -104,6 +111,9 @@ class FleetOverview:
     links: Mapping[str, str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
     yields: Yield | None = None
+    gauge: GaugeStudy | None = None
+    acknowledged: Mapping[str, Acknowledgement] = field(default_factory=dict)
+    notes: Sequence[Acknowledgement] = ()
 
 
 def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import FIGURES, figure_name
+from driftlab.spc.acknowledgements import Alarm
 from driftlab.spc.capability import WORTH
 from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
 
@@ -21,8 +22,7 @@ def sentences(line: LineReport) -> list[str]:
     if not line.controls:
         return ["Too few units for charts of the line."]
     judged = _against_baseline(line)
-    lines = [_change(line, group) for group in _together(line.controls)]
-    lines += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
+    lines = _changes(line)
     if all(len(chart.at) < MIN_UNITS for chart in line.controls):
         lines = ["Too few units to look for changes of the line."]
     elif not lines:
@@ -37,7 +37,18 @@ def sentences(line: LineReport) -> list[str]:
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
         lines.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
-    return [*judged, *lines, *_now(line), *_limits(line)]
+    return [*judged, *lines, *_now(line, counted=not judged), *_limits(line)]
+
+
+def in_tables(line: LineReport) -> set[str]:
+    """Return the sentences whose figures the tables of changes and of capability have."""
+    return {*_changes(line), *_limits(line)}
+
+
+def _changes(line: LineReport) -> list[str]:
+    """Return the changes in their order, then the trends."""
+    lines = [_change(line, group) for group in _together(line.controls)]
+    return lines + [_trend(line, chart) for chart in line.controls if chart.trend is not None]
 
 
 MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
@@ -45,31 +56,33 @@ NAMED = 5  # units that a sentence names
 ALIKE = 0.3  # autocorrelation from which on limits by neighbours are too narrow by a fifth
 
 
-def alarms(line: LineReport) -> dict[int, list[str]]:
-    """Return the reasons of units out of control, by place in the line: T-squared, limits, EWMA, then run rules.
+def alarms(line: LineReport) -> dict[int, list[Alarm]]:
+    """Return the alarms of units out of control, by place in the line: T-squared, limits, EWMA, then run rules.
 
     Against frozen limits; of the EWMA and of run rules, on all charts, the unit at which they begin to alarm.
     """
-    reasons: dict[int, list[str]] = {}
+    found: dict[int, list[Alarm]] = {}
     for joint in line.multivariate:
         for k in np.flatnonzero(joint.beyond).tolist():
             order = np.argsort(-np.nan_to_num(joint.contributions[k]))[:2]
             most = ", ".join(f"{figure_name(joint.quantities[i])} {joint.contributions[k, i]:.3g}" for i in order)
-            text = f"{joint.axis} T-squared {joint.value[k]:.3g}, limit {joint.limit[k]:.3g} (of it {most})"
-            reasons.setdefault(int(joint.at[k]), []).append(text)
+            about = f"{joint.axis} T-squared {joint.value[k]:.3g}"
+            text = f"{about}, limit {joint.limit[k]:.3g} (of it {most})"
+            found.setdefault(int(joint.at[k]), []).append(Alarm(about, text))
     for chart in line.controls:
         unit = line.shown(chart.quantity)
         for k in np.flatnonzero(chart.beyond & chart.of_family).tolist():
             value, low, high = (values[k] * unit.factor for values in (chart.value, chart.low, chart.high))
             low = low if chart.quantity == "level" else max(low, 0.0)
-            text = f"{_called(chart)} {value:.3g} {unit.shown}, limits {low:.3g} to {high:.3g}"
-            reasons.setdefault(int(chart.at[k]), []).append(text)
-        for k in _beginnings(chart.drifting & chart.of_family):
-            reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: the EWMA leaves its limits here")
-        for rule, found in chart.patterns.items():
-            for k in _beginnings(found):
-                reasons.setdefault(int(chart.at[k]), []).append(f"{_called(chart)}: {rule}")
-    return dict(sorted(reasons.items()))
+            about = f"{_called(chart)} {value:.3g} {unit.shown}"
+            alarm = Alarm(about, f"{about}, limits {low:.3g} to {high:.3g}")
+            found.setdefault(int(chart.at[k]), []).append(alarm)
+        begun = {"the EWMA leaves its limits here": chart.drifting & chart.of_family, **chart.patterns}
+        for what, where in begun.items():
+            for k in _beginnings(where):
+                text = f"{_called(chart)}: {what}"
+                found.setdefault(int(chart.at[k]), []).append(Alarm(text, text))
+    return dict(sorted(found.items()))
 
 
 def _beginnings(alarms: NDArray[np.bool_]) -> list[int]:
@@ -165,14 +178,16 @@ def _called(chart: ControlChart) -> str:
     return f"{chart.axis} {figure_name(chart.quantity)}"
 
 
-def _now(line: LineReport) -> list[str]:
+def _now(line: LineReport, *, counted: bool) -> list[str]:
+    """Return the present state; `counted`: with the number of values beyond three sigma."""
     out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
-    lines.append(
-        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
-    )
+    if counted:  # else the units beyond frozen limits are
+        lines.append(
+            f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
+        )
     alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
     if alike:
         more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""

@@ -418,7 +418,7 @@ class Lock:
         """Write the lock's owner into the file; raises OSError."""
         mark = {
             "program": "driftlab",
-            "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])[:1000],
+            "command": " ".join([Path(sys.argv[0]).name, *map(_without_secrets, sys.argv[1:])])[:1000],
             "process": os.getpid(),
             "host": socket.gethostname(),
             "since": datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
@@ -452,3 +452,9 @@ def _holder(mark: bytes) -> str:
         return f"`{owner['command']}` (process {owner['process']} on {owner['host']}, since {owner['since']})"
     except (ValueError, KeyError, TypeError):
         return "another process"
+
+
+def _without_secrets(argument: str) -> str:
+    """Return an argument of the command line; a URL with a user, a password or options is cut short."""
+    kind, sign, rest = argument.partition("://")
+    return f"{kind}://***" if sign and {"@", "?"} & set(rest) else argument

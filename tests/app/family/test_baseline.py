@@ -51,7 +51,7 @@ def test_a_shifted_lot_alarms_against_frozen_limits_and_not_against_its_own(law)
     assert np.median(chart.z) > 2.5
     assert chart.drifting[-1]
     assert "frozen limits (of 150 units, made from 2026-01-05" in found.sentences[0]
-    assert any(text.startswith("x noise: the EWMA leaves") for reasons in alarms(found).values() for text in reasons)
+    assert any(one.text.startswith("x noise: the EWMA leaves") for reasons in alarms(found).values() for one in reasons)
     single = np.any(chart.beyond)
     assert ("units are beyond" in found.sentences[0]) == single
     assert ("the line may have moved, x noise" in found.sentences[0]) != single
@@ -66,8 +66,9 @@ def test_one_unit_is_enough():
     assert "half of the units that are off by" in quiet.sentences[0]
     ((place, reasons),) = alarms(found).items()
     assert place == 0
-    assert any(text.startswith("z T-squared") and "(of it walk" in text for text in reasons)
-    assert any(text.startswith("z walk 0.1") and "deg/h/sqrt(s), limits" in text for text in reasons)
+    texts = [one.text for one in reasons]
+    assert any(text.startswith("z T-squared") and "(of it walk" in text for text in texts)
+    assert any(text.startswith("z walk 0.1") and "deg/h/sqrt(s), limits" in text for text in texts)
 
 
 def test_what_goes_together_is_missed_by_single_limits_and_seen_by_t_squared():
@@ -114,7 +115,7 @@ def test_run_rules_are_those_that_were_asked_for():
     records = line(60, 3, planted=[("noise", "y", 30, 60, 1.5)])
     assert not any(chart.patterns for chart in line_of(records, None).controls)
     found = line_of(records, None, rules="nelson")
-    said = [text for reasons in alarms(found).values() for text in reasons]
+    said = [one.text for reasons in alarms(found).values() for one in reasons]
     assert any(text.startswith("y noise: 9 units in a row") for text in said)
     base = Baseline.of_levels(30, AXES, [(0.0, 1.0)] * 3)
     assert "frozen" not in " ".join(judged(records, base).sentences)

@@ -4,8 +4,11 @@ import hashlib
 import json
 import os
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
+import family
 import fleets
 import polars as pl
 import pytest
@@ -390,3 +393,84 @@ def test_the_yield_is_told_by_the_columns_that_are_asked_for(fleet):
     assert same.summary["yield"] == again.summary["yield"]
     with pytest.raises(ConfigError, match=r"--by colour: no such column; choose lot, .*chamber"):
         fleet(by=["colour"])
+
+
+def moved(known, by):
+    """Move the frozen level of a family's file by so much, rad/s: every unit is then out of control."""
+    content = json.loads(known.read_text())
+    for limits in content["baseline"]["limits"]:
+        if limits["quantity"] == "level":
+            limits["centre"] += by
+    known.write_text(json.dumps(content))
+
+
+def test_a_note_on_an_alarm_stays_until_the_alarm_is_another(fleet):
+    shutil.move("made", "before")
+    known, nasty = Path("before/family.json"), "<script>alert(1)</script> [bold]known[/]"
+    moved(known, 1.0)
+    first, _ = fleet(out="new", family=known)
+    assert first.summary["family"]["open"] == ["0000", "0001", "0002"]
+    noted, asked = fleet(out="new", family=known, acknowledge={"0001": nasty, "0003": "none"}, operator="anna")
+    assert asked == []
+    assert noted.summary["family"]["open"] == ["0000", "0002"]
+    assert f"acknowledged: unit 0001: {nasty} (anna, " in "\n".join(noted.lines())
+    assert "not acknowledged: 0003 is neither odd nor out of control" in noted.lines()
+    again, _ = fleet(out="new", family=known)  # nothing is made again, and it says the same
+    assert again.summary["family"] == noted.summary["family"] | {"lines": again.summary["family"]["lines"]}
+    by_lot, _ = fleet(out="new", family=known, by=["chamber"])  # all is made again
+    assert by_lot.summary["family"]["acknowledged"] == noted.summary["family"]["acknowledged"]
+    page = Path("new/report.html").read_text()
+    assert "&lt;script&gt;alert(1)" in page
+    assert nasty not in page
+    listed, apart = page.index('id="alarms"'), page.index('id="acknowledged"')
+    assert "0001" not in page[listed:apart]
+    moved(known, 1.0)
+    opened, _ = fleet(out="new", family=known)
+    assert opened.summary["family"]["open"] == ["0000", "0001", "0002"]
+    assert opened.summary["family"]["acknowledged"] == {}
+    assert [one["note"] for one in opened.summary["acknowledgements"]] == [nasty]  # it is kept, and shown beside
+    assert "noted before: &lt;script&gt;" in Path("new/report.html").read_text()
+    with pytest.raises(ConfigError, match="--acknowledge 0009: no unit is called so"):
+        fleet(out="new", family=known, acknowledge={"0009": "n"})
+
+
+def test_results_go_to_a_database_and_its_options_nowhere(fleet):
+    url = "sqlite:///line.db?timeout=86421"  # an option, as a password may be one
+    first, asked = fleet(to=url)
+    again, _ = fleet(to=url, by=["chamber"])
+    assert asked == []
+    assert first.summary["id"] == again.summary["id"]
+    with closing(sqlite3.connect("line.db")) as database:
+        known = database.execute("SELECT fleet, name, units, done, failed FROM driftlab_fleets").fetchall()
+        rows = database.execute("SELECT count(*), count(DISTINCT chamber) FROM driftlab_units").fetchall()
+        limits = database.execute("SELECT DISTINCT name FROM driftlab_limits ORDER BY name").fetchall()
+    assert known == [(first.summary["id"], "made", COUNT, COUNT - 1, 1)]
+    assert rows == [(len(table()), 2)]
+    assert limits == [("noise",), ("residual",)]
+    assert not [path for path in Path("made").rglob("*") if path.is_file() and b"86421" in path.read_bytes()]
+    shutil.move("made", "elsewhere")
+    there, _ = fleet(to=url, out="elsewhere")
+    assert there.summary["id"] == first.summary["id"]
+
+
+def test_units_that_were_soaked_twice_are_a_gauge_study(fleet):
+    rows = Path("units.csv").read_text().splitlines()
+    family.write(Path("again.h5"), family.soak(family.deal(COUNT, 1, lots=2)[0], fleets.HOURS, seed=9))
+    one = rows[1].split(",")
+    again = ",".join([one[0], "again.h5", *one[2:4], "K7"])
+    Path("units.csv").write_text("\n".join([*rows, again]) + "\n")
+    result, asked = fleet(appraiser="chamber")
+    assert asked == [one[0]]
+    repeats = result.record(one[0]).repeats
+    assert [soak.name.rpartition("/")[2] for soak in repeats] == ["soak.h5", "again.h5"]
+    record = result.record(one[0])
+    for name in ("residual", "noise", "swing", "coast", "level"):
+        apart = [soak.figures[name].value for soak in repeats]
+        assert all(value is not None for of_soak in apart for value in of_soak), name
+        assert apart[0] != apart[1]
+    assert repeats[0].figures["noise"].value == pytest.approx(record.figures["noise"].value, rel=0.2)
+    assert result.summary["gauge"]["why_not"].startswith("1 unit was soaked twice or more over the same range; soak 10")
+    assert any(line.startswith("gauge R&R: 1 unit was soaked twice") for line in result.lines())
+    assert "Gauge R&amp;R" in Path("made/report.html").read_text()
+    with pytest.raises(ConfigError, match="--appraiser lot: no such column; choose chamber"):
+        fleet(appraiser="lot")

@@ -11,11 +11,13 @@ from lines import AXES, DEG_H, line
 from driftlab.config import Limits
 from driftlab.evaluation.limits import verdict_of_units
 from driftlab.family.outliers import Outlier
-from driftlab.family.record import FIGURES, figure_name
+from driftlab.family.record import FIGURES, Figure, RepeatedSoak, figure_name
 from driftlab.reports import fleet as fleet_rows
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, percentiles
 from driftlab.reports.line_charts import control_charts
+from driftlab.spc.acknowledgements import new_notes, of_outlier
+from driftlab.spc.gauge_study import gauge_study
 from driftlab.spc.line import line_of
 from driftlab.spc.yields import yields_of
 from driftlab.units import RATE
@@ -241,6 +243,33 @@ def test_yield_reasons_and_groups_are_on_the_page_and_fit_a_phone(opened, tmp_pa
         assert bar["x"] < stroke["x"] + 2 <= bar["x"] + bar["width"] + 4
         assert shown.locator(".yields").last.locator("tbody tr").count() == 180  # of 300 days, 20 before them
         assert "100 more are in fleet.json" in shown.locator("body").text_content()
+
+
+def test_gauge_study_and_notes_are_on_the_page_and_fit_the_sheet(opened, tmp_path):
+    found, rng = fleet(40, odd=(3, 11)), np.random.default_rng(1)
+    records = []
+    for one in found.records[:12]:
+        usual = np.array(one.figures["noise"].value)
+        figures = [{"noise": Figure(value=tuple(usual * f), sigma=(None,) * 3)} for f in 1 + 0.02 * rng.normal(size=2)]
+        repeats = [RepeatedSoak(name=f"{k}.h5", figures=own) for k, own in enumerate(figures)]
+        records.append(one.model_copy(update={"repeats": repeats}))
+    why = [of_outlier(outlier) for outlier in found.odd["0003"]]
+    notes = new_notes({"0003": NASTY}, "anna", {"0003": why}, {"0003": ""})
+    path = tmp_path / "report.html"
+    whole = replace(found, gauge=gauge_study(records, LIMITS), acknowledged={"0003": notes[0]}, notes=notes)
+    write_fleet_report(path, whole)
+    shown = opened(path, width=688)
+    text = shown.locator("body").inner_text()
+    assert "2 of 40 units are odd, 1 of them acknowledged." in shown.locator(".verdict").last.inner_text()
+    assert f"{NASTY} (anna, " in text
+    assert shown.title() != "broken"
+    first, second = (shown.locator(f"#{name} ~ table").first.inner_text() for name in ("odd", "acknowledged"))
+    assert "0011" in first
+    assert "0003" not in first
+    assert "0003" in second
+    rows = shown.locator("#gauge ~ table").first.locator("tbody tr").all_inner_texts()
+    assert [row.split()[:4] for row in rows] == [["noise", axis, "[deg/h/sqrt(Hz)]", "12"] for axis in AXES]
+    assert_fits_on_paper(shown)
 
 
 def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):

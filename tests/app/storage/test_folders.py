@@ -74,6 +74,22 @@ def test_a_folder_appears_when_it_is_whole_and_is_replaced_by_the_same_command(t
         assert names(tmp_path) == ["out"]
 
 
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("postgresql://anna:se@cr?et@host/line", "postgresql://***"),
+        ("--to=sqlite:///line.db?password=secret", "--to=sqlite://***"),
+        ("s3://line/units.csv", "s3://line/units.csv"),
+    ],
+)
+def test_the_holder_s_command_is_said_without_a_password(tmp_path, monkeypatch, argument, said):
+    monkeypatch.setattr(sys, "argv", ["driftlab", "fleet", argument])
+    lock = Lock(tmp_path / LOCK, "--out out")
+    lock.sign()
+    assert json.loads((tmp_path / LOCK).read_bytes())["command"] == f"driftlab fleet {said}"
+    lock.release()
+
+
 def test_of_two_at_once_the_second_ends_at_once_and_says_who_holds_the_folder(tmp_path):
     command = [sys.executable, "-c", HOLDER]
     first = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
