@@ -14,7 +14,7 @@ export MPLBACKEND := Agg
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL := pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture wheels lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture statistics wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -98,6 +98,10 @@ test: $(TEST_VENV)/ready
 # it also mounts small disks, and unmounts them). Failed cases are written to torture_failures
 torture: $(VENV)/ready
 	$(VENV)/bin/python tests/torture/campaign.py
+
+# tests that draw many seeds, with all of them; the suite has the first few
+statistics: $(VENV)/ready
+	DRIFTLAB_STATISTICS=1 OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest $$(grep -l 'from doses import' -r tests --include 'test_*.py')
 
 # before a release: the wheel of what is committed on three Pythons, each from nothing to C code; it is then in dist/
 PYTHONS ?= python3.11 python3.12 python3.13

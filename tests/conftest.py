@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-# files that take longest, though most have few tests; the campaigns of bad input last minutes, and wait for one another,
+# files that take longest, though most have few tests; the campaigns of bad input last minutes, wait for one another,
 # and begin when the loops are compiled, which each of their processes would do by itself
 LONG = (
     "test_explain.py", "test_docs.py", "test_torture.py", "test_ownership.py", "test_live.py", "test_shared_effects.py",
