@@ -10,14 +10,17 @@ export DRIFTLAB_DATA ?= $(abspath ../shared)
 endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
+# modules are compiled once, when they are first imported: most of what pip would compile is never imported, and takes it longest
+unexport PYTHONDONTWRITEBYTECODE
+PIP_INSTALL := pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture wheels lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test torture statistics wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(VENV)/bin/$(PIP_INSTALL) --editable '.[dev]'
 	touch $@
 
 demo: $(VENV)/ready
@@ -75,8 +78,8 @@ $(TEST_VENV)/bin/pip:
 $(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
 	rm -rf build dist driftlab.egg-info
 	$(TEST_VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
-	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check "$$(ls dist/driftlab-*.whl)[test]"
-	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/driftlab-*.whl
+	$(TEST_VENV)/bin/$(PIP_INSTALL) "$$(ls dist/driftlab-*.whl)[test]"
+	$(TEST_VENV)/bin/$(PIP_INSTALL) --no-deps --force-reinstall dist/driftlab-*.whl
 	touch $@
 
 # programs that tests run, from Debian, where one is missing (as root): a browser that looks at pages, compilers and an
@@ -96,6 +99,10 @@ test: $(TEST_VENV)/ready
 torture: $(VENV)/ready
 	$(VENV)/bin/python tests/torture/campaign.py
 
+# tests that draw many seeds, with all of them; the suite has the first few
+statistics: $(VENV)/ready
+	DRIFTLAB_STATISTICS=1 OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest $$(grep -l 'from doses import' -r tests --include 'test_*.py')
+
 # before a release: the wheel of what is committed on three Pythons, each from nothing to C code; it is then in dist/
 PYTHONS ?= python3.11 python3.12 python3.13
 wheels: $(VENV)/ready
@@ -111,7 +118,7 @@ types: $(VENV)/ready
 
 # the documentation as a site, in site/ (a minute); a link, an anchor or an image that is missing fails
 $(VENV)/docs: $(VENV)/ready pyproject.toml
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(VENV)/bin/$(PIP_INSTALL) --editable '.[docs]'
 	touch $@
 
 docs: $(VENV)/docs

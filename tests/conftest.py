@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-# files that take longest, though most have few tests; the campaigns of bad input last minutes, and wait for one another
+# files that take longest, though most have few tests; the campaigns of bad input last minutes, wait for one another,
+# and begin when the loops are compiled, which each of their processes would do by itself
 LONG = (
-    "test_torture.py", "test_explain.py", "test_docs.py", "test_ownership.py", "test_live.py", "test_shared_effects.py",
+    "test_explain.py", "test_docs.py", "test_torture.py", "test_ownership.py", "test_live.py", "test_shared_effects.py",
     "test_explain_files.py", "test_unit.py", "test_plugin_examples.py", "test_family_example.py", "test_live_waits.py",
     "test_plan.py", "test_examples.py", "test_live_web.py", "test_fleet_killed.py", "test_checkpoint.py",
     "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py",

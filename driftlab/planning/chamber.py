@@ -124,11 +124,11 @@ def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
     return _joined(name, "ramps", chamber, levels, np.full(len(levels), hold), moves)
 
 
-def mixed(chamber: Chamber, hours: float, cycles: int, step: float, share: float = 0.5) -> Profile | None:
-    """Return ramps for `share` of the hours, then levels up and down: rates and holds that tell effects apart."""
-    first, held = ramps(chamber, hours * share, cycles), None
+def mixed(chamber: Chamber, hours: float, cycles: int, step: float) -> Profile | None:
+    """Return ramps for half of the hours, then levels up and down: rates and holds that tell effects apart."""
+    first, held = ramps(chamber, hours / 2, cycles), None
     if first is not None:
-        held = staircase(replace(chamber, start=chamber.low), hours * (1 - share), step, down=True)
+        held = staircase(replace(chamber, start=chamber.low), hours / 2, step, down=True)
     if first is None or held is None:
         return None
     name = f"{first.name}; then a {held.name}"

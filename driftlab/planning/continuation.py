@@ -132,14 +132,14 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
     return RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, misfit)
 
 
-def jointly(profile: Profile, before: RecordedSoak, seed: int = 0) -> RatedProfile:
+def jointly(profile: Profile, before: RecordedSoak) -> RatedProfile:
     """Return the rating of the map that is fitted to the recordings and a further profile together."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     subject, chamber = before.subject, before.chamber
     new = profile.samples(chamber.lag, max(int(profile.duration / before.dt), 2))[1]
     T = np.concatenate([before.T, new])
-    bias = np.concatenate([before.bias, subject.drawn(new, before.dt, seed)])
+    bias = np.concatenate([before.bias, subject.drawn(new, before.dt, seed=0)])
     with threadpool_limits(1):
         answer = subject.map.smoother(T, bias)
         error = expected_curve_error(T, before.dt, subject.noise, subject.walk, answer)

@@ -218,9 +218,9 @@ def effects_in(
 class MonteCarlo:
     """Realisations of one planned recording, a search without effects; `price` is the log of the candidates there."""
 
-    def __init__(self, search: Search, unit: UnitModel, price: float, seed: int = 0) -> None:
+    def __init__(self, search: Search, unit: UnitModel, price: float) -> None:
         self.search, self.unit, self.price = search, unit, price
-        evidence, rng = search.columns.evidence, np.random.default_rng(seed)
+        evidence, rng = search.columns.evidence, np.random.default_rng(0)
         interval, shape = evidence.interval, (len(unit.axes), len(evidence), REALISATIONS)
         white = rng.normal(size=shape) * (unit.noise / np.sqrt(interval))[:, None, None]
         walk = np.cumsum(rng.normal(size=shape), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]

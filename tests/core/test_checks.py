@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from doses import draws
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -192,13 +193,14 @@ print(agree, refused)
 """
 
 
-def test_two_thousand_inputs_are_refused_or_mean_the_same_with_every_method():
+def test_inputs_are_refused_or_mean_the_same_with_every_method():
     """In a process of its own, for a crash to be a failure of this test alone."""
-    done = subprocess.run([sys.executable, "-c", CHILD, "0", "2000"], capture_output=True, text=True, check=False)
+    count = draws(500, 2000)
+    done = subprocess.run([sys.executable, "-c", CHILD, "0", str(count)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     agree, refused = map(int, done.stdout.split())
-    assert agree > 500
-    assert refused > 300
+    assert agree > 0.25 * count
+    assert refused > 0.15 * count
 
 
 @given(pattern=st.lists(st.lists(st.booleans(), min_size=m, max_size=m), min_size=1, max_size=30), full=st.booleans())

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from closed_loops import AUXILIARY, TOLD, assert_same_coast, kinds, left_out, loop
+from doses import draws
 from threadpoolctl import threadpool_limits
 from units_with_effects import CONFIG, make_unit
 
@@ -21,9 +22,8 @@ from fusion_core.faults import Faults
 @pytest.mark.parametrize(
     "effects",
     [
-        ("interaction",),
         ("periodic",),
-        ("turn_on", "hysteresis"),
+        ("turn_on",),
         ("thermal_lag", "drift", "channel"),
     ],
     ids="+".join,
@@ -91,9 +91,9 @@ def test_a_unit_that_was_only_ever_warmed_up_is_to_be_recorded_otherwise(tmp_pat
 
 
 def test_nothing_is_added_where_nothing_is_missing(tmp_path):
-    """No false addition in 12 units with decoy channels; `make loop` has more."""
+    """No false addition in units with decoy channels: four here, 12 in `make statistics`; `make loop` has more."""
     false = []
-    for seed in range(12):
+    for seed in range(draws(4, 12)):
         folder = tmp_path / str(seed)
         folder.mkdir()
         make_unit(folder, 1000 + seed, (), AUXILIARY, hours=(0.7, 0.6, 0.05))
@@ -140,7 +140,7 @@ source:
     gyro: {path: gyro, unit: rad/s}
     temperature: {path: temperature, unit: degC}
 filter:
-  update_interval: 1 s
+  update_interval: 5 s
   align: 300 s
   gyro:
     noise: 2e-7 rad/s/sqrt(Hz)
