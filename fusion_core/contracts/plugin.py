@@ -84,8 +84,13 @@ def built_in(plugin: Any) -> bool:
     return origin is not None and origin.distribution == HOME
 
 
+bring_all: list[Callable[[], None]] = []  # of the host: plugins are loaded where their kinds are asked for
+
+
 def installed() -> tuple[type[Plugin], ...]:
     """Return every class that is installed as a plugin."""
+    for bring in bring_all:
+        bring()
     return tuple(cls for cls in _ORIGINS if issubclass(cls, Plugin))
 
 
