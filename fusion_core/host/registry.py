@@ -27,7 +27,7 @@ from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandl
 from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit, PydanticUseDefault, core_schema
 
 from fusion_core.contracts.families import FAMILIES
-from fusion_core.contracts.plugin import HOME, Family, Origin, Plugin, bring_all
+from fusion_core.contracts.plugin import HOME, LOADERS, Family, Origin, Plugin
 from fusion_core.errors import FusionError, PluginError, describe_error, quote
 from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
@@ -263,7 +263,7 @@ def registry() -> Registry:
     if _found is None:
         _found = Registry()
         _found.load()
-        bring_all.append(_found._bring)
+        LOADERS.append(_found._bring)
     return _found
 
 

@@ -28,7 +28,7 @@ NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of t
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
 
 
-ROWS = 1 << 16  # read at once
+ROWS, FEW = 1 << 16, 100  # places read at once, and for which no memory is given back
 PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
 
 
@@ -118,5 +118,6 @@ def records(data: NDArray[np.uint8] | bytes, at: NDArray[np.int64], dtype: np.dt
     values = np.empty(len(at), windows.dtype)
     for start in range(0, len(at), ROWS):
         values[start : start + ROWS] = windows[at[start : start + ROWS]]
-        release(data)
+        if len(at) > FEW:
+            release(data)
     return values.view(dtype.base).reshape(len(at), *dtype.shape)
