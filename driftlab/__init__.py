@@ -17,14 +17,14 @@ is used; the local level frame is east, north, up.
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from driftlab import errors
     from driftlab.api import *
 
-__version__ = version("driftlab")
+    __version__: str
+
 __all__ = [
     "allan", "check", "compare", "errors", "explain", "export",
     "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate", "vehicle",
@@ -33,10 +33,15 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for: `import driftlab` alone loads no library."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        globals()[name] = version("driftlab")
+        return globals()[name]
     if name not in __all__:
         raise AttributeError(f"module 'driftlab' has no attribute '{name}'")
     return import_module("driftlab.errors") if name == "errors" else getattr(import_module("driftlab.api"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

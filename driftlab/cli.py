@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
-from driftlab.commands.options import ENFORCE_LIMITS, JSON, NEEDED, Command, Option
+from driftlab.commands.options import ENFORCE_LIMITS, JSON, NEEDED, Command, Deferred, Option
 from fusion_core.escaping import lines
 
 INTERRUPTED = 130
@@ -27,15 +27,6 @@ MIN_COLUMNS = 20  # columns of a terminal: below, `COLUMNS` is some program's mi
 COUNTS = ("NUMBA_NUM_THREADS", "POLARS_MAX_THREADS", "NUMBA_DISABLE_JIT")  # variables that libraries die of
 CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")  # a line end, or what acts on a terminal
 
-app = typer.Typer(
-    name="driftlab",
-    help="Thermal calibration and zero-velocity filtering of inertial units.",
-    epilog="--debug, with any command, shows what a plugin raised as a whole.",
-    no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
 PORT = 8088  # of the page of a live run, where none is named
 
 
@@ -101,8 +92,25 @@ COMMANDS = (
     Command("plugins", module="driftlab.commands.check", options={}),
     Command("schema", module="driftlab.commands.check", options={}),
 )
-for command in COMMANDS:
-    command.add_to(app)
+
+
+class Commands(TyperGroup):
+    """All of the commands."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings | {"commands": [Deferred(command) for command in COMMANDS]})
+
+
+app = typer.Typer(
+    name="driftlab",
+    cls=Commands,
+    help="Thermal calibration and zero-velocity filtering of inertial units.",
+    epilog="--debug, with any command, shows what a plugin raised as a whole.",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
 
 
 def _show_version(asked: bool) -> None:

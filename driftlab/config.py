@@ -193,7 +193,7 @@ def understood(document: Document, *, measuring: bool = False) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
     if measuring:
         document = reduce(override, _undeclared(document.data), document)
-    config = validate(Config, document, registry().broken())
+    config = validate(Config, document, registry().broken)
     config._name = document.path.name
     return config
 

@@ -6,7 +6,6 @@ plugins took part.
 
 from __future__ import annotations
 
-import ctypes
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -176,7 +175,6 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 
 @cache
-@cache
 def note_compiling() -> None:
     """Announce once in a process, on standard error, that loops are compiled for an installation or a processor."""
     from numba.core import event
@@ -223,7 +221,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
     def begin() -> None:
         nonlocal bar
-        if (console := terminal(stderr=True)).is_terminal:
+        if sys.stderr.isatty() and (console := terminal(stderr=True)).is_terminal:  # rich is not loaded for others
             from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
             columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
@@ -276,6 +274,8 @@ def keep_freed_memory() -> None:
     It gives large blocks back to the system at once, and the system hands them out again page by page, each cleared: a
     third of the steady method's time, an eighth of a whole run's.
     """
+    import ctypes
+
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "gnu_get_libc_version"):
         library = ctypes.CDLL(None)
         library.mallopt(TRIM_THRESHOLD, 1 << 30)

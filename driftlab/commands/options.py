@@ -16,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import typer
 from typer.core import TyperCommand
@@ -139,8 +139,13 @@ class Command:
     def __post_init__(self) -> None:
         object.__setattr__(self, "module", self.module or f"driftlab.commands.{self.name}")
 
-    def add_to(self, app: typer.Typer) -> None:
-        """Make it a command of an application."""
+    @property
+    def typed(self) -> str:
+        """Its name as it is typed."""
+        return self.title or self.name.replace("_", "-")
+
+    def made(self) -> TyperCommand:
+        """Return it as typer runs it."""
         declared = declaration(self.module, self.name)
         texts = {**declaration("driftlab.commands.run", "run").texts, **declared.texts, **HELP}
         parameters, rest = [], dict(self.options)
@@ -166,7 +171,9 @@ class Command:
 
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        app.command(self.title or self.name.replace("_", "-"), help=declared.summary, cls=self.kind)(call)
+        alone = typer.Typer(rich_markup_mode=None, add_completion=False)
+        alone.command(self.typed, help=summary(self.module, self.name), cls=self.kind)(call)
+        return cast(TyperCommand, typer.main.get_command(alone))
 
     def _call(self, module: Any, given: dict[str, Any]) -> None:
         """Load the config, call the function, and print its result."""
@@ -208,23 +215,47 @@ class Command:
             raise typer.Exit(status)
 
 
+class Deferred(TyperCommand):
+    """A command of which help knows the name and the text; its options are made where it is called."""
+
+    def __init__(self, command: Command) -> None:
+        super().__init__(command.typed, help=summary(command.module, command.name), rich_markup_mode=None)
+        self.command = command
+
+    def make_context(self, *given: Any, **named: Any) -> Any:
+        """Return the context of the command with its options."""
+        return self.command.made().make_context(*given, **named)
+
+
 class Declaration(NamedTuple):
     """A function as its source text declares it: each parameter's annotation and default, and the texts on them."""
 
     parameters: dict[str, tuple[str, Any]]
-    summary: str
     texts: dict[str, str]
+
+
+@cache
+def _head(module: str, name: str) -> str:
+    """Return the text of a function at the top of a module, which is not imported, to the end of its docstring."""
+    spec = find_spec(module)
+    assert spec is not None
+    source: str = spec.loader.get_source(module)  # type: ignore[union-attr]
+    start = source.index(f"\ndef {name}(") + 1
+    opened = source.index('"""', start)
+    return source[start : source.index('"""', opened + 3) + 3]
+
+
+def summary(module: str, name: str) -> str:
+    """Return the docstring of a function, down to its parameters."""
+    head = _head(module, name)
+    text = inspect.cleandoc(ast.literal_eval(head[head.index('"""') :]))
+    return text.partition("\n\nParameters\n----------\n")[0].strip()
 
 
 @cache
 def declaration(module: str, name: str) -> Declaration:
     """Read the signature and the docstring of a function at the top of a module, which is not imported."""
-    spec = find_spec(module)
-    assert spec is not None
-    source = spec.loader.get_source(module)  # type: ignore[union-attr]
-    text = re.search(rf'^def {name}\(.*?""".*?"""', source, re.MULTILINE | re.DOTALL)
-    assert text is not None, f"{module} has no function {name} with a docstring"
-    node = ast.parse(text[0]).body[0]
+    node = ast.parse(_head(module, name)).body[0]
     assert isinstance(node, ast.FunctionDef)
     arguments = node.args
     needed = [None] * (len(arguments.args) - len(arguments.defaults))
@@ -236,11 +267,11 @@ def declaration(module: str, name: str) -> Declaration:
         )
         for argument, default in zip([*arguments.args, *arguments.kwonlyargs], defaults, strict=True)
     }
-    summary, _, rest = (ast.get_docstring(node) or "").partition("\n\nParameters\n----------\n")
+    _, _, rest = (ast.get_docstring(node) or "").partition("\n\nParameters\n----------\n")
     section = re.split(r"\n\n\w+\n-+\n", rest)[0]
     texts = {
         name: line.strip()
         for names, line in re.findall(r"^(\w[\w, ]*) :.*\n {4}(.*)", section, re.MULTILINE)
         for name in names.split(", ")
     }
-    return Declaration(parameters, summary, texts)
+    return Declaration(parameters, texts)

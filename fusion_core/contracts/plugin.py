@@ -84,8 +84,14 @@ def built_in(plugin: Any) -> bool:
     return origin is not None and origin.distribution == HOME
 
 
+LOADERS: list[Callable[[], None]] = []
+"""Functions of the host that load what was not asked for yet: a built-in plugin is loaded where its kind is named."""
+
+
 def installed() -> tuple[type[Plugin], ...]:
     """Return every class that is installed as a plugin."""
+    for load in LOADERS:
+        load()
     return tuple(cls for cls in _ORIGINS if issubclass(cls, Plugin))
 
 

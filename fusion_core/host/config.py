@@ -13,7 +13,7 @@ As in a file, another `kind` replaces the mapping that it stands in, since the o
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -135,10 +135,10 @@ def _merge(base: dict[str, Any], over: dict[str, Any], at: Location, replaced: s
     return merged
 
 
-def validate(model: type[Model], document: Document, broken: Mapping[str, str] | None = None) -> Model:
+def validate(model: type[Model], document: Document, broken: Callable[[], Mapping[str, str]] = dict) -> Model:
     """Check a document against a pydantic model.
 
-    `broken` are the errors of plugins that are installed and could not be loaded, by name.
+    `broken` returns the errors of plugins that are installed and could not be loaded, by name.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def validate(model: type[Model], document: Document, broken: Mapping[str, str] |
     try:
         return model.model_validate(document.data, context={"folder": document.path.parent})
     except ValidationError as error:
-        lines = [_explain(item, document, broken or {}) for item in error.errors(include_url=False)]
+        lines = [_explain(item, document, broken()) for item in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None
 
 

@@ -4,33 +4,38 @@ Entry points are loaded one by one and registered by their value: one that fails
 stop the others, and two distributions may use the same entry-point name. The built-in ones come first, and who comes
 second does not get a name that is taken.
 
+A built-in plugin is loaded where its kind is asked for: its entry point says family and kind, as
+`zupt = "fusion_plugins.measurement_models.zupt"`. Those of others are loaded at once, for they may hold any.
+
 A class is a plugin where it is a whole class of its family, with a kind, that a config can hold.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial, reduce
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from operator import or_
 from pathlib import Path
+from threading import RLock
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit, PydanticUseDefault, core_schema
 
 from fusion_core.contracts.families import FAMILIES
-from fusion_core.contracts.plugin import HOME, Family, Origin, Plugin
+from fusion_core.contracts.plugin import HOME, LOADERS, Family, Origin, Plugin
 from fusion_core.errors import FusionError, PluginError, describe_error, quote
 from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
 from fusion_core.settings import nearest
 from fusion_core.units import bias_unit, unsettled
 
-BUILT_IN = ("fusion_plugins.", "driftlab.")  # modules of the distribution HOME
+PLUGINS = "fusion_plugins"
+BUILT_IN = (f"{PLUGINS}.", "driftlab.")  # modules of the distribution HOME
 PRODUCTS = "products"
 ANSWERS = (ValueError, AssertionError, ValidationError, PydanticCustomError, PydanticKnownError, PydanticOmit,
            PydanticUseDefault, FusionError, KeyboardInterrupt)  # fmt: skip  # what a validator may raise
@@ -55,12 +60,20 @@ class Registry:
 
     def __init__(self) -> None:
         self.families = {family.name: family for family in FAMILIES}
-        self.entries: list[Entry] = []
+        self._entries: list[Entry] = []
+        self._waiting: dict[tuple[str, str], EntryPoint] = {}  # built-in ones by family and kind
+        self._lock = RLock()
 
     def load(self) -> None:
-        """Load every entry point of the group, each on its own; families before the plugins that may be of them."""
+        """Load the entry points of the group, each on its own, but for built-in plugins."""
+        points = sorted(entry_points(group=PROJECT), key=_order)
+        self._waiting = {place: point for point in reversed(points) if (place := _place(point)) is not None}
+        self._load([point for point in points if _place(point) is None])
+
+    def _load(self, points: Iterable[EntryPoint]) -> None:
+        """Load entry points; families before the plugins that may be of them."""
         modules: dict[str, tuple[Any, EntryPoint]] = {}
-        for point in sorted(entry_points(group=PROJECT), key=_order):
+        for point in points:
             if point.value not in modules and (module := self._attempt(point, point.load)) is not None:
                 modules[point.value] = module, point
         for value, (module, point) in list(modules.items()):
@@ -68,6 +81,18 @@ class Registry:
                 del modules[value]
         for module, point in modules.values():
             self._attempt(point, partial(self._register, module, point.value, point))
+
+    def _bring(self, family: str | None = None, kind: str | None = None) -> None:
+        """Load the built-in plugins of a family and kind that were not asked for before; None stands for all."""
+        with self._lock:
+            places = [p for p in self._waiting if family in (None, p[0]) and kind in (None, p[1])]
+            self._load([self._waiting.pop(place) for place in places])
+
+    @property
+    def entries(self) -> list[Entry]:
+        """Every plugin and product, and what could not be loaded."""
+        self._bring()
+        return self._entries
 
     def register(self, module: Any) -> None:
         """Register one module (or object) that implements hooks; raises PluginError where it breaks a contract."""
@@ -84,11 +109,24 @@ class Registry:
     def classes(self, contract: type[Plugin]) -> dict[str, type[Plugin]]:
         """Return the working plugins of a family by kind."""
         name = self.family_of(contract).name
-        return {e.kind: e.plugin for e in sorted(self.entries, key=lambda e: e.kind) if e.family == name and e.plugin}
+        self._bring(name)
+        return {e.kind: e.plugin for e in sorted(self._entries, key=lambda e: e.kind) if e.family == name and e.plugin}
+
+    def kinds(self, contract: type[Plugin]) -> list[str]:
+        """Return the kinds of a family's plugins; one that was not loaded yet may turn out to be broken."""
+        name = self.family_of(contract).name
+        loaded = {e.kind for e in self._entries if e.family == name and e.plugin}
+        return sorted(loaded | {kind for family, kind in self._waiting if family == name})
+
+    def find(self, contract: type[Plugin], kind: str) -> type[Plugin] | None:
+        """Return the plugin of a family and kind; None where there is none that works."""
+        name = self.family_of(contract).name
+        self._bring(name, kind)
+        return next((e.plugin for e in self._entries if (e.family, e.kind) == (name, kind) and e.plugin), None)
 
     def products(self) -> dict[str, Path]:
         """Return the files of the products by name."""
-        return {e.kind: e.path for e in self.entries if e.family == PRODUCTS and e.path is not None}
+        return {e.kind: e.path for e in self._entries if e.family == PRODUCTS and e.path is not None}
 
     def broken(self) -> dict[str, str]:
         """Return the errors of what could not be loaded, by kind or name."""
@@ -141,7 +179,7 @@ class Registry:
         if hook == PRODUCTS:
             kind, path = _product(*item)
             self._check_free(origin, kind)
-            self.entries.append(Entry(hook, kind, *origin[1:], module, path=path))
+            self._entries.append(Entry(hook, kind, *origin[1:], module, path=path))
             return
         family = self.families[hook]
         check_class(family, item)
@@ -150,10 +188,11 @@ class Registry:
         if not (point and _is_built_in(point)):
             check_fields(item)
         guard(item, family, origin)
-        self.entries.append(Entry(hook, kind, *origin[1:], module, plugin=item))
+        self._entries.append(Entry(hook, kind, *origin[1:], module, plugin=item))
 
     def _check_free(self, origin: Origin, kind: str) -> None:
-        other = next((e for e in self.entries if (e.family, e.kind, e.error) == (origin.family, kind, None)), None)
+        self._bring(origin.family, kind)
+        other = next((e for e in self._entries if (e.family, e.kind, e.error) == (origin.family, kind, None)), None)
         if other:
             who = " ".join(filter(None, origin[1:])) or "this one"
             raise PluginError(
@@ -162,7 +201,7 @@ class Registry:
             )
 
     def _break(self, kind: str, module: str, error: BaseException, point: EntryPoint | None, family: str = "?") -> None:
-        self.entries.append(Entry(family, kind, *_distribution(point), module, error=describe_error(error, 300)))
+        self._entries.append(Entry(family, kind, *_distribution(point), module, error=describe_error(error, 300)))
 
 
 def _hooks_of(module: Any) -> list[str]:
@@ -203,6 +242,14 @@ def _is_built_in(point: EntryPoint) -> bool:
     return _distribution(point)[0] == HOME and point.value.startswith(BUILT_IN)
 
 
+def _place(point: EntryPoint) -> tuple[str, str] | None:
+    """Return the family and the kind of a built-in plugin; None of what is none."""
+    package, _, rest = point.value.partition(".")
+    if package != PLUGINS or not _is_built_in(point):
+        return None
+    return rest.partition(".")[0], point.name.rpartition(".")[2]
+
+
 def _order(point: EntryPoint) -> tuple[bool, str, str, str]:
     return not _is_built_in(point), _distribution(point)[0], point.value, point.name
 
@@ -216,6 +263,7 @@ def registry() -> Registry:
     if _found is None:
         _found = Registry()
         _found.load()
+        LOADERS.append(_found._bring)
     return _found
 
 
@@ -227,21 +275,25 @@ class Installed:
 
     def __init__(self, *, bias: str | None = None) -> None:
         self.bias = bias
+        self.contract: type[Plugin] = Plugin
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        self.contract = source
         if alone.get():
             return core_schema.any_schema()
-        classes = registry().classes(source)
-        if not classes:
+        kinds = registry().kinds(source)
+        if not kinds:
             text = f"no plugin of the family {registry().family_of(source).name} is installed; install one"
 
             def refuse(value: Any) -> Any:
                 raise PydanticCustomError("no_plugin", "{text}", {"text": text})
 
             return core_schema.no_info_before_validator_function(refuse, core_schema.any_schema())
-        union = reduce(or_, classes.values())
-        tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
-        schema = handler.generate_schema(tagged)
+        if len(kinds) > 1:
+            choices = {kind: _choice(source, kind) for kind in kinds}
+            schema: core_schema.CoreSchema = core_schema.tagged_union_schema(choices, "kind")
+        else:
+            schema = handler.generate_schema(registry().find(source, kinds[0]))
 
         def validate(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
             value = dict(value) if isinstance(value, Plugin) and unsettled(value) else value
@@ -259,7 +311,31 @@ class Installed:
                     plugin=str(kind),
                 ) from error
 
-        return core_schema.no_info_wrap_validator_function(validate, schema)
+        as_it_is = core_schema.plain_serializer_function_ser_schema(lambda plugin: plugin)
+        return core_schema.no_info_wrap_validator_function(validate, schema, serialization=as_it_is)
+
+    def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        """Return the schema of all plugins of the family."""
+        if alone.get() or not (classes := registry().classes(self.contract)):
+            return handler(core_schema.any_schema())
+        union = reduce(or_, classes.values())
+        tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
+        return handler(TypeAdapter(tagged).core_schema)
+
+
+def _choice(contract: type[Plugin], kind: str) -> core_schema.CoreSchema:
+    """Return the schema of one kind of a family: its plugin is loaded where a config names it."""
+
+    def validate(value: Any, info: core_schema.ValidationInfo) -> Any:
+        plugin = registry().find(contract, kind)
+        if plugin is None:
+            known = ", ".join(map(repr, registry().classes(contract)))
+            raise PydanticKnownError(
+                "union_tag_invalid", {"discriminator": "'kind'", "tag": kind, "expected_tags": known}
+            )
+        return plugin.model_validate(value, context=info.context)
+
+    return core_schema.with_info_plain_validator_function(validate)
 
 
 alone: ContextVar[bool] = ContextVar("alone", default=False)  # a class is looked at without the plugins within it

@@ -12,6 +12,7 @@ Where no sample is near enough a row has NaN, so that it is left out and counted
 
 from __future__ import annotations
 
+import mmap
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of t
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
 
 
+ROWS, FEW = 1 << 16, 100  # places read at once, and for which no memory is given back
 PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
 
 
@@ -50,6 +52,15 @@ def mapped(path: Path) -> NDArray[np.uint8]:
         return np.asarray(np.memmap(path, np.uint8, "r"))
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); free memory, or copy it again") from None
+
+
+def release(data: NDArray[np.uint8] | bytes) -> None:
+    """Let the system have the memory back in which it holds what was read of a mapped file; it reads it again."""
+    base: Any = data
+    while base is not None and not isinstance(base, mmap.mmap):
+        base = getattr(base, "base", None)
+    if base is not None and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)
 
 
 def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:
@@ -97,8 +108,16 @@ def interval(t: Array) -> float:
 
 
 def records(data: NDArray[np.uint8] | bytes, at: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes."""
+    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes.
+
+    What of a mapped file is held in memory for it is given back, piece by piece: a log is larger than what it takes.
+    """
     size = dtype.itemsize
     # every place in the data where one could begin, without a copy
     windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
-    return windows[at].view(dtype.base).reshape(len(at), *dtype.shape)
+    values = np.empty(len(at), windows.dtype)
+    for start in range(0, len(at), ROWS):
+        values[start : start + ROWS] = windows[at[start : start + ROWS]]
+        if len(at) > FEW:
+            release(data)
+    return values.view(dtype.base).reshape(len(at), *dtype.shape)

@@ -29,9 +29,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TimeBudget
-from fusion_plugins.sources.joining import records
+from fusion_plugins.sources.joining import records, release
 
-PIECE = 1 << 26  # bytes between two looks at the clock
+PIECE = 1 << 22  # bytes between two looks at the clock, and of a mapped log that are held
 Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
 State = tuple[int, int, int, int, int, int]
 Bytes = NDArray[np.uint8]
@@ -88,6 +88,7 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: TimeBudget) -> 
         rows, stop = counts.sum(), state[0] + PIECE
         state = _walk(data, stop, types_wanted, lengths, (at, types, counts, doubtful), state)
         clock.check(int(counts.sum() - rows))
+        release(data)
     _, count, doubts, lost, first_lost, end = state
     doubtful = doubtful[:doubts].copy()
     return Scan(at[:count], types[:count], counts, doubtful, data[doubtful + 2], lost, first_lost, end)

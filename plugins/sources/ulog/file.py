@@ -37,7 +37,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
-from fusion_plugins.sources.joining import mapped, records
+from fusion_plugins.sources.joining import ROWS, mapped, records, release
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
@@ -75,15 +75,22 @@ class Instance:
     row: np.dtype[np.void]
     data: NDArray[np.uint8]
 
-    def columns(self, rows: Places | slice = slice(None)) -> dict[str, Array]:
-        """Return rows of it by field."""
-        values: Any = records(self.data, self.at[rows] + 5, self.row)
-        return {name: values[name] for name in self.row.names or ()}
+    def columns(self, fields: Collection[str]) -> dict[str, Array]:
+        """Return all rows of it by field, of those fields that it has."""
+        names = [name for name in self.row.names or () if name in fields]
+        columns = {name: np.empty(self.rows, self.row[name]) for name in names}
+        for start in range(0, self.rows, ROWS):
+            part = slice(start, start + ROWS)
+            values: Any = records(self.data, self.at[part] + 5, self.row)
+            for name in names:
+                columns[name][part] = values[name]
+        return columns
 
     @cached_property
     def samples(self) -> Mapping[str, Array]:
         """Some of its rows, by field."""
-        return self.columns(sampled(self.rows))
+        values: Any = records(self.data, self.at[sampled(self.rows)] + 5, self.row)
+        return {name: values[name] for name in self.row.names or ()}
 
     @property
     def rows(self) -> int:
@@ -148,8 +155,7 @@ class LogFile:
         self._dropouts: list[tuple[int, float]] = []  # place, and duration in ms
         self._lost, self._first_lost = 0, -1
         self._fields = self._names = 0  # of all subscriptions: numbers in a row, and characters of what they are called
-        rows = self._messages(*_sections(path, first, len(self.data)))
-        found = dict(self._found(rows))
+        found = dict(self._found(*self._messages(*_sections(path, first, len(self.data)))))
         self.instances = {key: found[key] for key in sorted(found)}
         if not self.instances:
             raise UnreadableFile(f"{path}: ends before its first row ({len(self.data)} bytes); copy or log it again")
@@ -158,9 +164,9 @@ class LogFile:
         """Return the instances of a topic."""
         return [instance for (name, _), instance in self.instances.items() if name == topic]
 
-    def read(self, wanted: Collection[Instance], faults: Faults) -> dict[Instance, dict[str, Array]]:
-        """Return the rows of instances, by field; what is wrong with the file goes to `faults`."""
-        data = {instance: instance.columns() for instance in wanted}
+    def read(self, wanted: Mapping[Instance, Collection[str]], faults: Faults) -> dict[Instance, dict[str, Array]]:
+        """Return the fields of instances that are wanted, by name; what is wrong with the file goes to `faults`."""
+        data = {instance: instance.columns({*TIMES, *fields}) for instance, fields in wanted.items()}
         faults.add(
             "bytes of the log that belong to no message that is known (cut, damaged or of a later format)",
             self._lost,
@@ -177,24 +183,28 @@ class LogFile:
             )
         return data
 
-    def _messages(self, begin: int, ends: Sequence[int]) -> Places:
-        """Read the definitions, and return the places of the rows of what they define."""
-        rows, out, at, count, text = [np.empty(0, np.int64)], np.empty(BLOCK // 5 + 1, np.int64), begin, 0, 0
+    def _messages(self, begin: int, ends: Sequence[int]) -> tuple[Places, NDArray[np.uint16]]:
+        """Read the definitions, and return the places of the rows of what they define, and which these are."""
+        rows, numbers = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
+        out, at, count, text = np.empty(BLOCK // 5 + 1, np.int64), begin, 0, 0
         with TimeBudget(self.path, "what is no row") as clock:
             for end in ends:
                 while at < end:
                     at, n, lost, first, stopped = _walk(self.data[:end], at, at + BLOCK, self._lengths, out, *TYPES)
                     rows.append(out[:n].copy())
+                    numbers.append(records(self.data, out[:n] + 3, U16))
                     self._lost, self._first_lost = self._lost + lost, self._first_lost if self._lost else first
                     clock.check(n + stopped)
-                    if stopped:
+                    if not stopped:
+                        release(self.data)
+                    else:
                         size, kind = struct.unpack("<HB", self.data[at : at + 3].tobytes())
                         with suppress(ValueError, KeyError, IndexError):  # of what is damaged
                             self._define(chr(kind), at, self.data[at + 3 : at + 3 + size].tobytes())
                         at, count, text = at + 3 + size, count + 1, text + size
                         check_count(self.path, "parameters, dropouts and the like", count, COUNT // 2)
                         check_size(self.path, "what describes its rows", text, TEXTS)
-        return np.concatenate(rows)
+        return np.concatenate(rows), np.concatenate(numbers)
 
     def _define(self, kind: str, at: int, content: bytes) -> None:
         """Take in a message: formats and parameters before the first subscription, dropouts behind it."""
@@ -215,9 +225,8 @@ class LogFile:
             form, name = content[1 : 1 + content[0]].decode(errors="ignore").split(" ")[:2]
             (self.parameters[name],) = np.frombuffer(content[1 + content[0] :], NUMBERS[form]).tolist()
 
-    def _found(self, rows: Places) -> Iterator[tuple[tuple[str, int], Instance]]:
+    def _found(self, rows: Places, numbers: NDArray[np.uint16]) -> Iterator[tuple[tuple[str, int], Instance]]:
         """Yield the instances that have rows with a time; of several subscriptions of one, the first comes last."""
-        numbers = records(self.data, rows + 3, U16)
         order = np.argsort(numbers, kind="stable")
         rows, numbers = rows[order], numbers[order]
         for number, (topic, instance, row) in reversed(self._added.items()):
@@ -280,6 +289,7 @@ def _sections(path: Path, first: bytes, size: int) -> tuple[int, list[int]]:
 
 
 IDS = 65536  # subscriptions that a file can have
+TIMES = "timestamp", "timestamp_sample"  # fields: of the message, and of the sample where it has another
 BLOCK = 4 << 20  # bytes between two looks at the clock
 SAMPLED = 1024  # of the rows of an instance that tell about it, each so many-th is taken, and some of the first ones
 

@@ -132,7 +132,8 @@ class ULogTopics(Table):
         named = {path: self._instance(path) for path in paths}
         leading = named[paths[0]]
         instances = list(dict.fromkeys(named.values()))
-        data = self.log.read(instances, self.faults)
+        wanted = {i: [_column(path).field for path in paths if named[path] is i] for i in instances}
+        data = self.log.read(wanted, self.faults)
         self._check_temperatures(named, data)
         t, order = self._rows(leading, data[leading])
         values: dict[str, Array] = {}

@@ -132,7 +132,9 @@ def test_no_color_is_obeyed():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_how_much_is_said_can_be_chosen_of_every_command(command):
-    taken = {option for parameter in get_command(app).commands[command].params for option in parameter.opts}
+    taken = {
+        option for parameter in get_command(app).commands[command].command.made().params for option in parameter.opts
+    }
     assert {"-q", "--quiet", "-v", "--verbose"} <= taken
     assert ("--set" in taken) == (command in (*WITH_CONFIG, "export", "import", "vehicle"))
 

@@ -1,16 +1,22 @@
 """Plugins are found one by one: a broken one is shown and stops nothing."""
 
+import subprocess
+import sys
 import types
 from importlib.metadata import EntryPoint
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
 
 from fusion_core.contracts import BiasModel, Prior, Transition
+from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host import registry as module
-from fusion_core.host.registry import Registry, kind_of
+from fusion_core.host.config import Document, validate
+from fusion_core.host.registry import Installed, Registry, kind_of
+from fusion_core.settings import Settings
 
 
 class Still(BiasModel):
@@ -91,3 +97,76 @@ def test_broken_entry_points_stop_nothing(monkeypatch):
     assert errors["raises:x"].startswith("ZeroDivisionError")
     assert "implements no hook" in errors["empty:x"]
     assert "bias_modells" in errors["misspelt:x"]
+
+
+def test_the_entry_point_of_each_built_in_plugin_says_its_family_and_kind():
+    """By these it is loaded where its kind is asked for."""
+    registry = module.Registry()
+    registry.load()
+    waiting = set(registry._waiting)
+    assert len(waiting) > 30
+    assert waiting == {(entry.family, entry.kind) for entry in registry.entries if entry.family != "products"}
+    assert registry.broken() == {}
+
+
+def test_a_built_in_plugin_is_loaded_where_its_kind_is_asked_for():
+    code = (
+        "import sys\n"
+        "from fusion_core.contracts import Source\n"
+        "from fusion_core.host.registry import registry\n"
+        "def loaded(): return sorted(n.split('.')[2] for n in sys.modules if n.startswith('fusion_plugins.sources.'))\n"
+        "found = registry()\n"
+        "assert 'mat' in found.kinds(Source) and loaded() == [], loaded()\n"
+        "assert found.find(Source, 'mat').__name__ and 'mat' in loaded() and 'ulog' not in loaded(), loaded()\n"
+        "assert set(found.classes(Source)) == set(found.kinds(Source)) and 'ulog' in loaded()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+
+
+class Home(types.SimpleNamespace):
+    __hash__ = object.__hash__
+
+
+class BuiltIn(EntryPoint):
+    dist = Home(name="driftlab", version="0")
+
+    def load(self):
+        if self.name == "still":
+            return plugin("still", Still)
+        raise ImportError("libstill.so: cannot open")
+
+
+def test_the_kind_of_a_built_in_plugin_is_taken_before_it_is_loaded(monkeypatch):
+    class Foreign(EntryPoint):
+        def load(self):
+            return plugin("acme", type("Acme", (Still,), {"__annotations__": {"kind": Literal["still"]}}))
+
+    points = [
+        Foreign("acme", "acme", "fusion_core"),
+        BuiltIn("still", "fusion_plugins.bias_models.still", "fusion_core"),
+    ]
+    monkeypatch.setattr(module, "entry_points", lambda group: points)
+    registry = Registry()
+    registry.load()
+    assert registry.find(BiasModel, "still") is Still
+    assert "is taken by fusion_plugins.bias_models.still" in registry.broken()["still"]
+
+
+def test_a_config_that_names_a_built_in_plugin_which_cannot_be_loaded_says_why(monkeypatch):
+    points = [
+        BuiltIn(kind, f"fusion_plugins.bias_models.{kind}", "fusion_core") for kind in ("still", "missing", "gone")
+    ]
+    monkeypatch.setattr(module, "entry_points", lambda group: points)
+    registry = Registry()
+    registry.load()
+    monkeypatch.setattr(module, "_found", registry)
+
+    class Holder(Settings):
+        bias: Annotated[BiasModel, Installed()]
+
+    assert Holder.model_validate({"bias": {"kind": "still"}}).bias == Still()
+    with pytest.raises(ConfigError, match=r"kind 'gone' is installed but broken \(ImportError: libstill"):
+        validate(Holder, Document(Path("c.yaml"), {"bias": {"kind": "gone"}}), registry.broken)
+    with pytest.raises(ConfigError, match=r"kind 'stil' is not installed; did you mean still\?"):
+        validate(Holder, Document(Path("c.yaml"), {"bias": {"kind": "stil"}}), registry.broken)

@@ -1,9 +1,11 @@
 """Streams with their own time stamps, on the rows of another."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from fusion_plugins.sources.joining import joined
+from fusion_plugins.sources.joining import joined, mapped, records
 
 
 def test_a_slow_stream_is_drawn_through():
@@ -36,3 +38,22 @@ def test_nothing_is_held_for_long_beyond_the_ends():
 def test_a_stream_of_no_sample_or_one(M):
     found = joined(np.arange(3.0), np.ones(M), np.full(M, 7.0))
     assert np.isnan(found).all() if M == 0 else found[1] == 7.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
+def test_memory_in_which_a_mapped_log_is_held_is_given_back(tmp_path):
+    path = tmp_path / "log.bin"
+    path.write_bytes(np.arange(1 << 21, dtype="<u4").tobytes())
+    data = mapped(path)
+
+    def held():
+        """Return the kB of the file that are in this process's memory."""
+        parts = Path("/proc/self/smaps").read_text().split(str(path))[1:]
+        return sum(int(part.split("Rss:")[1].split()[0]) for part in parts)
+
+    at = 4 * np.arange(0, 1 << 21, 7)
+    assert data[at].sum() > 0
+    assert held() >= 8192
+    assert np.array_equal(records(data, at, np.dtype("<u4")), np.arange(0, 1 << 21, 7))
+    assert held() < 100
+    assert np.array_equal(records(data.tobytes(), at[:9], np.dtype("<u4")), np.arange(0, 63, 7))

@@ -61,7 +61,7 @@ def test_all_topics_are_those_of_pyulog(path):
     assert set(log.instances) == set(theirs)
     assert all(log.instances[key].rows == len(data["timestamp"]) for key, data in theirs.items())
     assert log.parameters == oracle.initial_parameters
-    by_instance = log.read([log.instances[key] for key in theirs], Faults())
+    by_instance = log.read({log.instances[key]: data for key, data in theirs.items()}, Faults())
     ours = {(instance.topic, instance.number): data for instance, data in by_instance.items()}
     for key, data in theirs.items():
         assert ours[key].keys() == data.keys()
