@@ -164,7 +164,7 @@ def _apart(columns: FileColumns, channels: Channels) -> OpenQuestion:
 
 
 def unread_of(columns: FileColumns, channels: Channels | None) -> list[str]:
-    """Return where columns hold no numbers, of those by whose names a channel lacks them; of all without channels."""
+    """Return sentences on cells that are no numbers, of columns that a channel lacks; the first without channels."""
     if channels is None:
         return list(columns.unread.values())[:1]
     found = []
