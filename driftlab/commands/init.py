@@ -25,7 +25,15 @@ from driftlab.storage.ownership import seal_of, with_own
 from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel
-from fusion_core.errors import ConfigError, DataError, EmptyRecording, FusionError, MissingChannel, UnitError
+from fusion_core.errors import (
+    ConfigError,
+    DataError,
+    EmptyRecording,
+    FusionError,
+    MissingChannel,
+    UnitError,
+    UnreadableFile,
+)
 from fusion_core.escaping import line
 from fusion_core.units import to_si
 
@@ -140,10 +148,10 @@ def _answers(
 
 def _problems(starter: Starter, path: Path) -> tuple[str, ...]:
     try:
-        return tuple(problems_of(with_recording(config_of(starter.text, measuring=True), str(path))))
+        return starter.problems + tuple(problems_of(with_recording(config_of(starter.text, measuring=True), str(path))))
     except (ConfigError, UnitError):
         if starter.asked:  # which is why it cannot be read yet
-            return ()
+            return starter.problems
         raise
 
 
@@ -171,6 +179,8 @@ def _guess(file: Path, path: str, given: Answers) -> Starter:
 
 def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answers) -> Starter:
     if not any(map(len, columns.values.values())):
+        if columns.unread:
+            raise UnreadableFile(f"{file}: no column holds numbers: {config_text.unread_of(columns, None)[0]}")
         raise EmptyRecording(
             f"{file}: has the {columns.noun}s {_listed(columns.names)} and no rows of numbers; record anew"
         )
@@ -185,9 +195,10 @@ def _of_columns(file: Path, path: str, columns: reading.FileColumns, given: Answ
 
 
 def _no_sensor(file: Path, columns: reading.FileColumns) -> NoSensor:
+    unread = f" (no numbers in {_listed(list(columns.unread))})" if columns.unread else ""
     error = NoSensor(
-        f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}; name those of its axes, "
-        "as in --column gyro=wx,wy,wz"
+        f"{file}: no {columns.noun} is called like a gyro; it has {_listed(columns.names)}{unread}; name those of its "
+        "axes, as in --column gyro=wx,wy,wz"
     )
     error.question = config_text.of_a_sensor(columns)
     return error

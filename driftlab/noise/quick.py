@@ -2,7 +2,8 @@
 
 The white noise is the Allan deviation at the shortest averaging times. The walk is the likeliest one in means of all
 that is quiet, beside any smooth curve of the temperature, and of how fast it moves: a bias that follows a ramp is no
-walk. It is known where the limits of 99 % of its likelihood are within a factor of it; else its upper limit is given.
+walk. It is known where the limits of 99 % of its likelihood are within a factor of it, and curves that bend within a
+kelvin, as those of units with a step do, leave it as large; else its upper limit is given.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ GAP = 1.5  # usual steps
 MIN_IN_MEAN = 8  # samples, of which the scatter about a line tells motion
 MEANS = 1500  # from which the walk is estimated, at most
 COLUMNS = 16  # of curves over the temperature, at most
-BEND = 4.0  # K: in less, no curve bends
+BEND, STEP = 4.0, 1.0  # K, between knots: of a curve that bends, and of one with a step
+STEPS = 96  # columns of such curves, at most
 LAG = 300.0  # s, of what follows the temperature
 RATIOS = np.geomspace(1e-8, 1e4, 73)  # of the walk's variance from mean to mean to that of their white noise
 DEPENDENT = 1e-9  # of the largest singular value: columns that are combinations of others
@@ -83,15 +85,16 @@ def _walk(t: Array, values: Array, temperature: Array | None) -> tuple[Array, Fl
     dt = np.concatenate([[np.inf], np.maximum(np.diff(times[:, 0]) / step, 0.0)])
     white = np.where(moving, np.inf, 1.0)
     found = []
-    for X in _curves(times[:, 0], means[:, 0]):
+    for X in (*_curves(times[:, 0], means[:, 0]), _orthonormal(_cubic(means[:, 0], STEP, STEPS))):
         costs, scales = LevelLikelihood([(np.hstack([X, y - y[:1]]), white, dt)], X.shape[1]).over(RATIOS)
         walks = np.sqrt(RATIOS[:, None] * scales / step)
         likely = np.where(costs - np.min(costs, axis=0) <= LIMIT, walks, np.nan)
         best = walks[np.argmin(costs, axis=0), np.arange(y.shape[1])]
         found.append((np.nanmin(likely, axis=0), best, np.nanmax(likely, axis=0)))
+    *found, (_, beside_steps, _) = found
     walk, all_found = found[0][1], np.array(found)
     known = (np.max(all_found, axis=(0, 1)) <= FACTOR * walk) & (FACTOR * np.min(all_found, axis=(0, 1)) >= walk)
-    known &= temperature is not None
+    known &= (temperature is not None) & (FACTOR * beside_steps >= walk)
     return np.where(known, walk, np.max(all_found, axis=(0, 1))), known
 
 
@@ -100,8 +103,6 @@ def _curves(t: Array, T: Array) -> Iterator[Array]:
 
     Through the noise of the thermometer a steep curve looks like a walk, to each of the two in another size.
     """
-    from scipy.interpolate import BSpline
-
     span = float(np.ptp(T))
     if span == 0:
         yield np.empty((len(t), 0))
@@ -109,11 +110,28 @@ def _curves(t: Array, T: Array) -> Iterator[Array]:
     slow = T.copy()
     for k in range(1, len(T)):
         slow[k] = slow[k - 1] + (T[k] - slow[k - 1]) * -np.expm1(-(t[k] - t[k - 1]) / LAG)
-    knots = np.linspace(T.min(), T.max(), int(np.clip(span / BEND, 1, COLUMNS)) + 1)
-    cubic = BSpline.design_matrix(T, np.concatenate([knots[[0] * 3], knots, knots[[-1] * 3]]), 3).toarray()
-    for columns in (np.column_stack([cubic, (T - slow) / span]), cubic):
-        left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
-        yield np.asarray(left[:, sizes > DEPENDENT * sizes[0]])
+    cubic = _cubic(T, BEND, COLUMNS)
+    yield _orthonormal(np.column_stack([cubic, (T - slow) / span]))
+    yield _orthonormal(cubic)
+
+
+def _cubic(T: Array, bend: float, most: int) -> Array:
+    """Return the cubic splines (K, q) of a temperature with knots `bend` K apart, or `most` intervals of them."""
+    from scipy.interpolate import BSpline
+
+    span = float(np.ptp(T))
+    if span == 0:
+        return np.empty((len(T), 0))
+    knots = np.linspace(T.min(), T.max(), int(np.clip(span / bend, 1, most)) + 1)
+    return np.asarray(BSpline.design_matrix(T, np.concatenate([knots[[0] * 3], knots, knots[[-1] * 3]]), 3).toarray())
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Return orthonormal columns (K, r) of the same space, but for a constant; r is its dimension."""
+    if not columns.shape[1]:
+        return columns
+    left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
+    return np.asarray(left[:, sizes > DEPENDENT * sizes[0]])
 
 
 def _quietest(t: Array, values: Array) -> slice | None:

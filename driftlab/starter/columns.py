@@ -86,7 +86,8 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
         if field in SENSORS and t is not None and (quick := noise_of(t, values, T)):
             noise[field] = quick
         stated = _stated(field, group, columns, given.units, written)
-        guess = stated or _by_values(field, values, channels, noise)
+        counts = any(name.counts for name in group) and field in ("gyro", "temperature")
+        guess = stated or (OF_COUNTS if counts else _by_values(field, values, channels, noise))
         axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
         paths = tuple(name.path for name in group)
         channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)
@@ -245,6 +246,9 @@ class Guess(NamedTuple):
     why: str
 
 
+OF_COUNTS = Guess(None, "raw counts, by the name: write their size, as in 0.0305 deg/s or 0.01 degC")
+
+
 def of_time(t: Array, swing: float = 0.0) -> Guess:
     """Guess the unit of time stamps (N,), while which the temperature moved by `swing` K."""
     finite = t[np.isfinite(t)]
@@ -301,6 +305,8 @@ def of_gyro(values: Array, density: Array, accel: str | None) -> Guess:
     sizes = f"mean {level:.2g} and noise {noise:.2g}/sqrt(Hz)"
     if level > COUNTS or noise > COUNTS / 100:
         return Guess(None, f"{sizes}: deg/h, mrad/s, or raw counts? Write their size, as in 0.0305 deg/s")
+    if np.array_equal(values, np.rint(values), equal_nan=True) and np.any(values):
+        return Guess(None, f"{sizes}, in whole numbers: raw counts? Write their size, as in 0.0305 deg/s")
     if level > LARGE or noise > QUIET_DEG:
         return Guess("deg/s", f"{sizes} are too large for rad/s")
     if 0 < noise < QUIET_RAD:

@@ -12,7 +12,7 @@ import numpy as np
 
 from driftlab.noise.quick import QuickNoise
 from driftlab.starter.columns import SENSORS, Channels, GuessedChannel, of_accel
-from driftlab.starter.names import Name
+from driftlab.starter.names import Name, read_name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
 from fusion_core.escaping import line, yaml_text
@@ -47,11 +47,15 @@ APART = OpenQuestion("interval", "", "the interval between rows: no column is a 
 
 @dataclass(frozen=True)
 class Starter:
-    """A config as text, and the places to be filled in, a sentence each; `questions` a person can be asked."""
+    """A config as text, and the places to be filled in, a sentence each; `questions` a person can be asked.
+
+    `problems` are columns of sensors that hold no numbers.
+    """
 
     text: str
     asked: tuple[str, ...]
     questions: tuple[OpenQuestion, ...] = ()
+    problems: tuple[str, ...] = ()
 
 
 def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
@@ -67,7 +71,9 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     settings = ((key, json.dumps(value, ensure_ascii=False)) for key, value in columns.settings.items())
     lines += [f"  {key}: {text}{guessed.get(key, '')}" for key, text in settings]
     if "time" not in channels.found and "interval" not in columns.settings:
-        lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
+        apart = _apart(columns, channels)
+        why = apart.text.partition(": ")[2]
+        lines.append(f"  # interval: {apart.choices[0]}       # fill in: {why}, so how far are the rows apart?")
     lines.append("  channels:")
     lines += [_channel(field, channel) for field, channel in channels.found.items()]
     if held is not None:
@@ -77,7 +83,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return replace(_starter(lines, asked), questions=questions)
+    return replace(_starter(lines, asked), questions=questions, problems=tuple(map(line, unread_of(columns, channels))))
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
@@ -135,7 +141,7 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
     for option, doubt in columns.doubts.items():
         yield OpenQuestion(option, "", f"{DOUBTED[option]}: {doubt.why}", doubt.ways, needed=False)
     if "time" not in channels.found and "interval" not in columns.settings:
-        yield APART
+        yield _apart(columns, channels)
     for field, channel in channels.found.items():
         if channel.guessed:
             usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
@@ -143,6 +149,32 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
             yield OpenQuestion(
                 "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
             )
+
+
+def _apart(columns: FileColumns, channels: Channels) -> OpenQuestion:
+    """Return the question for the interval: a guess where a time changes once in many rows."""
+    for name in (name for name in channels.others if name.quantity == "time"):
+        steps = np.diff(columns.values[name.path])
+        at = np.flatnonzero(steps)
+        if len(at) > 2 and np.all(steps[at] > 0) and (rows := float(np.median(np.diff(at)))) > 1:
+            text = f"the interval between rows: '{name.path}' stays the same over some {rows:.0f} rows"
+            guess = float(np.median(steps[at])) / rows
+            return APART._replace(text=text, choices=(f"{guess:.6g} s", *APART.choices))
+    return APART
+
+
+def unread_of(columns: FileColumns, channels: Channels | None) -> list[str]:
+    """Return sentences on cells that are no numbers, of columns that a channel lacks; the first without channels."""
+    if channels is None:
+        return list(columns.unread.values())[:1]
+    found = []
+    for path, why in columns.unread.items():
+        name = read_name(path)
+        channel = channels.found.get(name.quantity or "")
+        part = name.axis is not None and channel is not None and channel.values.shape[1] < 3
+        if name.quantity is not None and (channel is None or part):
+            found.append(why)
+    return found
 
 
 def of_a_sensor(columns: FileColumns) -> OpenQuestion:

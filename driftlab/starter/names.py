@@ -34,6 +34,13 @@ UNITS = {
     "msec": "ms", "millis": "ms", "s": "s", "sec": "s", "secs": "s", "seconds": "s", "g": "g", "c": "degC", "k": "K",
     "f": "degF", "v": "V", "vdc": "V", "ohm": "ohm", "ohms": "ohm", "dph": "deg/h",
 }  # fmt: skip
+COUNTS = {"lsb", "lsbs", "raw", "adc", "cnt", "cnts", "counts", "digits"}
+"""Last words of the names of values as a converter gives them."""
+SCALE = re.compile(
+    r"[(\[{,_]?\s*(?:(?P<per>\d+(?:[.,]\d+)?)\s*(?:LSB|counts?|digits?)\s*(?:/|per)\s*(?P<unit>[^\]}]+?)|"
+    r"(?P<size>\d+(?:[.,]\d+)?(?:e-?\d+)?)\s*(?P<each>[^\[({]+?)\s*(?:/|per)\s*(?:LSB|count|digit))\s*[)\]}]?$",
+    re.I,
+)  # of a count, as [131 LSB/(deg/s)] or (0.0305 deg/s/LSB)
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
 FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1
 
@@ -47,6 +54,7 @@ class Name:
     axis: str | None
     unit: str | None
     group: tuple[str, ...]  # its words without axis and unit
+    counts: bool = False  # of a converter, by its name, whose size it does not state
 
 
 LONGEST = 1000
@@ -57,11 +65,13 @@ def read_name(path: str) -> Name:
     """Read the name of a column; of one of more than `LONGEST` letters nothing is guessed."""
     if len(path) > LONGEST:
         return Name(path, None, None, None, (path,))
-    bare, unit = _in_brackets(path)
+    bare, unit = _of_a_count(path) or _in_brackets(path)
     words = [word.lower() for word in re.findall(r"[A-ZÄÖÜ]?[a-zäöüéèß]+|[A-ZÄÖÜ]+(?![a-zäöü])|\d+", bare)]
+    counts = unit is None and len(words) > 1 and words[-1] in COUNTS
+    words = words[:-1] if counts else words
     letter = re.split(r"[./_\s]", re.split(r"[./]", bare)[-1].strip())[0]
     if letter == "T" or (letter == "t" and words[-1] == "t"):
-        return Name(path, "time" if letter == "t" else "temperature", None, unit, (bare,))
+        return Name(path, "time" if letter == "t" else "temperature", None, unit, (bare,), counts)
     quantity, axis, rest = _meaning(words)
     if unit is None:
         for count in (3, 2, 1):  # `m_s2` and `rad_s` are several words
@@ -72,7 +82,7 @@ def read_name(path: str) -> Name:
                 break
     elif not (quantity and _fits(unit, quantity)) and not NO_SENSOR & set(words):
         quantity = quantity_of(unit)  # whatever its language calls it
-    return Name(path, quantity, axis, unit, tuple(rest))
+    return Name(path, quantity, axis, unit, tuple(rest), counts)
 
 
 def quantity_of(unit: str) -> str | None:
@@ -136,6 +146,18 @@ def known_unit(text: str) -> str | None:
     degrees = re.sub("[°º˚]", "deg", text.strip().replace("²", "2").replace("µ", "u").replace("μ", "u"))
     unit = UNITS.get(re.sub(r"[^a-z0-9]", "", degrees.lower()), degrees)
     return unit if unit and same_dimension(unit, unit) else None
+
+
+def _of_a_count(path: str) -> tuple[str, str] | None:
+    """Return a name without the scale that it states, and the size of a count as a unit; None where it states none."""
+    found = SCALE.search(path)
+    if found is None:
+        return None
+    unit = known_unit((found["unit"] or found["each"]).strip(" ()"))
+    size = float((found["per"] or found["size"]).replace(",", "."))
+    if unit is None or not size:
+        return None
+    return path[: found.start()], f"{1 / size if found['per'] else size:.9g} {unit}"
 
 
 def _in_brackets(path: str) -> tuple[str, str | None]:

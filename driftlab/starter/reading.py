@@ -51,6 +51,7 @@ class FileColumns:
     units: dict[str, str]  # as the file gives them
     more: bool  # whether the file has more rows than were looked at
     doubts: dict[str, Doubt] = field(default_factory=dict)  # by settings
+    unread: dict[str, str] = field(default_factory=dict)  # columns that are no numbers, and where
 
 
 @dataclass(frozen=True)
@@ -156,12 +157,16 @@ def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
-    values, more = _values(source, path, names)
-    return FileColumns(source.kind, noun, settings, names, values, units, more, doubts)
+    unread: dict[str, str] = {}
+    values, more = _values(source, path, names, unread)
+    return FileColumns(source.kind, noun, settings, names, values, units, more, doubts, unread)
 
 
-def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
-    """Return the first rows of the columns that can be read: all together, or where that fails one by one."""
+def _values(source: FileSource, path: Path, names: list[str], unread: dict[str, str]) -> tuple[dict[str, Array], bool]:
+    """Return the first rows of the columns that can be read: all together, or where that fails one by one.
+
+    `unread` is given the others, and why.
+    """
     try:
         return _rows(source, path, names)
     except DataError:
@@ -172,7 +177,8 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
         check_all()
         try:
             own, further = _rows(source, path, [name])
-        except DataError:
+        except DataError as error:
+            unread[name] = str(error).removeprefix(f"{path}: ")
             continue
         more = more or further
         for values in own.values():

@@ -169,7 +169,9 @@ class GrowingFile:
                 with named(self.path):
                     self._file.close()
             finally:
-                if self._beside is not None and not self._data:
+                if self._data and self._early:  # also where the last rows could not be written: others are safe
+                    self.settle()
+                elif self._beside is not None and not self._data:
                     self._beside.unlink(missing_ok=True)
         if self._data:
             self.settle()

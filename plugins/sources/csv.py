@@ -36,6 +36,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.dialect import (
     JOINED,
     bare,
+    called,
     dialect_of,
     fields_of,
     has_day,
@@ -52,7 +53,7 @@ SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file; TEXTS o
 SLOW = 40  # times as many for each line that is left out by itself
 COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
 FIRST = re.compile(rb"^(?!#)[^\S\n]*\S[^\n]*", re.M)  # line that is neither
-SEPARATORS = {",": ",", ";": ";", "\t": "\\t", " ": " "}  # and how each is shown
+SEPARATORS = {",": ",", ";": ";", "\t": "\\t", "|": "|", " ": " "}  # and how each is shown
 BLANKS, EDGES = re.compile(rb"[ \t]+"), re.compile(rb"^[ \t]+|[ \t]+(?=\r?$)", re.M)
 MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}  # of encodings, at the beginning
 COMMA = str.maketrans(",.", ".,")
@@ -66,7 +67,7 @@ class Csv(FileSource):
     suffixes: ClassVar[tuple[str, ...]] = (".csv", ".tsv", ".txt", ".csv.gz")
 
     kind: Literal["csv"] = "csv"
-    separator: Literal[",", ";", "\t", " "] = ","
+    separator: Literal[",", ";", "\t", "|", " "] = ","
     """Separator of the cells of a line; a blank stands for any number of blanks and tabs."""
     decimal: Literal[".", ","] = "."
     """Decimal sign of the numbers."""
@@ -160,6 +161,7 @@ class CsvLines(Table):
         self.skipped, self.most = 0, TEXTS  # bytes of comments and blank lines, and how many there may be
         self.line = 1  # number of the first line of the block that is read
         self.units: list[str] = []
+        self.again: re.Pattern[bytes] | None = None  # the line of the names, where a logger writes it once more
         self.texts = {part for path in settings.dates for part in self._parts(path)}
         self.columns = self._names()
         self._check_header()
@@ -211,7 +213,7 @@ class CsvLines(Table):
         """Return the names of the columns, and leave the file before the first row."""
         header, first = self.settings.header, self.settings.first_row
         if header is None and first is None:
-            return self._widened([name.strip() for name in self._fields(self._header())])
+            return self._widened(called(self._fields(self._again(self._header()))))
         skipped = [decoded(self.file.readline(LONGEST)) for _ in range(max(header or 0, (first or 1) - 1))]
         self.line += len(skipped)
         self._skip(sum(map(len, skipped)))
@@ -221,9 +223,17 @@ class CsvLines(Table):
         if header > len(skipped) or not skipped[header - 1]:
             raise EmptyRecording(f"{self.path}: has fewer than {header} lines; correct source.header")
         rest = [names_of(line, self.separator) for line in skipped[header:] if line.strip()]
-        names = names_of(skipped[header - 1], self.separator)
+        names = names_of(self._again(skipped[header - 1]), self.separator)
         self.units = rest[0] if rest and len(rest[0]) == len(names) else []
         return self._widened(names)
+
+    def _again(self, names: str) -> str:
+        """Return the line of the names, which is left out where it stands between rows."""
+        line = names.strip("\ufeff\r\n\t ").encode()
+        line = BLANKS.sub(b" ", line) if self.separator == " " else line
+        if line:
+            self.again = re.compile(rb"^[ \t]*" + re.escape(line) + rb"[ \t]*\r?(?:\n|\Z)", re.M)
+        return names
 
     def _next_line(self) -> str:
         """Return the next line that is neither blank nor a comment, and stay before it."""
@@ -279,6 +289,10 @@ class CsvLines(Table):
     def _without(self, block: bytes) -> bytes:
         """Return a block without its comments, and without blank lines where these are no empty cells."""
         rows = (COMMENTS if len(self.columns) == 1 else BLANK).sub(b"", block)
+        if self.again is not None and (first := self.again.search(block)):
+            rows, count = self.again.subn(b"", rows)
+            where = self.line + block.count(b"\n", 0, first.start())
+            self.faults.add("line of the names again, left out", count, f"line {where}")
         self._skip(len(block) - len(rows))
         return rows
 
@@ -292,7 +306,7 @@ class CsvLines(Table):
                 f"{self.path}: the first line has numbers only ({', '.join(self.columns[:4])}, ...), "
                 "the columns' names were expected; write them in a line above, or set header: 0"
             )
-        other = next((s for s in ",;\t" if s != self.separator and s in self.columns[0]), None)
+        other = next((s for s in ",;\t|" if s != self.separator and s in self.columns[0]), None)
         if len(self.columns) == 1 and other:
             raise MissingChannel(
                 f"{self.path}: the header has no '{SEPARATORS[self.separator]}' and is a single column; "
@@ -395,7 +409,9 @@ class CsvLines(Table):
         """Return the number of the k-th line that is kept of the block."""
         left_out = COMMENTS if len(self.columns) == 1 else BLANK
         lines = block.removesuffix(b"\n").split(b"\n")
-        numbers = (number for number, line in enumerate(lines) if not left_out.fullmatch(line + b"\n"))
+        again = self.again.fullmatch if self.again is not None else lambda line: None
+        kept = ((k, line + b"\n") for k, line in enumerate(lines))
+        numbers = (number for number, line in kept if not (left_out.fullmatch(line) or again(line)))
         return self.line + next(islice(numbers, k, None), len(lines))
 
     def _row(self, line: str, at: dict[str, int], where: Callable[[int], int], k: int) -> list[float]:
@@ -451,6 +467,9 @@ def _number(cell: str) -> float | None:
     """Return the number in a cell, NaN where it is empty, None where there is something else."""
     if "_" in cell or not cell.isascii():  # which Python takes for part of a number
         return None
+    cell = cell.strip()
+    if cell[:1] in ("+", "-"):
+        cell = cell[0] + cell[1:].lstrip(" ")  # a sign in a place of its own
     try:
         return float(cell) if cell.strip() else np.nan
     except ValueError:

@@ -20,11 +20,11 @@ from fusion_core.chunk import Array
 if TYPE_CHECKING:
     import polars as pl
 
-SEPARATORS = ("\t", ";", ",", " ")
+SEPARATORS = ("\t", ";", ",", "|", " ")
 SAMPLE = 400  # lines that are looked at, behind a preamble of at most as many
 NUMBER = {
     sign: re.compile(
-        rf"[+-]?(?:\d+(?:{re.escape(sign)}\d*)?|{re.escape(sign)}\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.I
+        rf"(?:[+-] *)?(?:\d+(?:{re.escape(sign)}\d*)?|{re.escape(sign)}\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.I
     )
     for sign in ".,"
 }
@@ -107,9 +107,10 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
 def _longest_run(rows: Sequence[int], lines: Sequence[str]) -> int:
     """Return the first of the most rows that nothing but blank lines and comments are between."""
     begin, best, longest = 0, 0, 0
+    above = {line.strip() for line in lines[: rows[0]]}  # where the names are: a logger writes them again as it begins
     for k in range(1, len(rows) + 1):
         between = lines[rows[k - 1] + 1 : rows[k]] if k < len(rows) else ["-"]
-        if any(line.strip() and not line.startswith("#") for line in between):
+        if any(line.strip() and not line.startswith("#") and line.strip() not in above for line in between):
             if k - begin > longest:
                 best, longest = rows[begin], k - begin
             begin = k
@@ -118,7 +119,13 @@ def _longest_run(rows: Sequence[int], lines: Sequence[str]) -> int:
 
 def names_of(line: str, separator: str) -> list[str]:
     """Return the names of the columns in a line, which may be a comment."""
-    return [name.strip() for name in fields_of(line.strip("\ufeff\r\n ").lstrip("#").lstrip(" "), separator)]
+    return called(fields_of(line.strip("\ufeff\r\n ").lstrip("#").lstrip(" "), separator))
+
+
+def called(cells: Sequence[str]) -> list[str]:
+    """Return the names in cells; a first one that has none is called 1."""
+    names = [cell.strip() for cell in cells]
+    return ["1", *names[1:]] if any(names) and not names[0] and "1" not in names else names
 
 
 def bare(cells: list[str]) -> list[str]:

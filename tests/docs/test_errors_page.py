@@ -1,6 +1,7 @@
 """The messages of errors.md are those of the source: no run of three words of one stands in no text of the code."""
 
 import ast
+import importlib.util
 import re
 from pathlib import Path
 
@@ -55,3 +56,13 @@ def test_every_message_stands_in_the_code():
     found = {message: runs for message in messages if (runs := unknown(message, known))}
     assert found == {}
     assert unknown("driftlab: a.yaml:11: the yardstick flatters quickly", known) == ["the yardstick flatters quickly"]
+
+
+def test_the_list_of_all_messages_is_that_of_the_source():
+    """`python docs/reference/make_errors.py` changes nothing."""
+    spec = importlib.util.spec_from_file_location("make_errors", PAGE.with_name("make_errors.py"))
+    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    made = module.lines()
+    assert made.count("\n| `") > 450
+    assert "| `{file}: no column holds numbers: " in made
+    assert PAGE.read_text(encoding="utf-8").endswith(made)

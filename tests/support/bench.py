@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 from units_at_rest import unit_at_rest
 
@@ -63,8 +64,7 @@ class Device:
         self.plug()
 
     def plug(self):
-        import tty
-
+        tty = pytest.importorskip("tty", reason="terminals are those of POSIX")
         self.master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self.master, False)

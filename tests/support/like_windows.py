@@ -2,7 +2,8 @@
 
     python like_windows.py FOLDER COMMANDS    # a JSON list of argument lists; prints a list of [status, stderr]
 
-HDF5 has its own calls of the system: its files are known to be open all the same, by `/proc/self/fd`.
+`hide` alone is what `make hidden` has in all processes of the suite. HDF5 has its own calls of the system: its files
+are known to be open all the same, by `/proc/self/fd`.
 """
 
 import builtins
@@ -16,23 +17,55 @@ import subprocess  # noqa: F401  # which takes the module `msvcrt` for Windows i
 import sys
 import tempfile
 import types
+from importlib import import_module
+from importlib.machinery import PathFinder, SourceFileLoader
+from pathlib import Path
 
 LIBRARIES = ("h5py", "numba.core.caching", "onnx", "onnxruntime", "pint", "polars", "rich.console", "scipy.special")
 LACKS = ("fcntl", "termios", "tty", "pty", "resource", "pwd", "grp", "readline")
+OURS = ("driftlab", "fusion_core", "fusion_plugins")
 CALLS = ("pread", "pwrite", "geteuid", "getgid", "statvfs", "fork", "mkfifo", "killpg", "fchmod", "O_NOFOLLOW",
          "O_NONBLOCK", "ST_RDONLY", "posix_fallocate", "register_at_fork", "set_blocking", "mknod")  # fmt: skip
 SIGNALS = ("SIGHUP", "SIGIO", "SIGALRM", "SIGUSR1", "pthread_sigmask", "setitimer")
 RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?$|.*[<>:\"|?*\x00-\x1f]|.*[. ]$")
 
 
-def begin() -> None:
-    """Hide what Windows lacks, and have files behave as they do there."""
-    import fcntl
-    import multiprocessing
-    from importlib import import_module
+class Libraries:
+    """A finder for libraries, which have other parts for Windows: here they take those of POSIX."""
 
-    for name in LIBRARIES:  # which ask `os.name`, and then for what POSIX has
-        import_module(name)
+    def __init__(self, real: dict[str, types.ModuleType]) -> None:
+        self.real, self.depth = real, 0
+
+    def find_spec(self, name, path=None, target=None):
+        """Return the usual spec, of a library with a loader before which nothing is hidden."""
+        spec = PathFinder.find_spec(name, path, target)
+        if name.partition(".")[0] in OURS or not isinstance(getattr(spec, "loader", None), SourceFileLoader):
+            return spec
+        if "site-packages" in Path(spec.origin).parts:
+            run = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: self.shown(run, module)
+        return spec
+
+    def shown(self, run, module):
+        """Run the code of a module while nothing is hidden."""
+        self.depth += 1
+        sys.modules.update(self.real)
+        try:
+            run(module)
+        finally:
+            self.depth -= 1
+            if not self.depth:
+                sys.modules.update(dict.fromkeys(LACKS))
+
+
+def hide() -> None:
+    """Hide modules that Windows lacks, and have `msvcrt` lock files in the place of `fcntl`."""
+    if "msvcrt" in sys.modules:
+        return  # hidden already
+    import fcntl
+
+    sys.meta_path.insert(0, Libraries({name: import_module(name) for name in LACKS}))
+
     locks = types.ModuleType("msvcrt")
     locks.LK_NBLCK = 2
 
@@ -40,9 +73,22 @@ def begin() -> None:
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     locks.locking = locking
-    for name in LACKS:
-        sys.modules[name] = None
+    sys.modules.update(dict.fromkeys(LACKS))
     sys.modules["msvcrt"] = locks
+
+
+def as_it_is_written(path: Path) -> Path:
+    """Return the name of a file of rows that a program has open: its own only where open files can be renamed."""
+    return path.with_name(path.name + ".new") if "msvcrt" in sys.modules else path
+
+
+def begin() -> None:
+    """Hide what Windows lacks, and have files behave as they do there."""
+    import multiprocessing
+
+    for name in LIBRARIES:  # which ask `os.name`, and then for what POSIX has
+        import_module(name)
+    hide()
     for name in CALLS:
         if hasattr(os, name):
             delattr(os, name)

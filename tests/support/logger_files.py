@@ -63,7 +63,7 @@ class LoggerFile:
     rate : float
         Of its rows, Hz.
     asks, refused : str
-        Pattern of what must be asked, or of the message that refuses it; empty where nothing is.
+        Pattern of what must be asked or said to be wrong, or of the message that refuses it; empty where nothing is.
     """
 
     name: str
@@ -726,7 +726,8 @@ def read_back(file: LoggerFile, folder: Path) -> str:
     if file.refused:
         return f"is not refused, asks {done.asked}"
     if file.asks:
-        return "" if any(matches(file.asks, text) for text in done.asked) else f"asks {done.asked}"
+        said = (*done.asked, *done.problems)
+        return "" if any(matches(file.asks, text) for text in said) else f"asks {said}"
     try:
         got = concatenate(list(load_config(folder / "unit.yaml").source.chunks(100_000, Faults())))
     except FusionError as error:

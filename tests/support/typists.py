@@ -1,12 +1,13 @@
 """A person at a terminal, who reads what a program writes there and types."""
 
 import os
-import pty
 import select
 import signal
 import subprocess
 import sys
 import time
+
+import pytest
 
 SECONDS = 20
 
@@ -16,13 +17,20 @@ def at_a_terminal(*args, cwd, answers=(), **environment):
 
     A command that waits for more is stopped, and an error.
     """
-    ours, theirs = pty.openpty()
+    fcntl = pytest.importorskip("fcntl", reason="terminals are those of POSIX")
+    termios = pytest.importorskip("termios", reason="terminals are those of POSIX")
+    ours, theirs = os.openpty()
+
+    def take_the_terminal():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a shell has its background jobs ignore
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
     known = {"TERM": "xterm", "COLUMNS": "100", "LINES": "40", "PROMPT_TOOLKIT_NO_CPR": "1"}
     env = {**os.environ, **known, **environment}
     running = subprocess.Popen(
         [sys.executable, "-m", "driftlab", *map(str, args)],
         stdout=theirs, stderr=theirs, stdin=theirs, env=env, cwd=cwd, start_new_session=True,
-        preexec_fn=_take_the_terminal,
+        preexec_fn=take_the_terminal,
     )  # fmt: skip
     os.close(theirs)
     shown, passed, left, until = b"", 0, list(answers), time.monotonic() + SECONDS
@@ -44,11 +52,3 @@ def at_a_terminal(*args, cwd, answers=(), **environment):
         running.kill()
         running.wait()
         raise AssertionError(f"waits for more; shown is {text}") from None
-
-
-def _take_the_terminal():
-    import fcntl
-    import termios
-
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a shell has its background jobs ignore
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)

@@ -264,7 +264,8 @@ def test_bytes_without_a_clock_need_an_interval_which_is_then_in_the_config(tmp_
 
 def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
     with pytest.raises(
-        MissingChannel, match=r"no column is called like a gyro; it has one, b, c; name those of its axes, as in --col"
+        MissingChannel,
+        match=r"no column is called like a gyro; it has one, b, c \(no numbers in c\); name those of its axes, as",
     ):
         written(tmp_path, {"one": [1.0, 2.0], "b": [1.0, 2.0], "c": ["x", "y"]})
 

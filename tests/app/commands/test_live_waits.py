@@ -2,7 +2,6 @@
 
 import json
 import os
-import pty
 import re
 import select
 import signal
@@ -72,7 +71,8 @@ def test_noise_is_spoken_of_and_the_run_ends(bench):
 
 def test_silence_is_spoken_of_on_the_terminal_too_and_ctrl_c_ends_it(bench):
     folder, _ = bench
-    master, slave = pty.openpty()
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
+    master, slave = os.openpty()
     run = begin(folder, stdout=slave)
     os.close(slave)
     seen, begun = b"", time.monotonic()
@@ -149,8 +149,7 @@ def test_what_was_measured_outlives_kill_and_other_commands(bench):
 
 
 def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_was_flushed(bench):
-    import resource
-
+    resource = pytest.importorskip("resource", reason="limits of a process are those of POSIX")
     folder, device = bench
     stop = threading.Event()
     sender = paced(device, unit_frames(60, RATE), RATE, stop)

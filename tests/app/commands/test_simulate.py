@@ -328,6 +328,7 @@ def test_what_serves_nothing_is_named(config, tmp_path):
 
 def test_a_config_reads_what_is_served(config, tmp_path):
     """The `source` that is said reads all samples, in the order and at the times at which they were simulated."""
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
     begun, chunks = threading.Event(), []
 
     def listen(said):

@@ -19,6 +19,7 @@ LINES = Text.model_validate({"columns": ["t"], "channels": {"time": {"path": "t"
 
 @pytest.fixture
 def terminal():
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
     made = PseudoTerminal()
     yield made
     made.close()
@@ -60,6 +61,7 @@ def test_samples_are_sent_when_they_are_due(terminal):
 
 
 def test_a_link_lasts_as_long_as_the_device(tmp_path):
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
     link = tmp_path / "port"
     link.symlink_to("/dev/pts/987654")  # of one that was killed
     with served_at(link) as terminal:

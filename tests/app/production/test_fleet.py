@@ -435,7 +435,7 @@ def test_a_note_on_an_alarm_stays_until_the_alarm_is_another(fleet):
 
 
 def test_results_go_to_a_database_and_its_options_nowhere(fleet):
-    url = "sqlite:///line.db?timeout=86421"  # an option, as a password may be one
+    url = "sqlite:///line.db?timeout=86421.53197"  # an option, as a password may be one
     first, asked = fleet(to=url)
     again, _ = fleet(to=url, by=["chamber"])
     assert asked == []
@@ -447,7 +447,7 @@ def test_results_go_to_a_database_and_its_options_nowhere(fleet):
     assert known == [(first.summary["id"], "made", COUNT, COUNT - 1, 1)]
     assert rows == [(len(table()), 2)]
     assert limits == [("noise",), ("residual",)]
-    assert not [path for path in Path("made").rglob("*") if path.is_file() and b"86421" in path.read_bytes()]
+    assert not [path for path in Path("made").rglob("*") if path.is_file() and b"86421.53197" in path.read_bytes()]
     shutil.move("made", "elsewhere")
     there, _ = fleet(to=url, out="elsewhere")
     assert there.summary["id"] == first.summary["id"]

@@ -82,3 +82,13 @@ def test_the_walk_is_that_whose_allan_curve_has_this_floor():
     noise = noise_of(t, (walk + 0.01 * np.sqrt(10) * RNG.standard_normal(200_000))[:, None])
     np.testing.assert_allclose(noise.white, 0.01, rtol=0.1)
     np.testing.assert_allclose(noise.walk, 1e-3, rtol=0.4)
+
+
+def test_a_step_of_the_bias_within_a_kelvin_is_not_taken_for_a_walk():
+    """Of 100 deg/h at 30 degC, on a staircase: a curve with knots 4 K apart leaves some of it, as a walk would be."""
+    t = np.arange(40_000) / 4
+    T = 20 + 5 * np.floor(t / 2000) + 5 * np.clip(np.mod(t, 2000) / 300, 0, 1) + 0.02 * RNG.standard_normal(len(t))
+    white = 10 * np.sqrt(4) * RNG.standard_normal(len(t))
+    bend = 100 / (1 + np.exp(-4.4 * (T - 30.5)))
+    noise = noise_of(t, np.column_stack([white, white + bend]), T)
+    assert not noise.known[1]

@@ -11,6 +11,7 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from like_windows import as_it_is_written
 
 from driftlab.storage.folders import LOCK, Lock, output_folder
 from driftlab.storage.hdf5 import GrowingFile
@@ -311,7 +312,7 @@ def recorded(path, **how):
 def test_a_recording_is_locked_and_is_never_replaced_unasked(tmp_path):
     path = tmp_path / "raw.h5"
     recorder = recorded(path)
-    with h5py.File(path, "r", swmr=True) as file:
+    with h5py.File(as_it_is_written(path), "r", swmr=True) as file:
         assert len(file["time"]) == 5
     with pytest.raises(ConfigError, match=r"--record .*raw.h5: is being written by"):
         Recorder(path, "", resume=True)

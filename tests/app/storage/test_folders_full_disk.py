@@ -1,7 +1,6 @@
 """No room, no right, no reader: one sentence, an exit status, and what was flushed can be read. Real processes."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -64,6 +63,12 @@ def bench(tmp_path_factory):
     return folder
 
 
+def limited(kib):
+    """Limit the size of every file that a command writes."""
+    resource = pytest.importorskip("resource", reason="limits of a process are those of POSIX")
+    return {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (kib << 10, kib << 10))}
+
+
 @pytest.fixture
 def disk(bench):
     """Mount a disk of so many KiB on `disk`; where that is not allowed, limit the size of every file instead."""
@@ -74,7 +79,7 @@ def disk(bench):
             ["mount", "-t", "tmpfs", "-o", f"size={max(kib, 4)}k", "tmpfs", bench / "disk"], check=False
         )
         if done.returncode:
-            return {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (kib << 10, kib << 10))}
+            return limited(kib)
         made.append(bench / "disk")
         if kib == 0:
             (bench / "disk" / "full").write_bytes(bytes(4096))
@@ -107,8 +112,8 @@ def test_a_full_disk_is_said_in_one_sentence(bench, disk, name):
 
 @pytest.mark.parametrize("name", ["run", "simulate"])
 def test_a_limit_of_a_files_size_too(bench, name):
-    limit = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (200 << 10, 200 << 10))}
-    assert "cannot be written (File too large); make room" in said(driftlab(*COMMANDS[name], cwd=bench, **limit))
+    done = driftlab(*COMMANDS[name], cwd=bench, **limited(200))
+    assert "cannot be written (File too large); make room" in said(done)
     subprocess.run(["find", bench / "disk", "-mindepth", "1", "-delete"], check=True)
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import operator
-import resource
 import struct
 import types
 import zlib
@@ -325,6 +324,7 @@ def test_a_third_party_adds_a_framing():
 
 def test_hours_of_frames_in_flat_memory():
     """6 h at 100 Hz at full speed, as reads of 16 kB, with a torn frame and noise every hour: nothing piles up."""
+    resource = pytest.importorskip("resource", reason="memory of a process is asked of POSIX")
     rate, hours, read = 100, 6, 16_384
     minute = b"".join(frame(k) for k in range(60 * rate))
     dirt = frame(1)[:20] + SYNC + bytes(100)
