@@ -124,9 +124,9 @@ def test_what_no_export_holds_is_said(folder):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment; name those"),
+        (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment, g_sensitivity; name those"),
         (["--stimulus", "tumble"], "--stimulus: is that of --terms"),
-        (["--terms", TERMS, "--stimulus", "shaker"], "is none of rate_table, positions, tumble; name one of them"),
+        (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
         (["--terms", TERMS, "--compare"], "--terms: gives one map, and no page"),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),

@@ -4,13 +4,14 @@ from turned_units import bias_of, matrix_of, sensor_frame, tumble, turntable
 
 from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import TERMS
-from driftlab.triad.stimuli import KnownRates, PlacedForces, rests
-from fusion_core.contracts import ThermalMap
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import KnownRates, PlacedForces, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, SingularFit
 from fusion_core.host.registry import registry
 
 KINDS = registry().classes(ThermalMap)
 POLYNOMIAL = KINDS["polynomial"].model_validate({"kind": "polynomial", "order": 3})
+TUMBLE = registry().classes(Stimulus)["tumble"].model_validate({})
 TEMPERATURES = [-20.0, 0.0, 20.0, 40.0, 60.0]
 AT = np.array([-20.0, 20.0, 60.0])
 
@@ -27,7 +28,7 @@ def known_rates(seed=0, temperatures=TEMPERATURES, **how):
 
 def placed_forces(seed=0, temperatures=TEMPERATURES, **how):
     t, y, T = tumble(seed, temperatures, **how)
-    places = rests(t, y, least=2.0)
+    places = TUMBLE._places(Chunk(t, {"accel": y}), 0)
     return PlacedForces(*(np.stack([v[a:b].mean(axis=0) for a, b in places]) for v in (y, T, t)), 9.80665)
 
 
