@@ -50,8 +50,8 @@ def _lacking_force(force: Array | None, axis: str, what: str) -> str:
     if force is None:
         return "no specific force is known; record the accelerometers too, or turn about the vertical at a latitude"
     along = force[:, AXES.index(axis)]
-    seen = f"the force along {axis} goes from {along.min():.1f} to {along.max():.1f} m/s^2"
-    return f"{seen}; add {what} with {axis} up, and with {axis} down"
+    low, high = (round(float(v), 1) + 0.0 for v in (along.min(), along.max()))
+    return f"the force along {axis} goes from {low:g} to {high:g} m/s^2; add {what} with {axis} up, and with {axis} down"
 
 
 @dataclass(frozen=True, eq=False)
