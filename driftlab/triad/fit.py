@@ -380,6 +380,8 @@ class _Search:
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        if not np.any(self.told):
+            return
         prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
         z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
         curves = self._curves(self.chosen)

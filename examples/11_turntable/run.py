@@ -1,6 +1,6 @@
 """Scale factors as states, tracked while a turntable turns and warms: `python examples/11_turntable/run.py`.
 
-The filter is the measurement model `driven`; a joint least-squares solution of all epochs at once says whether it is right.
+The filter is the measurement model `driven`; a joint least-squares solution of all epochs says whether it is right.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def turned(seed: int = 0, epochs: int = 270) -> tuple[dict[str, object], np.ndar
     step = ((t - 0.5 / hz) // (2 * EPOCH)).astype(int)
     rate = np.deg2rad(60.0) * np.eye(3)[step % 3] * np.where(step // 3 % 2, -1.0, 1.0)[:, None]
     T = 20.0 + 40.0 * (1 - np.exp(-t / 700.0))
-    scale = np.outer(T - 20.0, [6e-5, -1e-4, 3e-5]) + [0.004, -0.002, 0.001]
+    scale = np.outer(T - 20.0, [6e-5, -1e-4, 3e-5]) + np.array([0.004, -0.002, 0.001])
     bias = 5e-3 + np.cumsum(rng.normal(0, BIAS_WALK / np.sqrt(hz), (N + 1, 3)), axis=0)
     gyro = rate * (1 + scale) + bias + rng.normal(0, NOISE * np.sqrt(hz), (N + 1, 3))
     return {"time": (t, "s"), "gyro": (gyro, "rad/s"), "table": (rate, "rad/s"), "temperature": (T, "degC")}, scale
@@ -65,7 +65,7 @@ def main(out: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     print(f"less those of the joint solution, sigma: {np.max(np.abs(run.x[-1] - joint) / run.sigma[-1]):.1e} at most")
     true, shown = scale[np.searchsorted(data["time"][0], run.t - 1e-6)] * 1e6, run.x[:, :3] * 1e6
     error = np.std((shown - true)[len(run.t) // 10 :])
-    title = f"Scale factors while the table turns and warms by 40 K: known to {error:.0f} ppm, minute by minute"
+    title = f"Scale factors while the table turns and warms by 40 K: known to {error:.0f} ppm rms"
     figure, (panel,) = picture(title, columns=1)
     for k, name in enumerate("xyz"):
         band = 2e6 * run.sigma[:, k]

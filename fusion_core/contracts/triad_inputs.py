@@ -51,7 +51,9 @@ def _lacking_force(force: Array | None, axis: str, what: str) -> str:
         return "no specific force is known; record the accelerometers too, or turn about the vertical at a latitude"
     along = force[:, AXES.index(axis)]
     low, high = (round(float(v), 1) + 0.0 for v in (along.min(), along.max()))
-    return f"the force along {axis} goes from {low:g} to {high:g} m/s^2; add {what} with {axis} up, and with {axis} down"
+    return (
+        f"the force along {axis} goes from {low:g} to {high:g} m/s^2; add {what} with {axis} up, and with {axis} down"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,3 +109,18 @@ def tumble(seed, temperatures, placements=18, hold=5.0, hz=10.0, g=9.80665, up=N
             made.stretch(hold, g * direction / np.linalg.norm(direction), T)
     made.stretch(1.0, 9 + 3 * made.rng.normal(size=(round(hz), 3)), T)
     return made.arrays()
+
+
+def ferraris_session(seed, hold=5.0, hz=50.0, g=9.80665, T=20.0):
+    """Return accel and gyro (N, 3) of each section of a session by Ferraris, Grimaldi and Parvis: faces and full turns.
+
+    Sections are named as imucal does: x_p has x up, x_a down, x_rot turns by -360 deg about x, which is up.
+    """
+    rng, sections = np.random.default_rng(seed), {}
+    for k, axis in enumerate(AXES):
+        for name, way, rate in (("p", 1, 0.0), ("a", -1, 0.0), ("rot", 1, -2 * np.pi / hold)):
+            f, u = np.tile(way * g * axis, (round(hold * hz), 1)), np.tile(rate * axis, (round(hold * hz), 1))
+            accel = f + f @ matrix_of(T).T + bias_of(T, 0.3) + rng.normal(0, 5e-4 * np.sqrt(hz), f.shape)
+            gyro = u + u @ matrix_of(T).T + bias_of(T, np.deg2rad(1.0)) + f @ sensitivity_of(T).T
+            sections[f"{'xyz'[k]}_{name}"] = accel, gyro + rng.normal(0, 8e-5 * np.sqrt(hz), u.shape)
+    return sections
