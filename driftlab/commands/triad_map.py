@@ -111,9 +111,9 @@ def fit_triad_map(
         read = own.files_to_fit() if "bias" in names else own.files()
         check_place(out, [*read, *paths_of(recordings)], "fit-map")
     known = None if "bias" in names else _known_bias(own, settings)
+    if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
+        raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
-    if "g_sensitivity" in names and gathered.sensor.channel != "gyro":
-        raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {gathered.sensor.channel}; leave it out")
     wanted = np.zeros(len(TERMS) + len(SENSITIVITY) * ("g_sensitivity" in names), dtype=bool)
     for name in ("bias", *names):
         wanted[list(GROUPS[name])] = True
