@@ -21,7 +21,7 @@ from driftlab.reports.charts import Chart
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_place, save
 from driftlab.triad.fit import TriadFit, fit_triad
-from driftlab.triad.model import BIAS, SCALE, SENSITIVITY, TERMS
+from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
 from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
@@ -30,10 +30,7 @@ from fusion_core.faults import Faults
 from fusion_core.host.registry import registry
 from fusion_core.thermal.record_texts import recorded
 
-GROUPS = {
-    "bias": BIAS, "scale": SCALE, "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE],
-    "g_sensitivity": SENSITIVITY,
-}  # fmt: skip
+ASKED = {**GROUPS, "g_sensitivity": [len(TERMS) + j for j in range(len(SENSITIVITIES))]}
 USUAL_BIAS = {"rad/s": np.deg2rad(1.0), "m/s^2": 0.5}  # of a unit of which nothing is known
 POINTS = 400  # temperatures of the curve
 
@@ -103,8 +100,8 @@ def fit_triad_map(
         If a recording does not hold the stimulus, or the config's map is of another sensor.
     """
     names = [name.strip() for name in terms.split(",")]
-    if unknown := [name for name in names if name not in GROUPS]:
-        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(GROUPS)}; name those")
+    if unknown := [name for name in names if name not in ASKED]:
+        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(ASKED)}; name those")
     own, faults = _with_stimulus(config, stimulus), Faults()
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
@@ -114,9 +111,9 @@ def fit_triad_map(
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
-    wanted = np.zeros(len(TERMS) + len(SENSITIVITY) * ("g_sensitivity" in names), dtype=bool)
+    wanted = np.zeros(len(TERMS) + len(SENSITIVITIES) * ("g_sensitivity" in names), dtype=bool)
     for name in ("bias", *names):
-        wanted[list(GROUPS[name])] = True
+        wanted[ASKED[name]] = True
     walk = (gathered.sensor.bias.as_random_walk() or {}).get("walk")
     fit = fit_triad(
         gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,

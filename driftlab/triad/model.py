@@ -26,7 +26,8 @@ from fusion_core.contracts.stimulus import TERMS as TERMS
 from fusion_core.contracts.stimulus import inverted as inverted
 from fusion_core.errors import ConfigError
 
-BIAS, SCALE, SENSITIVITY = range(3), (3, 7, 11), range(12, 21)
+BIAS, SCALE = range(3), (3, 7, 11)
+GROUPS = {"bias": [*BIAS], "scale": [*SCALE], "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 NARROW = 2.0  # K: temperatures that move less have one value of each term
 ORDERS = 3  # highest order that is tried, where the map's kind names none
 SMOOTHINGS = tuple(10.0**k for k in range(-3, 5))  # of a kind with a penalty, relative to its information
