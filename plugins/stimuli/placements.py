@@ -47,12 +47,10 @@ class Placements(Stimulus):
         if length is None:
             raise ConfigError(f"stimulus: kind {self.kind} is for an accelerometer or a gyro, not for {channel}")
         gravity, unsure = length if self.gravity is None else (float(self.gravity), 0.0)
-        pairs = list(zip(recordings, parts, strict=True))
-        T, t = (
-            np.array([v[a:b].mean() for chunk, places in pairs for v in [read(chunk)] for a, b in places])
-            for read in (lambda chunk: chunk["temperature"], lambda chunk: chunk.t)
-        )
-        y = np.stack([chunk[channel][a:b].mean(axis=0) for chunk, places in pairs for a, b in places])
+        rows = [(chunk, slice(*ends)) for chunk, places in zip(recordings, parts, strict=True) for ends in places]
+        y = np.stack([chunk[channel][part].mean(axis=0) for chunk, part in rows])
+        T = np.array([chunk["temperature"][part].mean() for chunk, part in rows])
+        t = np.array([chunk.t[part].mean() for chunk, part in rows])
         return PlacedForces(y, T, t, gravity, unsure / gravity)
 
     def _places(self, chunk: Chunk, k: int) -> list[tuple[int, int]]:
