@@ -133,7 +133,7 @@ def strain(values: Array, force: Array | None) -> Array:
     """Return G f (N, 3) of terms (N, q) under a force (N, 3); zero where there is no G, or no force is known."""
     if values.shape[1] == len(TERMS) or force is None:
         return np.zeros((len(values), 3))
-    return np.einsum("nij,nj->ni", values[:, 12:].reshape(-1, 3, 3), force)
+    return np.asarray(np.einsum("nij,nj->ni", values[:, 12:].reshape(-1, 3, 3), force))
 
 
 def input_derivative(W: Array, u: Array, force: Array | None = None) -> Array:

@@ -46,7 +46,7 @@ class Driven(Held):
     """A sensor at a known input that changes."""
 
     kind: Literal["driven"] = "driven"  # type: ignore[assignment]
-    reference: Name  # type: ignore[assignment]
+    reference: Name
     """Channel of the input, with the axes of the sensor."""
     matrix: MatrixStates = MatrixStates()
     """Scale factor and misalignment."""

@@ -122,9 +122,8 @@ def placed_rates(chunk: Chunk, places: Sequence[tuple[int, int]]) -> PlacedRates
     between = [slice(a[1], b[0]) for a, b in pairwise(places)]
     force = np.stack([f[a:b].mean(axis=0) for a, b in places])
     up = force / np.linalg.norm(force, axis=1)[:, None]
-    means = (np.stack([values[a:b].mean(axis=0) for a, b in places]) for values in (T, t))
     rest = np.stack([y[a:b].mean(axis=0) for a, b in places])
     return PlacedRates(
-        rest, up, *means, [y[part] for part in between], [step[part] for part in between],
-        force, [f[part] for part in between],
+        rest, up, np.array([T[a:b].mean() for a, b in places]), np.array([t[a:b].mean() for a, b in places]),
+        [y[part] for part in between], [step[part] for part in between], force, [f[part] for part in between],
     )  # fmt: skip
