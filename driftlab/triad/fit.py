@@ -48,7 +48,7 @@ from driftlab.triad.model import (
     polynomial,
 )
 from fusion_core.chunk import Array
-from fusion_core.contracts import CurveError, Equations, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
+from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
 from fusion_core.errors import SingularFit
 
 STEPS = 30
@@ -294,7 +294,8 @@ class _Search:
 
     def linearise(self) -> None:
         """Take the equations about these terms, whiten them, and forget the columns of those before."""
-        self.e = e = self._equations(self.terms.at(self.stimulus.T))
+        e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        self.e = e = replace(e, J=np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1]))))  # of terms it knows not of
         sigma = self.s[e.group]
         self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
         self._J = e.J / sigma[:, None]
@@ -302,11 +303,6 @@ class _Search:
         self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk)) if self.walk else None
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
-
-    def _equations(self, values: Array) -> Equations:
-        """Return the equations, with columns of zeros for terms that the stimulus does not know of."""
-        e = self.stimulus.equations(values)
-        return replace(e, J=np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1]))))
 
     def _walked(self) -> Array:
         """Return the covariance (m, m) of the equations over their white noise that a walk of density one leaves."""

@@ -35,7 +35,7 @@ class MatrixStates(Settings):
     """The states of scale factor and misalignment."""
 
     misalignment: bool = True
-    """Whether misalignments are states too, beside the scale factors."""
+    """True: misalignments are states too, beside the scale factors."""
     sigma_0: Annotated[float, Unit("1", positive=True, example="1 %")] = Quantity(0.01, "1 %")
     """Deviation of each before the first sample."""
     walk: Annotated[float, Unit("1/sqrt(s)", least=0, example="1 ppm/sqrt(s)")] = Quantity(0.0, "0 1/sqrt(s)")

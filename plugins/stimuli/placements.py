@@ -23,7 +23,7 @@ QUIET = 4.0  # times the scatter of the quietest tenth of the windows: more is m
 EDGE = 0.25  # s, left out at both ends of a rest
 
 
-class Placements(Stimulus):
+class PlacedStimulus(Stimulus):
     """Placements at rest, of which gravity is known."""
 
     placements: Files | None = None

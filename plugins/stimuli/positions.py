@@ -6,10 +6,10 @@ from typing import Literal
 
 from fusion_core.contracts import Stimulus
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.stimuli.placements import Placements
+from fusion_plugins.stimuli.placements import PlacedStimulus
 
 
-class Positions(Placements):
+class Positions(PlacedStimulus):
     """Placements by hand, or on six faces and between them."""
 
     kind: Literal["positions"] = "positions"

@@ -6,10 +6,10 @@ from typing import Literal
 
 from fusion_core.contracts import Stimulus
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.stimuli.placements import Placements
+from fusion_plugins.stimuli.placements import PlacedStimulus
 
 
-class Tumble(Placements):
+class Tumble(PlacedStimulus):
     """Placements over temperature, of a chamber with a two-axis table or hands."""
 
     kind: Literal["tumble"] = "tumble"
