@@ -91,7 +91,7 @@ def test_an_accelerometer_has_no_g_sensitivity():
     gyro = {"noise": "1 deg/s/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1 deg/s/sqrt(s)"}}
     config = {"filter": {"gyro": gyro, "accel": accel, "track": "accel"}, "stimulus": {"kind": "tumble"}}
     data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (0 * y, "rad/s"), "temperature": (T, "degC")}
-    with pytest.raises(ConfigError, match="--terms g_sensitivity: is a gyro's, not one of accel; leave it out"):
+    with pytest.raises(ConfigError, match="terms g_sensitivity: is a gyro's, not one of accel; leave it out"):
         driftlab.fit_map(config, data, terms="bias,g_sensitivity")
 
 
