@@ -14,7 +14,7 @@ export MPLBACKEND := Agg
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL := pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: setup demo oven navigator autopilot family planned reference hysteresis paper tools test hidden torture statistics wheels lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot family planned reference hysteresis turntable paper tools test hidden torture statistics wheels lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -58,6 +58,10 @@ hysteresis: $(VENV)/ready
 paper: $(VENV)/ready
 	$(VENV)/bin/python examples/paper/paper.py
 	$(VENV)/bin/python examples/paper/ablation.py
+
+# scale factors as states while a simulated turntable turns and warms (10 s)
+turntable: $(VENV)/ready
+	$(VENV)/bin/python examples/11_turntable/run.py
 
 # the tables of docs/reference/performance.md, side by side with filterpy, Eigen and polars (fifteen minutes, 10 GB of disk)
 bench: $(VENV)/ready

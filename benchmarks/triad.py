@@ -2,10 +2,12 @@
 
 python benchmarks/triad.py sigma    # how many of 50 turntables and tumbles are within their sigma
 python benchmarks/triad.py warm_up  # the angle that a rotating unit is off after a warm-up, by what its map holds
+python benchmarks/triad.py imucal   # sessions by Ferraris beside imucal, and a recording turned by hand (DRIFTLAB_DATA)
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -16,7 +18,22 @@ import driftlab
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
-from turned_units import Readings, bias_of, matrix_of, sensor_frame, tumble, turntable
+from turned_units import (
+    AXES,
+    Readings,
+    bias_of,
+    ferraris_session,
+    matrix_of,
+    sensitivity_of,
+    sensor_frame,
+    strained,
+    tumble,
+    turntable,
+)
+
+from driftlab.triad.fit import fit_triad
+from fusion_core.contracts import KnownRates, ThermalMap
+from fusion_core.host.registry import registry
 
 SEEDS, TEMPERATURES, AT = 50, [-20.0, 0.0, 20.0, 40.0, 60.0], np.array([-20.0, 20.0, 60.0])
 TERMS, GRAVITY = "bias,scale,misalignment", 9.80665
@@ -27,10 +44,11 @@ GYRO = {
 ACCEL = {"noise": "5e-4 m/s^2/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1e-6 m/s^2/sqrt(s)"}}
 
 
-def turned(seed, temperatures=TEMPERATURES, terms=TERMS, **how):
+def turned(seed, temperatures=TEMPERATURES, terms=TERMS, made=turntable, **how):
     """Return the map that fit-map makes of a turntable's recording."""
-    t, y, T, table = turntable(seed, temperatures, **how)
+    t, y, T, table, *force = made(seed, temperatures, **how)
     data = {"time": (t, "s"), "gyro": (y, "rad/s"), "temperature": (T, "degC")}
+    data |= {"accel": (force[0], "m/s^2")} if force else {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "table.csv"
         path.write_text(table)
@@ -51,16 +69,25 @@ def tumbled(seed):
     return driftlab.fit_map(config, data, terms=TERMS)
 
 
+def with_strain(seed):
+    """Return the map with g-sensitivity that fit-map makes of a vertical turntable, each axis up and down."""
+    return turned(seed, terms=f"{TERMS},g_sensitivity", made=strained)
+
+
 def sigma():
     """Print the share of the terms within one and 1.96 sigma, and the largest sigma."""
-    cases = {"turntable": (turned, lambda M: M, np.deg2rad(1.0)), "tumble": (tumbled, sensor_frame, 0.3)}
+    rate = np.deg2rad(1.0)
+    cases = {"turntable": (turned, lambda M: M, rate), "tumble": (tumbled, sensor_frame, 0.3),
+             "turntable up and down, with g-sensitivity": (with_strain, lambda M: M, rate)}  # fmt: skip
     for name, (fitted, frame, size) in cases.items():
         truth = np.array([np.concatenate([bias_of(T, size), frame(matrix_of(T)).ravel()]) for T in AT])
+        if fitted is with_strain:
+            truth = np.hstack([truth, [sensitivity_of(T).ravel() for T in AT]])
         z, largest = [], 0.0
         for seed in range(SEEDS):
             fit = fitted(seed).fit
             z.append(((fit.terms.at(AT) - truth) / fit.sigma(AT))[:, fit.free])
-            largest = max(largest, float(np.max(fit.sigma(AT)[:, 3:])))
+            largest = max(largest, float(np.max(fit.sigma(AT)[:, 3:12])))
         z = np.abs(np.array(z))
         print(
             f"{name}: {SEEDS} seeds, {z.shape[2]} terms at {len(AT)} temperatures: within one sigma "
@@ -91,5 +118,66 @@ def warm_up():
         print(f"  {name:45s} about z {error[2]:+9.3f}   across {np.hypot(*error[:2]):8.3f}")
 
 
+def by_imucal(sections, seconds, g=GRAVITY):
+    """Return imucal's K_g R_g - I, K_ga and K_a R_a - I of a session's sections; a turn takes `seconds`."""
+    import imucal as peer
+
+    regions = {f"acc_{n}": accel for n, (accel, _) in sections.items()}
+    regions |= {f"gyr_{n}": np.rad2deg(gyro) for n, (_, gyro) in sections.items()}
+    hz = len(sections["x_rot"][0]) / seconds
+    units = {"from_acc_unit": "m/s^2", "from_gyr_unit": "deg/s"}
+    found = peer.FerrarisCalibration(grav=g).compute(peer.FerrarisSignalRegions(**regions), hz, **units)
+    return found.K_g @ found.R_g - np.eye(3), np.deg2rad(found.K_ga), found.K_a @ found.R_a - np.eye(3)
+
+
+def by_driftlab(sections, seconds):
+    """Return M and G of the gyros and M of the accelerometers from the means of the same sections."""
+    names, T = list(sections), np.array([20.0])
+    along = np.array([AXES["xyz".index(n[0])] for n in names])
+    force = GRAVITY * np.array([[{"a": -1, "p": 1, "rot": 1}[n[2:]]] for n in names]) * along
+    u = -2 * np.pi / seconds * np.array([[n[2:] == "rot"] for n in names]) * along
+    accel, gyro = (np.stack([sections[n][of].mean(axis=0) for n in names]) for of in (0, 1))
+    kind = registry().classes(ThermalMap)["polynomial"].model_validate({})
+    each = np.full(len(names), 20.0), 60.0 * np.arange(len(names))
+    of_gyro = fit_triad(KnownRates(u, gyro, *each, force), kind, np.deg2rad(1.0), np.ones(21, dtype=bool)).terms
+    of_accel = fit_triad(KnownRates(force, accel, *each), kind, 0.5).terms
+    return of_gyro.matrix(T)[0], of_gyro.sensitivity(T)[0], of_accel.matrix(T)[0]
+
+
+def imucal(sessions=20):
+    """Print rms errors of both on simulated sessions, and scale factors of a measured recording by both."""
+    truth = matrix_of(20.0), sensitivity_of(20.0), matrix_of(20.0)
+    made = [ferraris_session(seed) for seed in range(sessions)]
+    both = [(by_imucal(one, 5.0), by_driftlab(one, 5.0)) for one in made]
+    scales = {"gyro, M [ppm]": 1e6, "gyro, G [deg/h/g]": np.rad2deg(3600) * GRAVITY, "accelerometer, M [ppm]": 1e6}
+    print(f"{sessions} simulated sessions by Ferraris, rms over the 9 terms")
+    for k, (name, scale) in enumerate(scales.items()):
+        errors = [scale * np.sqrt(np.mean([(own[side][k] - truth[k]) ** 2 for own in both])) for side in (0, 1)]
+        apart = scale * np.sqrt(np.mean([(own[0][k] - own[1][k]) ** 2 for own in both]))
+        print(f"  {name:24s} imucal {errors[0]:8.2f}   driftlab {errors[1]:8.2f}   apart {apart:8.2f}")
+    measured_by_hand()
+
+
+def measured_by_hand():
+    """Print scale factors of accelerometers turned by hand; imucal takes the six best placements for faces."""
+    folder = Path(os.environ["DRIFTLAB_DATA"]) / "data" / "imu_tk"
+    log = np.loadtxt(folder / "xsens_acc.txt.gz")
+    y = (log[:, 1:] - 32768) * 0.0024
+    data = {"time": (log[:, 0], "s"), "accel": (y, "m/s^2"), "gyro": (1e-3 * y, "rad/s")}
+    config = {"filter": {"track": "accel", "gyro": GYRO, "accel": ACCEL},
+              "stimulus": {"kind": "positions", "gravity": "9.81744 m/s^2", "rest": "1 s"}}  # fmt: skip
+    fit = driftlab.fit_map(config, data, terms=TERMS).fit
+    up = fit.stimulus.y / np.linalg.norm(fit.stimulus.y, axis=1)[:, None]
+    best = {f"{name}_{way}": int(np.argmax(sign * up[:, k]))
+            for k, name in enumerate("xyz") for way, sign in (("p", 1), ("a", -1))}  # fmt: skip
+    tilt = [np.rad2deg(np.arccos(abs(up[row, "xyz".index(name[0])]))) for name, row in best.items()]
+    sections = {name: (fit.stimulus.y[[row, row]], np.zeros((2, 3))) for name, row in best.items()}
+    sections |= {f"{name}_rot": (sections[f"{name}_p"][0], -np.pi * AXES[[k, k]]) for k, name in enumerate("xyz")}
+    theirs = np.diag(sensor_frame(by_imucal(sections, 2.0, 9.81744)[2])) * 1e6
+    ours, of = fit.terms.matrix(np.array([25.0]))[0], fit.sigma(np.array([25.0]))[0, [3, 7, 11]] * 1e6
+    print(f"accelerometers of an Xsens MTi turned by hand; its faces are off by {min(tilt):.1f} to {max(tilt):.1f} deg")
+    print(f"  scale [ppm]: imucal {np.round(theirs)}   driftlab {np.round(np.diag(ours) * 1e6)} +- {np.round(of)}")
+
+
 if __name__ == "__main__":
-    {"sigma": sigma, "warm_up": warm_up}[sys.argv[1]]()
+    {"sigma": sigma, "warm_up": warm_up, "imucal": imucal}[sys.argv[1]]()

@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import (
     BeforeValidator,
-    Field,
     PrivateAttr,
     SerializeAsAny,
     ValidationInfo,
@@ -24,12 +23,12 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from driftlab.storage.in_memory import CopyName, InMemoryName
-from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, Stimulus, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, quote
 from fusion_core.escaping import is_plain
 from fusion_core.host.config import Document, override, read_document, validate
 from fusion_core.host.registry import Installed, registry
-from fusion_core.settings import ConfigPath, Settings
+from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit, bias_unit
 from fusion_core.units.grammar import NUMBER
 
@@ -68,7 +67,7 @@ class Config(Settings):
     """Source that reads the recording."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_default_kind)] = None
     """The filter: its sensors, and how their biases move."""
-    stimulus: Annotated[KnownRate | Placed, Field(discriminator="kind")] | None = None
+    stimulus: Annotated[Stimulus, Installed()] | None = None
     """The input of a triad while its scale factor and misalignment are fitted (`fit-map --terms`)."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
     """Upper limits of acceptance; the pages say whether the unit passes."""
@@ -269,42 +268,6 @@ def _seconds(text: str, recording: str) -> float | None:
             f"'{quote(recording, 200)}': '{quote(text)}' is not a number of seconds; write PATH::START:STOP"
         )
     return Quantity(float(text), f"{text} s", "s")
-
-
-def _each(value: Any) -> Any:
-    """Return one file or axis as those of one recording."""
-    return (value,) if isinstance(value, str | Path) else value
-
-
-Files = Annotated[tuple[ConfigPath, ...], BeforeValidator(_each, json_schema_input_type=str | list[str])]
-
-
-class KnownRate(Settings):
-    """A turntable: its rates as a table of segments, or as a channel of the recording."""
-
-    kind: Literal["rate_table"] = "rate_table"
-    segments: Files | None = None
-    """Table of segments (start, stop, axis, rate), CSV; one for each recording."""
-    channel: str | None = None
-    """Channel of the table's rate, about `axes`."""
-    axes: Annotated[tuple[str, ...], BeforeValidator(_each, json_schema_input_type=str | list[str])] = ()
-    """Axis of the unit that the table turns about: x, -x, ..., or three numbers; one for all or for each recording."""
-    settle: Annotated[float, Unit("s", least=0, example="2 s")] = Quantity(2.0, "2 s")
-    """Time at the start of a segment that is left out."""
-    length: Annotated[float, Unit("s", positive=True, example="10 s")] = Quantity(10.0, "10 s")
-    """Length of the parts into which a channel is cut."""
-
-
-class Placed(Settings):
-    """Placements at rest by hand, by faces or in a tumble over temperature."""
-
-    kind: Literal["positions", "tumble"] = "positions"
-    placements: Files | None = None
-    """Table of placements (start, stop), CSV; found by the rests of the sensors where it is left out."""
-    rest: Annotated[float, Unit("s", positive=True, example="2 s")] = Quantity(2.0, "2 s")
-    """Least duration of a rest."""
-    gravity: Annotated[float, Unit("m/s^2", positive=True, example="9.81 m/s^2")] | None = None
-    """Local gravity; by latitude where it is left out."""
 
 
 LONGEST = 64  # characters of a serial number

@@ -27,6 +27,7 @@ KINDS = {
     FAMILIES / "measurement_models.md": {"sealed"},
     FAMILIES / "exporters.md": {"acme_words"},
     FAMILIES / "report_sections.md": {"acme_worst"},
+    FAMILIES / "stimuli.md": {"fixture"},
     FAMILIES / "products.md": {"acme_x1"},
     FAMILIES / "families.md": set(),
 }

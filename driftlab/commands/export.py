@@ -51,6 +51,7 @@ from fusion_core.units import along_axes
 
 CONFIGS = (".yaml", ".yml")
 SHOWN = {"rad/s": "deg/h", "m/s^2": "mg"}  # units in which people read those of a map's file
+GRAVITY = 9.80665  # m/s^2, in a g
 LOSS = "loss.json"
 SCHEMA = 2  # of its layout
 NEEDED = ("t", "tau", "rate", "coast", "still", "used", "innovations", "x")
@@ -200,6 +201,7 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             loss = exporter.export(what, written)
             if not exporter.holds_matrix:
                 loss = replace(loss, left_out=(*loss.left_out, *_matrices(exporter.kind, what)))
+            loss = replace(loss, left_out=(*loss.left_out, *_sensitivities(exporter.kind, what)))
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
@@ -230,6 +232,15 @@ def _matrices(kind: str, what: Export) -> Iterator[str]:
                 f"{sensor.channel}: scale factor and misalignment, up to {1e6 * np.max(np.diag(M)):.0f} ppm and "
                 f"{1e3 * np.max(M - np.diag(np.diag(M))):.2f} mrad; {kind} holds the bias alone"
             )
+
+
+def _sensitivities(kind: str, what: Export) -> Iterator[str]:
+    """Yield the size of the g-sensitivities over temperature, which no form of export holds."""
+    for sensor in what.sensors:
+        held = None if sensor.map is None else sensor.map.record.sensitivity
+        if held is not None:
+            G = np.max(np.abs(held.terms(np.linspace(held.T[0], held.T[-1], 100)))) * sensor.factor * GRAVITY
+            yield f"{sensor.channel}: g-sensitivity, up to {G:.3g} {sensor.shown}/g; {kind} leaves it out"
 
 
 def key_of(path: Path) -> str:

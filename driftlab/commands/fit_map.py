@@ -203,10 +203,10 @@ def fit_map(
         Write a certificate too: one sheet with results, uncertainty and limits.
         Beside the map or in `report`, as certificate.html and certificate.json; it needs `out`.
     terms : str, optional
-        Terms to fit by a stimulus: bias,scale,misalignment.
+        Terms to fit by a stimulus: bias,scale,misalignment,g_sensitivity.
         Without bias, that stays as the config's map has it.
     stimulus : str, optional
-        Stimulus of --terms: rate_table, positions or tumble; default: the config's.
+        Stimulus of --terms: rate_table, positions, tumble or a plugin's; default: the config's.
     progress : callable, optional
         Called with the recording's time in s and the number of samples so far, then with texts.
 
@@ -217,7 +217,7 @@ def fit_map(
     FamilyMapResult
         With `family`: `temperature` (N,), `bias`, `sigma`, `own_bias`, `own_sigma` (N, d) over the family's domain.
     TriadMapResult
-        With `terms`: `temperature` (N,), `terms`, `sigma` (N, 12); `map.corrected(reading, T)` gives the input.
+        With `terms`: `temperature` (N,), `terms`, `sigma` (N, 12 or 21); `map.corrected(reading, T)` gives the input.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The map of a triad with scale factor and misalignment, by a stimulus: `driftlab fit-map --terms`."""
+"""The map of a triad with scale factor, misalignment and g-sensitivity, by a stimulus: `driftlab fit-map --terms`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from driftlab.commands.console import say, say_lines, terminal
 from driftlab.commands.result import Result
-from driftlab.config import Config, KnownRate, Placed, paths_of
+from driftlab.config import Config, paths_of
 from driftlab.filtering.setup import check_map
 from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
 from driftlab.reports import triad as words
@@ -21,17 +21,16 @@ from driftlab.reports.charts import Chart
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_place, save
 from driftlab.triad.fit import TriadFit, fit_triad
-from driftlab.triad.model import BIAS, SCALE, TERMS
+from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
-from fusion_core.contracts import FittedMap, MapRecord, ThermalMap
+from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
 from fusion_core.faults import Faults
-from fusion_core.settings import Settings
+from fusion_core.host.registry import registry
 from fusion_core.thermal.record_texts import recorded
 
-GROUPS = {"bias": BIAS, "scale": SCALE, "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
-STIMULI: dict[str, type[Settings]] = {"rate_table": KnownRate, "positions": Placed, "tumble": Placed}
+ASKED = {**GROUPS, "g_sensitivity": [len(TERMS) + j for j in range(len(SENSITIVITIES))]}
 USUAL_BIAS = {"rad/s": np.deg2rad(1.0), "m/s^2": 0.5}  # of a unit of which nothing is known
 POINTS = 400  # temperatures of the curve
 
@@ -39,10 +38,13 @@ POINTS = 400  # temperatures of the curve
 class TriadMapResult(Result):
     """The terms of a triad over `temperature` (N,): `terms` and `sigma` (N, 12), the bias, then M row by row.
 
+    With g-sensitivity (N, 21), G row by row after them.
+
     Attributes
     ----------
     map : FittedMap
-        `map.corrected(reading, T)` gives the input (N, 3), `map.bias(T)` the bias.
+        `map.corrected(reading, T)` gives the input (N, 3), `map.bias(T)` the bias; with g-sensitivity
+        `map.corrected(reading, T, force=f)`.
     fit : TriadFit
         Terms with their joint covariance, `fit.verdict()` what the stimulus does not tell.
     written : tuple of Path
@@ -56,10 +58,10 @@ class TriadMapResult(Result):
         T = np.linspace(*fitted.domain, POINTS)
         inside = np.clip(T, fit.grid[0], fit.grid[-1])
         self._columns = {"temperature": T, "terms": fit.terms.at(inside), "sigma": fit.sigma(inside)}
-        each = tuple(self.unit.si if j in BIAS else "1" for j in range(len(TERMS)))
+        each = tuple(words.si_unit_of(j, self.unit) for j in range(len(fit.names)))
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
-        self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in TERMS))
-        self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix"}) | {
+        self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
+        self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
             "triad": plain(words.as_json(fit, self.unit)), "serial": config.serial
         }  # fmt: skip
 
@@ -86,7 +88,7 @@ def fit_triad_map(
     Parameters
     ----------
     terms : str
-        Of `bias`, `scale`, `misalignment`, with commas. Without bias, the bias stays that of the config's map.
+        Of `bias`, `scale`, `misalignment`, `g_sensitivity`, with commas. Without bias, that stays the config's map's.
     stimulus : str, optional
         Kind of the stimulus, instead of the config's.
     kind : str, optional
@@ -98,18 +100,20 @@ def fit_triad_map(
         If a recording does not hold the stimulus, or the config's map is of another sensor.
     """
     names = [name.strip() for name in terms.split(",")]
-    if unknown := [name for name in names if name not in GROUPS]:
-        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(GROUPS)}; name those")
+    if unknown := [name for name in names if name not in ASKED]:
+        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(ASKED)}; name those")
     own, faults = _with_stimulus(config, stimulus), Faults()
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
         read = own.files_to_fit() if "bias" in names else own.files()
         check_place(out, [*read, *paths_of(recordings)], "fit-map")
     known = None if "bias" in names else _known_bias(own, settings)
+    if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
+        raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
-    wanted = np.zeros(len(TERMS), dtype=bool)
+    wanted = np.zeros(len(TERMS) + len(SENSITIVITIES) * ("g_sensitivity" in names), dtype=bool)
     for name in ("bias", *names):
-        wanted[list(GROUPS[name])] = True
+        wanted[ASKED[name]] = True
     walk = (gathered.sensor.bias.as_random_walk() or {}).get("walk")
     fit = fit_triad(
         gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,
@@ -125,9 +129,10 @@ def fit_triad_map(
 def _with_stimulus(config: Config, kind: str | None) -> Config:
     if kind is None or (config.stimulus is not None and config.stimulus.kind == kind):
         return config
-    if kind not in STIMULI:
-        raise ConfigError(f"--stimulus {quote(kind)}: is none of {', '.join(STIMULI)}; name one of them")
-    return config.model_copy(update={"stimulus": STIMULI[kind].model_validate({"kind": kind})})
+    known = registry().classes(Stimulus)
+    if kind not in known:
+        raise ConfigError(f"--stimulus {quote(kind)}: is none of {', '.join(known)}; name one of them")
+    return config.model_copy(update={"stimulus": known[kind].model_validate({})})
 
 
 def _known_bias(config: Config, settings: ThermalMap) -> FittedMap:
@@ -151,18 +156,18 @@ def _map_of(
 ) -> FittedMap:
     """Return the map: the bias of the fit, or one that is known, and the matrix."""
     try:
-        matrix = fit.matrix()
+        parts = {"matrix": fit.matrix(), "sensitivity": fit.sensitivity()}
     except ValidationError as error:
         raise MapError(
             f"the fit gives no map: {error.errors()[0]['msg']}; check the units of the config against the stimulus"
         ) from None
     if known is not None:
-        return known.noting(matrix=matrix)
+        return known.noting(**parts)
     T = np.linspace(fit.grid[0], fit.grid[-1], POINTS)
     record = MapRecord(
         kind=settings.kind, domain=(float(T[0]), float(T[-1])), channel=gathered.sensor.channel,
         unit=gathered.sensor.unit, residual=(fit.noise[0],) * 3, samples=gathered.rows,
-        error=fit.curve_error(slice(0, 3)), provenance=recorded(about), matrix=matrix,
+        error=fit.curve_error(slice(0, 3)), provenance=recorded(about), **parts,
     )  # fmt: skip
     fitted = settings.from_curve(T, fit.terms.at(T)[:, :3], record)
     return of_sensor(config, replace(fitted, record=fitted.record))

@@ -29,6 +29,7 @@ from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, MapError, MissingChannel
 from fusion_core.settings import nearest
 
+FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
 
 
@@ -133,14 +134,19 @@ def subtracted(
 ) -> dict[str, Array]:
     """Return the part (N, d) of each channel that is taken off before the filter.
 
-    Of a calibration all that its map says, of a map that a bias model follows scale and misalignment alone.
+    Of a calibration all that its map says, of a map that a bias model follows all but the bias. The force that strains
+    a gyro is that of the accelerometers, less their own part; where there are none, g-sensitivity stays in.
     """
     parts: dict[str, Array] = {}
     for name, fitted in calibrations.items():
         parts[name] = fitted.bias(chunk["temperature"], chunk.t)
-    for name, fitted in {**calibrations, **(followed or {})}.items():
-        if fitted.record.matrix is not None:
-            parts[name] = parts.get(name, 0.0) + fitted.distortion(chunk[name], chunk["temperature"], chunk.t)
+    maps = {**calibrations, **(followed or {})}
+    for name in sorted(maps, key=lambda name: name != FORCE):
+        record = maps[name].record
+        if record.matrix is not None or record.sensitivity is not None:
+            force = chunk[FORCE] - parts.get(FORCE, 0.0) if FORCE in chunk.channels and name != FORCE else None
+            part = maps[name].distortion(chunk[name], chunk["temperature"], chunk.t, force)
+            parts[name] = parts.get(name, 0.0) + part
     return parts
 
 

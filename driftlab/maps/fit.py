@@ -142,6 +142,9 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} °C"]
     if record.matrix is not None:
         lines.append(f"map {record.kind}: with scale factor and misalignment, {sum(record.matrix.told)} terms of M(T)")
+    if record.sensitivity is not None:
+        told = sum(record.sensitivity.told)
+        lines.append(f"map {record.kind}: with g-sensitivity, {told} terms of G(T), taken off where accel is recorded")
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"

@@ -1,4 +1,4 @@
-"""Scale factor and misalignment of a triad over temperature: sentences, a table, a chart, JSON."""
+"""Terms of a triad over temperature, bias to g-sensitivity: sentences, a table, a chart, JSON."""
 
 from __future__ import annotations
 
@@ -14,12 +14,21 @@ from driftlab.triad.model import AXES, SCALE, TERMS
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
+GRAVITY = 9.80665  # m/s^2, in a g
+
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
     """Return the unit in which a term is shown, and the factor to it."""
     if term < len(AXES):
         return unit.shown, unit.factor
+    if term >= len(TERMS):
+        return f"{unit.shown}/g", unit.factor * GRAVITY
     return ("ppm", 1e6) if term in SCALE else ("mrad", 1e3)
+
+
+def si_unit_of(term: int, unit: BiasUnit) -> str:
+    """Return the unit of a term in SI."""
+    return unit.si if term < len(AXES) else "1" if term < len(TERMS) else f"{unit.si}/(m/s^2)"
 
 
 def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
@@ -40,7 +49,7 @@ def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
             of_range = ["not told", "-"]
         elif curve == "constant":
             of_range = ["none", "-"]
-        rows.append([f"{TERMS[j]} [{name}]", *of_term, *of_range, curve])
+        rows.append([f"{fit.names[j]} [{name}]", *of_term, *of_range, curve])
     heads = ("term", f"at {T[0]:.1f} °C", "sigma", "change", "sigma", "curve")
     return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False, rigid=True)
 
@@ -79,11 +88,11 @@ def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:
         "verdict": fit.verdict(),
         "terms": {
             name: {
-                "unit": unit.si if j < len(AXES) else "1", "told": bool(fit.told[j]), "free": bool(fit.free[j]),
+                "unit": si_unit_of(j, unit), "told": bool(fit.told[j]), "free": bool(fit.free[j]),
                 "change_told": bool(fit.told[j] and not fit.untold_changes[j] and np.ptp(fit.domain) >= np.ptp(T)),
                 "curve": fit.terms.curves[j].name, "value": values[:, j].tolist(), "sigma": sigma[:, j].tolist(),
                 "change": float(change[j]), "change_sigma": float(of_change[j]),
             }
-            for j, name in enumerate(TERMS)
+            for j, name in enumerate(fit.names)
         },
     }  # fmt: skip

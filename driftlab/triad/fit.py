@@ -1,4 +1,4 @@
-"""Joint fit of bias, scale factor and misalignment over temperature to the equations of a stimulus.
+"""Joint fit of bias, scale factor, misalignment and g-sensitivity over temperature to the equations of a stimulus.
 
 Gauss-Newton steps on penalised least squares, with the noise that the residuals show::
 
@@ -9,9 +9,9 @@ s_g is the white noise of a group of equations, q the walk of the bias over time
 
 The curve of each term is chosen forward, by the largest fall of::
 
-    m log(residual) + p (log m + 2 log 12)
+    m log(residual) + p (log m + 2 log q)
 
-with p the effective number of coefficients: the price of a coefficient among 12 terms that could have had it (extended
+with p the effective number of coefficients: the price of a coefficient among q terms that could have had it (extended
 Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
 noise and walk are means over their restricted likelihood; the prior of the density of the walk is half-Cauchy (Gelman,
 Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. A term that the
@@ -23,27 +23,38 @@ the probability that follows from the two models' evidence (Schwarz, Annals of S
     p = 1 / (1 + sqrt(m) exp(-b^2 / 2 s^2)),    E[b^2] = p (s^2 + b^2)
 
 and the scatter of the terms over the walks that are likely is a part of their error. As many equations as there are
-leave the size of the noise unsure: the error is that of Student's t. m equations, n coefficients.
+leave the size of the noise unsure: the error is that of Student's t. m equations, n coefficients, q terms: 12, or 21.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.triad.model import BIAS, GRID, NARROW, SCALE, TERMS, TermCurve, TriadTerms, curves_of, polynomial
-from driftlab.triad.stimuli import Stimulus
+from driftlab.triad.model import (
+    BIAS,
+    GRID,
+    NARROW,
+    SCALE,
+    SENSITIVITIES,
+    TERMS,
+    TermCurve,
+    TriadTerms,
+    curves_of,
+    polynomial,
+)
 from fusion_core.chunk import Array
-from fusion_core.contracts import CurveError, ThermalMap, TriadMatrix
+from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
 from fusion_core.errors import SingularFit
 
 STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
 UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
+USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / 9.80665  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
 POOR = 0.1  # of it: one that is known better is well known
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
@@ -59,17 +70,17 @@ class TriadFit:
 
     Attributes
     ----------
-    stimulus : Stimulus
+    stimulus : TriadInput
     terms : TriadTerms
     domain : pair of float
         Temperatures of the stimulus.
-    usual : (12,) array
+    usual : (q,) array
         Sizes of the terms of a usual unit, beside which a deviation is large or small.
-    free : (12,) array of bool
+    free : (q,) array of bool
         Terms that were looked for.
-    told : (12,) array of bool
+    told : (q,) array of bool
         Terms that the stimulus tells; the others are zero.
-    untold_changes : (12,) array of bool
+    untold_changes : (q,) array of bool
         Told terms whose change over temperature it does not tell.
     design, root : TriadTerms' curves and (n, n) array
         Curves of the error, and the root of the covariance of their coefficients.
@@ -77,7 +88,7 @@ class TriadFit:
         Deviation of an equation in each group.
     """
 
-    stimulus: Stimulus
+    stimulus: TriadInput
     terms: TriadTerms
     domain: tuple[float, float]
     usual: Array
@@ -88,6 +99,11 @@ class TriadFit:
     root: Array
     noise: tuple[float, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the q terms."""
+        return (*TERMS, *SENSITIVITIES)[: len(self.free)]
+
     @cached_property
     def grid(self) -> Array:
         """Temperatures at which the error is kept."""
@@ -96,7 +112,7 @@ class TriadFit:
         return np.linspace(middle - half, middle + half, GRID if high - low >= NARROW else 2)
 
     def modes(self, T: Array) -> Array:
-        """Return the modes (n, N, 12) of the joint error of all terms at T (N,)."""
+        """Return the modes (n, N, q) of the joint error of all terms at T (N,)."""
         parts, at = [], 0
         for curve in self.design:
             parts.append(curve.values(T) @ self.root[at : at + curve.q])
@@ -104,18 +120,18 @@ class TriadFit:
         return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
 
     def sigma(self, T: Array) -> Array:
-        """Return the deviation (N, 12) of the terms at T (N,)."""
+        """Return the deviation (N, q) of the terms at T (N,)."""
         return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
 
     def change(self) -> tuple[Array, Array]:
-        """Return the change of each term (12,) from the lowest to the highest temperature, and its deviation."""
+        """Return the change of each term (q,) from the lowest to the highest temperature, and its deviation."""
         ends = self.grid[[0, -1]]
         values, modes = self.terms.at(ends), self.modes(ends)
         return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
 
     @cached_property
     def _joint_modes(self) -> Array:
-        """Modes (r, G, 12) on the grid, those alone that matter beside the deviation of some term."""
+        """Modes (r, G, q) on the grid, those alone that matter beside the deviation of some term."""
         modes = self.modes(self.grid)
         size = np.sqrt(np.sum(modes**2, axis=0)) + TINY
         _, s, V = np.linalg.svd((modes / size).reshape(len(modes), -1), full_matrices=False)
@@ -134,20 +150,28 @@ class TriadFit:
 
     def matrix(self) -> TriadMatrix:
         """Return M over temperature as a map's record holds it."""
+        frame = "sensor" if self.stimulus.sensor_frame else "given"
+        return TriadMatrix.model_validate({**self._curve(slice(3, 12)), "frame": frame})
+
+    def sensitivity(self) -> MatrixCurve | None:
+        """Return G over temperature as a map's record holds it; None where none of it was looked for."""
+        return MatrixCurve.model_validate(self._curve(slice(12, 21))) if np.any(self.free[12:]) else None
+
+    def _curve(self, part: slice) -> dict[str, object]:
+        """Return the fields of the 9 terms of a matrix."""
         (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
         bent = any(curve.q > 4 for curve in self.terms.curves)
         T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
         inside = np.clip(T, low + h, high - h)
-        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, 3:] / (2 * h)
+        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, part] / (2 * h)
         if not bent:  # exact for a cubic through four points
-            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, 3:])
+            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, part])
             slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
-        frame = "sensor" if self.stimulus.sensor_frame else "given"
-        return TriadMatrix(
-            T=tuple(T.tolist()), values=tuple(map(tuple, self.terms.at(T)[:, 3:].tolist())),
-            slopes=tuple(map(tuple, slopes.tolist())), frame=frame, told=tuple(self.told[3:].tolist()),
-            kinds=tuple(curve.name for curve in self.terms.curves[3:]), error=self.curve_error(slice(3, None)),
-        )  # fmt: skip
+        return {
+            "T": tuple(T.tolist()), "values": tuple(map(tuple, self.terms.at(T)[:, part].tolist())),
+            "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.told[part].tolist()),
+            "kinds": tuple(curve.name for curve in self.terms.curves[part]), "error": self.curve_error(part),
+        }  # fmt: skip
 
     def _scaled(self, T: Array) -> Array:
         low, high = self.grid[[0, -1]]
@@ -157,7 +181,7 @@ class TriadFit:
         """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
         lines = []
         middle = self.sigma(np.array([np.mean(self.domain)]))[0]
-        for j, name in enumerate(TERMS):
+        for j, name in enumerate(self.names):
             if not self.free[j]:
                 continue
             if not self.told[j]:
@@ -166,7 +190,7 @@ class TriadFit:
                 lines.append(f"{name}: poorly told, {middle[j] / self.usual[j]:.0%} of a usual size, since "
                              f"{self.stimulus.lacking(j)}")  # fmt: skip
         low, high = self.domain
-        untold = [TERMS[j] for j in np.flatnonzero(self.untold_changes)]
+        untold = [self.names[j] for j in np.flatnonzero(self.untold_changes)]
         if high - low < NARROW:
             lines.append(
                 f"no change over temperature is told: all of it lies at {np.mean(self.domain):.1f} °C; repeat it at "
@@ -181,7 +205,7 @@ class TriadFit:
 
 
 def fit_triad(
-    stimulus: Stimulus,
+    stimulus: TriadInput,
     settings: ThermalMap,
     bias_size: float,
     wanted: NDArray[np.bool_] | None = None,
@@ -191,13 +215,14 @@ def fit_triad(
 
     Parameters
     ----------
-    stimulus : Stimulus
+    stimulus : TriadInput
     settings : ThermalMap
         Kind of the curves that are tried beside constants and polynomials.
     bias_size : float
-        Bias of a usual unit, in its unit; its other terms are 1 % and 10 mrad.
-    wanted : (12,) array of bool, optional
-        Terms that may differ from zero, beside the bias; by default all that the stimulus leaves free.
+        Bias of a usual unit, in its unit; its other terms are 1 %, 10 mrad and 0.1 deg/s/g.
+    wanted : (q,) array of bool, optional
+        Terms that may differ from zero, beside the bias; by default all of the 12 that the stimulus leaves free. With
+        21 of them, g-sensitivity is looked for.
     walk : float, optional
         Declared density of the random walk of the bias, its unit/sqrt(s); without it the scale of the prior is a walk
         that ends as large as the noise of an equation.
@@ -211,8 +236,9 @@ def fit_triad(
     """
     T = stimulus.T
     domain = float(T.min()), float(T.max())
-    usual = np.array([bias_size] * 3 + [0.01] * 9)
-    free = stimulus.free if wanted is None else stimulus.free & wanted
+    wanted = np.ones(len(TERMS), dtype=bool) if wanted is None else wanted
+    free = np.concatenate([stimulus.free, np.ones(len(wanted) - len(TERMS), dtype=bool)]) & wanted
+    usual = np.array([bias_size] * 3 + [0.01] * 9 + [USUAL_SENSITIVITY] * 9)[: len(free)]
     search = _Search(stimulus, curves_of(settings, domain), usual, free, walk)
     search.check()
     if not search.converge():
@@ -239,7 +265,7 @@ class _Search:
 
     def __init__(
         self,
-        stimulus: Stimulus,
+        stimulus: TriadInput,
         curves: list[TermCurve],
         usual: Array,
         free: NDArray[np.bool_],
@@ -247,8 +273,8 @@ class _Search:
     ) -> None:
         self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
         self.told = free.copy()
-        self.chosen = [0] * len(TERMS)
-        self.x: list[Array] = [np.zeros(1) for _ in TERMS]
+        self.chosen = [0] * len(free)
+        self.x: list[Array] = [np.zeros(1) for _ in free]
         self.s, self.walk, self.declared = np.ones(2), 0.0, declared
         self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of told terms
         self.linearise()
@@ -268,7 +294,8 @@ class _Search:
 
     def linearise(self) -> None:
         """Take the equations about these terms, whiten them, and forget the columns of those before."""
-        self.e = e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        self.e = e = replace(e, J=np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1]))))  # of terms it knows not of
         sigma = self.s[e.group]
         self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
         self._J = e.J / sigma[:, None]
@@ -298,7 +325,7 @@ class _Search:
     def _system(self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE) -> tuple[Array, Array]:
         """Return N (n, n), with priors and penalties in it, and the whitened design A (m, n) of curves.
 
-        Of terms that are not among `some` (12,) the columns are zero; the prior is `wide` times the usual size.
+        Of terms that are not among `some` (q,) the columns are zero; the prior is `wide` times the usual size.
         """
         columns, prior = [], []
         for j, curve in enumerate(curves):
@@ -349,6 +376,8 @@ class _Search:
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        if not np.any(self.told):
+            return
         prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
         z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
         curves = self._curves(self.chosen)
@@ -375,10 +404,10 @@ class _Search:
         self.x = np.split(solution, np.cumsum(sizes)[:-1])
 
     def _covariance(self) -> Array:
-        """Return the covariance (12, 12) of the terms in the middle, by the columns that are free."""
+        """Return the covariance (q, q) of the terms in the middle, by the columns that are free."""
         curves, T = self._curves(self.chosen), np.array([(self.e.T.min() + self.e.T.max()) / 2])
         N, _ = self._system(curves, self.told)
-        B = np.zeros((len(TERMS), len(N)))
+        B = np.zeros((len(self.free), len(N)))
         at = 0
         for j, curve in enumerate(curves):
             B[j, at : at + curve.q] = curve.values(T)[0]
@@ -398,7 +427,7 @@ class _Search:
 
     def choose(self) -> None:
         """Give each term the curve that pays for its coefficients."""
-        self.chosen = [0] * len(TERMS)
+        self.chosen = [0] * len(self.free)
         best = self._price(self.chosen)
         while True:
             trials = []
@@ -420,7 +449,7 @@ class _Search:
             p += float(np.sum(own)) + 1 if np.any(curve.penalty) else curve.q
         if p >= m - 1:
             return np.inf
-        return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(TERMS))))
+        return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(self.free))))
 
     def result(self, domain: tuple[float, float]) -> TriadFit:
         """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
@@ -433,7 +462,7 @@ class _Search:
         starts = np.cumsum([0, *(curve.q for curve in design)])
         whole = np.linalg.inv(N)
         sigma, moved = np.sqrt(np.diag(whole)), whole @ (A.T @ self.z)
-        untold, pinned = np.zeros(len(TERMS), dtype=bool), []
+        untold, pinned = np.zeros(len(self.free), dtype=bool), []
         for j, start in enumerate(starts[:-1]):
             own = range(start, starts[j + 1])
             if self.told[j] and straight[j]:

@@ -2,10 +2,11 @@
 
 ::
 
-    y = (I + M(T)) u + b(T) + noise,    M_ii: error of the scale factor,    M_ij: axis i reads the input along j
+    y = (I + M(T)) u + b(T) + G(T) f + noise,    M_ii: error of the scale factor,    M_ij: i reads the input along j
 
-The 12 terms are the bias, 3, and M row by row, 9. A term is a curve c' B(T): a constant, a polynomial of an order, or
-the curves that stand for an installed kind of map, as smooth as their penalty has them. m equations, q coefficients.
+The 12 terms are the bias, 3, and M row by row, 9; 9 more are a gyro's g-sensitivity G, where that is asked for. A term
+is a curve c' B(T): a constant, a polynomial of an order, or the curves that stand for an installed kind of map, as
+smooth as their penalty has them. m equations, q coefficients.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from numpy.polynomial import chebyshev
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import NetworkMap, ThermalMap
+from fusion_core.contracts.stimulus import AXES as AXES
+from fusion_core.contracts.stimulus import PAIRS as PAIRS
+from fusion_core.contracts.stimulus import SENSITIVITIES as SENSITIVITIES
+from fusion_core.contracts.stimulus import TERMS as TERMS
+from fusion_core.contracts.stimulus import inverted as inverted
 from fusion_core.errors import ConfigError
 
-AXES = "xyz"
-PAIRS = tuple(i + j for i in AXES for j in AXES)
-TERMS = tuple(f"bias {i}" for i in AXES) + tuple(
-    f"scale {p[0]}" if p[0] == p[1] else f"misalignment {p}" for p in PAIRS
-)
 BIAS, SCALE = range(3), (3, 7, 11)
-BELOW = (6, 9, 10)  # of the terms: M below its diagonal, zero in the frame that the sensor itself defines
+GROUPS = {"bias": [*BIAS], "scale": [*SCALE], "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 NARROW = 2.0  # K: temperatures that move less have one value of each term
 ORDERS = 3  # highest order that is tried, where the map's kind names none
 SMOOTHINGS = tuple(10.0**k for k in range(-3, 5))  # of a kind with a penalty, relative to its information
@@ -80,27 +81,21 @@ def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCur
 
 @dataclass(frozen=True, eq=False)
 class TriadTerms:
-    """The 12 terms over temperature: curves with their coefficients."""
+    """The 12 or 21 terms over temperature: curves with their coefficients."""
 
     curves: Sequence[TermCurve]
     coefficients: Sequence[Array]  # (q_j,) of each
 
     def at(self, T: Array) -> Array:
-        """Return the terms (N, 12) at T (N,)."""
+        """Return the terms (N, 12), or (N, 21), at T (N,)."""
         T = np.atleast_1d(np.asarray(T, dtype=np.float64))
         return np.stack([c.values(T) @ x for c, x in zip(self.curves, self.coefficients, strict=True)], axis=1)
 
     def matrix(self, T: Array) -> Array:
         """Return M (N, 3, 3)."""
-        return self.at(T)[:, 3:].reshape(-1, 3, 3)
+        return self.at(T)[:, 3:12].reshape(-1, 3, 3)
 
-
-def inverted(values: Array) -> tuple[Array, Array]:
-    """Return (I + M)^-1 (N, 3, 3) and the bias (N, 3) of terms (N, 12)."""
-    return np.asarray(np.linalg.inv(np.eye(3) + values[:, 3:].reshape(-1, 3, 3))), values[:, :3]
-
-
-def input_derivative(W: Array, u: Array) -> Array:
-    """Return du/dterms (N, 3, 12) of the input u = W (y - b) (N, 3), where W (N, 3, 3) = (I + M)^-1."""
-    of_M = -np.einsum("nki,nj->nkij", W, u).reshape(len(u), 3, 9)
-    return np.concatenate([-W, of_M], axis=2)
+    def sensitivity(self, T: Array) -> Array:
+        """Return G (N, 3, 3); zero where it was not asked for."""
+        values = self.at(T)[:, 12:]
+        return values.reshape(-1, 3, 3) if values.shape[1] else np.zeros((len(values), 3, 3))

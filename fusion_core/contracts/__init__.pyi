@@ -39,6 +39,9 @@ from fusion_core.contracts.sensor import axis_of as axis_of
 from fusion_core.contracts.source import SimulatedSource as SimulatedSource
 from fusion_core.contracts.source import Source as Source
 from fusion_core.contracts.source import Twin as Twin
+from fusion_core.contracts.stimulus import Equations as Equations
+from fusion_core.contracts.stimulus import Stimulus as Stimulus
+from fusion_core.contracts.stimulus import TriadInput as TriadInput
 from fusion_core.contracts.table import USUAL as USUAL
 from fusion_core.contracts.table import Block as Block
 from fusion_core.contracts.table import Channel as Channel
@@ -49,6 +52,9 @@ from fusion_core.contracts.thermal_bias import ThermalBias as ThermalBias
 from fusion_core.contracts.thermal_map import NetworkMap as NetworkMap
 from fusion_core.contracts.thermal_map import Target as Target
 from fusion_core.contracts.thermal_map import ThermalMap as ThermalMap
+from fusion_core.contracts.triad_inputs import KnownRates as KnownRates
+from fusion_core.contracts.triad_inputs import PlacedForces as PlacedForces
+from fusion_core.contracts.triad_inputs import PlacedRates as PlacedRates
 from fusion_core.model import Measurement as Measurement
 from fusion_core.model import Prior as Prior
 from fusion_core.model import State as State
@@ -71,4 +77,5 @@ from fusion_core.thermal.map_file import read_map as read_map
 from fusion_core.thermal.map_file import write_bytes as write_bytes
 from fusion_core.thermal.map_file import write_map as write_map
 from fusion_core.thermal.penalised import Basis as Basis
+from fusion_core.thermal.triad_matrix import MatrixCurve as MatrixCurve
 from fusion_core.thermal.triad_matrix import TriadMatrix as TriadMatrix

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import output_checks as checks
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
@@ -15,6 +16,7 @@ from fusion_core.contracts.plugin import Check, Family
 from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.sensor import Detector, Patience, Sensor
 from fusion_core.contracts.source import Source
+from fusion_core.contracts.stimulus import Equations, Stimulus, TriadInput
 from fusion_core.contracts.thermal_map import ThermalMap
 from fusion_core.statespace import Block
 from fusion_core.thermal.fitted_map import FittedMap, MapRecord
@@ -78,9 +80,11 @@ MEASUREMENT_MODELS: Answers = {
 EXPORTERS: Answers = {"export": checks.loss, "read": several("what it reads back", ReadBack)}
 _TEXTS = dict.fromkeys(("title", "text", "html", "svg"), checks.text)
 REPORT_SECTIONS: Answers = {"section": instance("section", Section, optional=True, **_TEXTS)}
+STIMULI: Answers = {"inputs": instance("inputs", TriadInput), "simulated": several("simulated", Chunk)}
 PARTS: Mapping[type, Answers] = {  # what a plugin makes, which answers for it
     FittedMap: dict.fromkeys(("_bias", "_slope", "sigma"), array("its curve", "N d")),
     Detector: {"look": checks.look},
+    TriadInput: {"equations": instance("equations", Equations), "lacking": checks.text},
 }
 
 FAMILIES = (
@@ -96,5 +100,6 @@ FAMILIES = (
         MEASUREMENT_MODELS,
     ),
     Family("exporters", Exporter, "forms in which a fitted map leaves for other programs", EXPORTERS),
+    Family("stimuli", Stimulus, "how the input of a triad is known", STIMULI),
     Family("report_sections", ReportSection, "sections of the report of a run", REPORT_SECTIONS),
 )

@@ -1,7 +1,7 @@
 """The contract of measurement models: the sensors of the filter, and the measurement of their biases.
 
-The states are those of the model itself (what it integrates, say), which begin at zero exactly, and then one block for
-the bias of each sensor, in the order of `sensors`::
+The states are those of the model itself (what it integrates, say, from zero exactly), and then one block for the bias
+of each sensor, in the order of `sensors`::
 
     x = (own states, bias block of sensor 1, bias block of sensor 2, ...)
 
@@ -118,9 +118,9 @@ class MeasurementModel(Plugin):
 
     @property
     def own(self) -> tuple[Block, ...]:
-        """The blocks of its own states, which begin at zero exactly; none by default.
+        """The blocks of its own states; none by default.
 
-        They start anew at a refused measurement.
+        One without a prior begins at zero exactly, and starts anew at a refused measurement: what is integrated.
         """
         return ()
 
@@ -130,7 +130,7 @@ class MeasurementModel(Plugin):
         return [(sensor.channel, axis, sensor.unit) for sensor in self.sensors for axis in sensor.axes]
 
     def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
-        """Put the priors of the blocks together, the own states at zero.
+        """Put the priors of the blocks together, the own states at their own, or at zero.
 
         `blocks` are in the order of `sensors`, `alignment` is that of the stretch which the filter begins with,
         None where nothing has been measured yet.
@@ -217,4 +217,4 @@ class MeasurementModel(Plugin):
     @cached_property
     def restarting(self) -> Flags:
         """Flags (n,) of the states that start anew at a refused measurement."""
-        return self.space.flags(*(block.name for block in self.own))
+        return self.space.flags(*(block.name for block in self.own if block.prior is None))

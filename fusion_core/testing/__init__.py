@@ -18,7 +18,17 @@ from functools import partial
 from inspect import isfunction
 from types import ModuleType
 
-from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Plugin, Source, ThermalMap
+from fusion_core.contracts import (
+    BiasModel,
+    Effect,
+    Exporter,
+    Framing,
+    MeasurementModel,
+    Plugin,
+    Source,
+    Stimulus,
+    ThermalMap,
+)
 from fusion_core.testing import (
     bias_models,
     effects,
@@ -27,6 +37,7 @@ from fusion_core.testing import (
     measurement_models,
     samples,
     sources,
+    stimuli,
     thermal_maps,
 )
 
@@ -41,6 +52,7 @@ MODULES: Mapping[type[Plugin], ModuleType] = {
     Effect: effects,
     MeasurementModel: measurement_models,
     Exporter: exporters,
+    Stimulus: stimuli,
 }
 
 

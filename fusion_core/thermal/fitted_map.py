@@ -18,7 +18,7 @@ from fusion_core.settings import Frozen
 from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 from fusion_core.thermal.thermometer import Steps
-from fusion_core.thermal.triad_matrix import TriadMatrix
+from fusion_core.thermal.triad_matrix import MatrixCurve, TriadMatrix
 
 Outside = Literal["refuse", "clamp", "tangent"]
 
@@ -64,6 +64,8 @@ class MapRecord(Frozen):
     """Of the curve; None where the kind does not tell."""
     matrix: TriadMatrix | None = None
     """Scale factor and misalignment of a triad over temperature; None where only the bias was fitted."""
+    sensitivity: MatrixCurve | None = None
+    """g-sensitivity of a triad of gyros over temperature; None where it was not fitted."""
     provenance: Annotated[Mapping[Plain, Plain], Field(max_length=100)] = {}
     """Recording, date, version, settings."""
 
@@ -83,7 +85,7 @@ class MapRecord(Frozen):
 
     @model_validator(mode="after")
     def _matrix_is_of_a_triad(self) -> Self:
-        if self.matrix is not None and self.d != 3:
+        if (self.matrix is not None or self.sensitivity is not None) and self.d != 3:
             raise ValueError(f"has scale and misalignment of a triad, and {self.d} axes; a triad has three")
         return self
 
@@ -149,18 +151,22 @@ class FittedMap(ABC):
             bias = bias + (T - inside)[:, None] * self._slope(inside)
         return bias
 
-    def distortion(self, reading: Array, T: Array, t: Array | None = None) -> Array:
-        """Return the part M u (N, d) that scale and misalignment have in readings y = (I + M) u + b (N, d) at T (N,).
+    def distortion(self, reading: Array, T: Array, t: Array | None = None, force: Array | None = None) -> Array:
+        """Return the part M u + G f (N, d) of readings y = (I + M) u + b + G f (N, d) at T (N,), f the force (N, 3).
 
-        Zero for a map of the bias alone. Beyond the domain M is that of its end. Raises as `bias`.
+        Zero for a map of the bias alone, and without its part of G where the force is not known. Beyond the domain M
+        and G are those of its end. Raises as `bias`.
         """
+        inside, strain = np.clip(self._temperatures(T), *self.domain), np.zeros_like(reading)
+        if self.record.sensitivity is not None and force is not None:
+            strain = np.einsum("nij,nj->ni", self.record.sensitivity.at(inside), force)
         if self.record.matrix is None:
-            return np.zeros_like(reading)
-        return self.record.matrix.distortion(reading - self.bias(T, t), np.clip(self._temperatures(T), *self.domain))
+            return strain
+        return strain + self.record.matrix.distortion(reading - strain - self.bias(T, t), inside)
 
-    def corrected(self, reading: Array, T: Array, t: Array | None = None) -> Array:
-        """Return the input u = (I + M(T))^-1 (y - b(T)) (N, d) that readings y (N, d) at T (N,) show; as `bias`."""
-        return np.asarray(reading - self.bias(T, t) - self.distortion(reading, T, t))
+    def corrected(self, reading: Array, T: Array, t: Array | None = None, force: Array | None = None) -> Array:
+        """Return the input u = (I + M)^-1 (y - b - G f) (N, d) that readings y at T (N,) show; as `distortion`."""
+        return np.asarray(reading - self.bias(T, t) - self.distortion(reading, T, t, force))
 
     def slope(self, T: Array, t: Array | None = None) -> Array:
         """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""

@@ -1,12 +1,12 @@
-"""Scale factor and misalignment of a triad as a function of temperature.
+"""Scale factor, misalignment and g-sensitivity of a triad as functions of temperature.
 
-The readings y of a triad whose input is u are::
+The readings y of a triad whose input is u, under a specific force f, are::
 
-    y = (I + M(T)) u + b(T),    M_ij: change of what axis i reads with the input along axis j
+    y = (I + M(T)) u + b(T) + G(T) f,    M_ij: change of what axis i reads with the input along axis j
 
-The diagonal of M holds the errors of the scale factors, the rest the misalignments. Each of the 9 terms is a piecewise
-cubic through values and slopes at K temperatures, which holds constants, lines, parabolas, cubics and the cubic spline
-exactly. N samples.
+The diagonal of M holds the errors of the scale factors, the rest the misalignments; G is a gyro's g-sensitivity. Each
+of the 9 terms of a matrix is a piecewise cubic through values and slopes at K temperatures, which holds constants,
+lines, parabolas, cubics and the cubic spline exactly. N samples.
 """
 
 from __future__ import annotations
@@ -29,18 +29,15 @@ TERMS = 9
 SINGULAR = 0.5  # largest sum of |M_ij| along a row: beyond, an axis reads another one
 
 
-class TriadMatrix(Frozen):
-    """The matrix M(T), as a map's record holds it.
+class MatrixCurve(Frozen):
+    """A matrix over temperature, as a map's record holds it: of a gyro's g-sensitivity, in its unit per m/s^2.
 
     Attributes
     ----------
     T : (K,) floats
         Temperatures, rising, degC.
     values, slopes : (K, 9) floats
-        M there, row by row, and its derivative, 1/K.
-    frame : str
-        `given`: all 9 terms are from the frame of the stimulus. `sensor`: that the triad defines itself, z along its
-        z axis and y in the plane of y and z; the terms below the diagonal are zero.
+        The matrix there, row by row, and its derivative with temperature.
     kinds : (9,) texts
         The curve of each term.
     told : (9,) bools
@@ -52,7 +49,6 @@ class TriadMatrix(Frozen):
     T: tuple[FiniteFloat, ...]
     values: Rows
     slopes: Rows
-    frame: Frame
     kinds: tuple[Plain, ...]
     told: tuple[bool, ...]
     error: CurveError
@@ -66,9 +62,6 @@ class TriadMatrix(Frozen):
             raise ValueError(f"values and slopes of the matrix are not of the shape {shape}")
         if not len(self.kinds) == len(self.told) == len(self.error.bend) == TERMS:
             raise ValueError(f"kinds, told and error of the matrix are not of its {TERMS} terms")
-        rows = np.abs(np.asarray(self.values)).reshape(-1, 3, 3).sum(axis=2)
-        if np.max(rows) >= SINGULAR:
-            raise ValueError(f"a row of the matrix adds up to {np.max(rows):.3g}, below {SINGULAR:g} was expected")
         return self
 
     @cached_property
@@ -86,12 +79,32 @@ class TriadMatrix(Frozen):
         return np.asarray(left * values[k] + right * values[k + 1] + bent)
 
     def at(self, T: Array) -> Array:
-        """Return M (N, 3, 3) at T (N,) degC."""
+        """Return the matrix (N, 3, 3) at T (N,) degC."""
         return self.terms(T).reshape(-1, 3, 3)
 
     def sigma(self, T: Array) -> Array:
         """Return the standard deviation (N, 9) of the terms at T (N,) degC."""
         return np.asarray(np.sqrt(self.error.variance(T)))
+
+
+class TriadMatrix(MatrixCurve):
+    """The matrix M(T) of scale factor and misalignment, a number.
+
+    Attributes
+    ----------
+    frame : str
+        `given`: all 9 terms are from the frame of the stimulus. `sensor`: that the triad defines itself, z along its
+        z axis and y in the plane of y and z; the terms below the diagonal are zero.
+    """
+
+    frame: Frame
+
+    @model_validator(mode="after")
+    def _can_be_inverted(self) -> Self:
+        rows = np.abs(np.asarray(self.values)).reshape(-1, 3, 3).sum(axis=2)
+        if np.max(rows) >= SINGULAR:
+            raise ValueError(f"a row of the matrix adds up to {np.max(rows):.3g}, below {SINGULAR:g} was expected")
+        return self
 
     def distortion(self, less: Array, T: Array) -> Array:
         """Return M u (N, 3), the part of readings less their bias (I + M) u (N, 3) that is no input."""

@@ -36,7 +36,7 @@ def _read_reference(value: Any, info: pydantic.ValidationInfo) -> Any:
     """Return the name of a channel, or a constant in SI; a thermometer's is a reading and no difference."""
     if isinstance(value, str) and value and not (value[0].isdigit() or value[0] in "+-."):
         return value
-    warm = _unit_of(info.data.get("noise"))[0] == "K"
+    warm = unit_of(info.data.get("noise"))[0] == "K"
     return (Unit("degC", example="25 degC") if warm else Unit("bias", example="10 V")).read(value, info)
 
 
@@ -84,7 +84,7 @@ class Held(contracts.MeasurementModel):
         if not isinstance(data, dict):
             return handler(data)
         with (
-            quantities.bias_unit(*_unit_of(data.get("noise"))),
+            quantities.bias_unit(*unit_of(data.get("noise"))),
             quantities.section_axes((contracts.axis_of(str(data.get("channel"))),)),
         ):
             return handler(data)
@@ -92,7 +92,7 @@ class Held(contracts.MeasurementModel):
     @pydantic.model_validator(mode="after")
     def _fits_together(self) -> Self:
         quantities.check_axes("noise", self.noise, len(self.bias.axes))
-        if _unit_of(self.noise)[0] is None:
+        if unit_of(self.noise)[0] is None:
             raise ValueError("noise has no unit, and the sensor's unit follows from it; write e.g. '0.06 ppm/sqrt(Hz)'")
         if isinstance(self.reference, tuple):
             quantities.check_axes("reference", self.reference, len(self.bias.axes))
@@ -115,7 +115,7 @@ class Held(contracts.MeasurementModel):
     @cached_property
     def sensors(self) -> tuple[contracts.Sensor, ...]:
         """The one sensor."""
-        unit, shown = _unit_of(self.noise)
+        unit, shown = unit_of(self.noise)
         assert unit is not None, "the noise is a quantity"
         noise = quantities.along_axes(self.noise, len(self.bias.axes))
         shown = shown if unit != "K" or shown.endswith("K") else unit  # of a thermometer: differences
@@ -195,7 +195,7 @@ class Held(contracts.MeasurementModel):
         return contracts.Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
 
 
-def _unit_of(noise: Any) -> tuple[str | None, str]:
+def unit_of(noise: Any) -> tuple[str | None, str]:
     """Return the unit of the sensor in SI and as written, from its noise; None where that is not a quantity."""
     first = noise[0] if isinstance(noise, list | tuple) and noise else noise
     text = first.text if isinstance(first, Quantity) else first

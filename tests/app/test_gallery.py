@@ -59,11 +59,19 @@ def test_a_hysteresis_is_found_in_one_soak_with_its_size_and_none_where_there_is
     assert (tmp_path / "hysteresis.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("example", ["11_turntable"], indirect=True)
+def test_scale_factors_that_are_tracked_are_those_of_a_joint_solution(example, tmp_path):
+    last, joint, sigma, z = example.main(tmp_path)
+    assert np.max(np.abs(last - joint) / sigma) < 1e-6
+    assert np.mean(np.abs(z[27:]) < 2) > 0.9  # it drifts by steps of the walk's size, and no random walk
+    assert (tmp_path / "turntable.png").stat().st_size > 10_000
+
+
 def test_every_picture_of_the_gallery_is_small_and_its_command_exists():
     text = (ROOT / "docs" / "gallery.md").read_text()
     pictures = re.findall(r"!\[[^]]+\]\((images/\w+\.png)\)", text)
     commands = re.findall(r"^    make (\w+)\n.*?\| takes \| [^\n]*`(\S+\.py)` \|$", text, re.MULTILINE | re.DOTALL)
     makefile = (ROOT / "Makefile").read_text()
-    assert len(pictures) == len(commands) == 8
+    assert len(pictures) == len(commands) == 9
     assert all((ROOT / "docs" / picture).stat().st_size < 80_000 for picture in pictures)
     assert all(f"\n{target}: $(VENV)/ready\n\t$(VENV)/bin/python {script}\n" in makefile for target, script in commands)

@@ -13,9 +13,11 @@ from fusion_core.contracts import (
     Effect,
     Frames,
     Framing,
+    KnownRates,
     MeasurementModel,
     Prior,
     Source,
+    Stimulus,
     ThermalMap,
     Transition,
     on_each_axis,
@@ -231,6 +233,34 @@ def test_a_measurement_model_that_breaks_two():
     assert "z, cut at (1,)" in found["any split gives the same"]
     assert "is taken for motion" in found["rest is taken for rest"]
     assert len(found) == 2
+
+
+class Reversed(KnownRates):
+    """Has the derivatives the wrong way round, a bias that is not its own, and no remedy."""
+
+    def equations(self, values):
+        e = super().equations(values)
+        return replace(e, J=-e.J, left=e.left + 0.1)
+
+    def lacking(self, term):
+        return "nothing turns"
+
+
+class Backwards(registry().classes(Stimulus)["rate_table"]):
+    """Makes of its recordings equations that do not hold."""
+
+    def inputs(self, recordings, channel, site, length):
+        own = super().inputs(recordings, channel, site, length)
+        return Reversed(own.u, own.y, own.temperatures, own.times, own.force)
+
+
+def test_a_stimulus_that_breaks_three():
+    found = broken(next(iter(Backwards.examples())))
+    assert set(found) == {
+        "equations hold for the terms of the unit", "derivatives are those of differences",
+        "what is lacking has a remedy",
+    }  # fmt: skip
+    assert "of term 0" in found["derivatives are those of differences"]
 
 
 class Field(Effect):

@@ -12,7 +12,7 @@ from logger_files import xlsx
 from recordings_on_disk import KINDS, channels, columns, write
 from ulog_writer import sensor, write_ulog
 
-from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, Stimulus, ThermalMap
 from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin, laws
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
@@ -34,7 +34,7 @@ def kinds(family):
     return sorted(registry().classes(family).items())
 
 
-FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter)
+FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter, Stimulus)
 OWN = {  # held to their laws below; a kind may be that of two families
     (BiasModel, "thermal_derivative"),
     *((Source, kind) for kind in ("binary_log", "csv", "dataflash", "hdf5", "mat", "parquet", "rosbag", "serial",

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 from command_line import driftlab as run
-from turned_units import bias_of, matrix_of, sensor_frame, tumble, turntable
+from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strained, tumble, turntable
 
 import driftlab
 from driftlab.errors import ConfigError
@@ -60,6 +60,39 @@ def test_json_says_what_each_term_is(folder):
     term = triad["terms"]["scale z"]
     assert (term["unit"], term["told"], term["change_told"], term["curve"]) == ("1", True, True, "order 2")
     np.testing.assert_allclose(term["value"][0], matrix_of(triad["temperature"][0])[2, 2], atol=5 * term["sigma"][0])
+
+
+@pytest.mark.parametrize("accel", [True, False], ids=["measured force", "vertical table"])
+def test_g_sensitivity_is_fitted_held_and_left_out_of_exports(folder, accel):
+    t, y, T, table, force = strained(0, [0.0, 20.0, 40.0], hold=8.0)
+    (folder / "strained.csv").write_text(table)
+    data = {"time": (t, "s"), "gyro": (y, "rad/s"), "temperature": (T, "degC")}
+    data |= {"accel": (force, "m/s^2")} if accel else {}
+    walk = {"kind": "random_walk", "walk": "1e-6 rad/s/sqrt(s)"}
+    config = {
+        "filter": {"gyro": {"noise": "8e-5 rad/s/sqrt(Hz)", "bias": walk}},
+        "stimulus": {"kind": "rate_table", "segments": str(folder / "strained.csv")},
+    } | ({} if accel else {"latitude": "0 deg"})  # fmt: skip
+    made = driftlab.fit_map(config, data, terms=f"{TERMS},g_sensitivity", out=folder / "g.json")
+    assert made["terms"].shape[1] == len(made.labels["terms"]) == len(made.units["terms"]) == 21
+    assert (made.labels["terms"][12], made.units["terms"][12]) == ("g-sensitivity_xx", "rad/s/(m/s^2)")
+    at = np.array([0.0, 20.0, 40.0])
+    true = np.array([sensitivity_of(x).ravel() for x in at])
+    assert np.max(np.abs(made.map.record.sensitivity.terms(at) - true) / made.fit.sigma(at)[:, 12:]) < 4.5
+    done = run("export", "c", "g.json", "--out", "g_c", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "left out: gyro: g-sensitivity, up to 52" in done.stdout  # 2.6e-4 rad/s a m/s^2 are 526 deg/h/g
+    assert "c leaves it out" in done.stdout
+
+
+def test_an_accelerometer_has_no_g_sensitivity():
+    t, y, T = tumble(0, [20.0], placements=4)
+    accel = {"noise": "5e-4 m/s^2/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1e-5 m/s^2/sqrt(s)"}}
+    gyro = {"noise": "1 deg/s/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1 deg/s/sqrt(s)"}}
+    config = {"filter": {"gyro": gyro, "accel": accel, "track": "accel"}, "stimulus": {"kind": "tumble"}}
+    data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (0 * y, "rad/s"), "temperature": (T, "degC")}
+    with pytest.raises(ConfigError, match="terms g_sensitivity: is a gyro's, not one of accel; leave it out"):
+        driftlab.fit_map(config, data, terms="bias,g_sensitivity")
 
 
 @pytest.mark.parametrize("bias", ["calibration", "map"])
@@ -124,9 +157,9 @@ def test_what_no_export_holds_is_said(folder):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment; name those"),
+        (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment, g_sensitivity; name those"),
         (["--stimulus", "tumble"], "--stimulus: is that of --terms"),
-        (["--terms", TERMS, "--stimulus", "shaker"], "is none of rate_table, positions, tumble; name one of them"),
+        (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
         (["--terms", TERMS, "--compare"], "--terms: gives one map, and no page"),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),

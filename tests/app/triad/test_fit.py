@@ -1,33 +1,35 @@
 import numpy as np
 import pytest
-from turned_units import bias_of, matrix_of, sensor_frame, tumble, turntable
+from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strained, tumble, turntable
 
 from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import TERMS
-from driftlab.triad.stimuli import KnownRates, PlacedForces, rests
-from fusion_core.contracts import ThermalMap
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import KnownRates, PlacedForces, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, SingularFit
 from fusion_core.host.registry import registry
 
 KINDS = registry().classes(ThermalMap)
 POLYNOMIAL = KINDS["polynomial"].model_validate({"kind": "polynomial", "order": 3})
+TUMBLE = registry().classes(Stimulus)["tumble"].model_validate({})
 TEMPERATURES = [-20.0, 0.0, 20.0, 40.0, 60.0]
 AT = np.array([-20.0, 20.0, 60.0])
 
 
-def known_rates(seed=0, temperatures=TEMPERATURES, **how):
+def known_rates(seed=0, temperatures=TEMPERATURES, made=turntable, **how):
     """The segments of a turntable, cut by its table with nothing of the reader."""
-    t, y, T, table = turntable(seed, temperatures, **how)
+    t, y, T, table, *force = made(seed, temperatures, **how)
     rows = [line.split(",") for line in table.splitlines()[1:]]
     parts = [slice(*np.searchsorted(t, [float(start) + 1, float(stop)])) for start, stop, _, _ in rows]
-    u = [np.deg2rad(float(rate)) * np.eye(3)["xyz".index(axis)] for _, _, axis, rate in rows]
-    means = (np.stack([values[part].mean(axis=0) for part in parts]) for values in (y, T, t))
+    ways = [(-1 if axis[0] == "-" else 1) * np.eye(3)["xyz".index(axis[-1])] for _, _, axis, _ in rows]
+    u = [np.deg2rad(float(row[3])) * way for row, way in zip(rows, ways, strict=True)]
+    means = (np.stack([values[part].mean(axis=0) for part in parts]) for values in (y, T, t, *force))
     return KnownRates(np.stack(u), *means)
 
 
 def placed_forces(seed=0, temperatures=TEMPERATURES, **how):
     t, y, T = tumble(seed, temperatures, **how)
-    places = rests(t, y, least=2.0)
+    places = TUMBLE._places(Chunk(t, {"accel": y}), 0)
     return PlacedForces(*(np.stack([v[a:b].mean(axis=0) for a, b in places]) for v in (y, T, t)), 9.80665)
 
 
@@ -53,6 +55,48 @@ def test_terms_over_temperature_are_within_their_sigma(stimulus, sensor, size, u
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
     sigma = fit.sigma(AT)[:, 3:]
     assert np.max(sigma) < 1e-4  # 100 ppm, 0.1 mrad
+
+
+ALL = np.ones(21, dtype=bool)
+
+
+def test_g_sensitivity_over_temperature_is_within_its_sigma():
+    true = np.hstack([truth(lambda M: M, np.deg2rad(1.0)), [sensitivity_of(T).ravel() for T in AT]])
+    z = []
+    for seed in range(210, 214):
+        fit = fit_triad(known_rates(seed, made=strained), POLYNOMIAL, 0.02, ALL, walk=1e-6)
+        z.append((fit.terms.at(AT) - true) / fit.sigma(AT))
+    z = np.array(z)
+    assert fit.told.all()
+    assert fit.names[12:14] == ("g-sensitivity xx", "g-sensitivity xy")
+    assert np.max(fit.sigma(AT)[:, 12:]) < 2e-6  # 0.001 deg/s/g
+    for part in (z[..., :12], z[..., 12:]):
+        assert 0.75 < np.sqrt(np.mean(part**2)) < 1.25
+        assert np.mean(np.abs(part) < 1.96) > 0.9
+    held = fit.sensitivity()
+    np.testing.assert_allclose(held.at(AT), fit.terms.sensitivity(AT), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(held.sigma(AT), fit.sigma(AT)[:, 12:], rtol=1e-2)
+
+
+def test_g_sensitivity_goes_with_the_bias_where_no_axis_points_both_ways():
+    """Of b + G f with f along +x, +y, +z alone, one sum an axis stays open: the error of all four has it."""
+    fit = fit_triad(known_rates(made=strained, ways=(1,)), POLYNOMIAL, 0.02, ALL, walk=1e-6)
+    assert np.sum(~fit.told[12:]) == 3
+    assert np.all(fit.sigma(AT)[:, :3] > 0.4 * 1.78e-4 * 9.8)
+    assert np.all(fit.sigma(AT)[:, 12:] > 0.4 * 1.78e-4)
+    line = next(line for line in fit.verdict() if "not told, and taken as zero" in line)
+    assert "from 0 to 9.8 m/s^2; add segments with" in line
+    assert np.max(fit.sigma(AT)[:, 3:12]) < 1e-4  # M is not touched by it
+
+
+def test_without_a_known_force_no_g_sensitivity_is_told():
+    own = known_rates()
+    fit = fit_triad(own, POLYNOMIAL, 0.02, ALL, walk=1e-6)
+    assert not fit.told[12:].any()
+    assert np.all(fit.terms.at(AT)[:, 12:] == 0)
+    assert sum("no specific force is known; record the accelerometers too" in line for line in fit.verdict()) == 9
+    plain = fit_triad(own, POLYNOMIAL, 0.02, walk=1e-6)
+    np.testing.assert_allclose(fit.terms.at(AT)[:, :12], plain.terms.at(AT), atol=2e-5)
 
 
 def test_a_change_that_does_not_pay_counts_in_the_error():
@@ -183,6 +227,17 @@ def test_gravity_that_is_unsure_is_unsure_in_all_scale_factors_alike():
     modes = other.modes(AT)
     correlation = np.sum(modes[:, 1, 3] * modes[:, 1, 7]) / np.prod(other.sigma(AT)[1, [3, 7]])
     assert correlation > 0.99
+
+
+def test_a_stimulus_whose_input_is_not_what_it_says_tells_nothing():
+    """Faces that are off by half: each term is worse known than a usual unit's, and each has a line."""
+    own = known_rates()
+    rng = np.random.default_rng(0)
+    wrong = KnownRates(own.u, rng.normal(0, 2.0, own.y.shape), own.temperatures, own.times)
+    fit = fit_triad(wrong, POLYNOMIAL, 0.02)
+    assert not fit.told.any()
+    assert np.all(fit.sigma(AT) > 0.4 * fit.usual)
+    assert len(fit.verdict()) >= 12
 
 
 def test_too_few_segments_are_refused():

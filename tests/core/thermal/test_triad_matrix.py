@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fusion_core.contracts import CurveError, ThermalMap, TriadMatrix
+from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap, TriadMatrix
 from fusion_core.host.registry import registry
 
 CUBIC = np.random.default_rng(0).normal(0, 2e-3, (4, 9))  # coefficients of x^0 to x^3
@@ -44,6 +44,24 @@ def test_a_map_gives_back_the_input_of_readings(tmp_path):
     again = settings.read(tmp_path / "map.json")
     np.testing.assert_array_equal(again.corrected(y, T), fitted.corrected(y, T))
     assert not np.any(fitted.noting(matrix=None).distortion(y, T))
+
+
+def test_the_strain_of_a_gyro_is_taken_off_where_the_force_is_known(tmp_path):
+    settings = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "order": 1})
+    T, rng = np.linspace(-20, 60, 200), np.random.default_rng(1)
+    bias, u, f = np.outer(T, [1e-4, -2e-4, 3e-4]), rng.normal(size=(200, 3)), rng.normal(0, 9, (200, 3))
+    M, G = cubic(T)[0].reshape(-1, 3, 3), 0.1 * cubic(T)[0].reshape(-1, 3, 3)
+    fields = matrix_with().model_dump(exclude={"frame"})
+    fields |= {name: 0.1 * np.array(fields[name]) for name in ("values", "slopes")}
+    held = MatrixCurve.model_validate({**fields, **{n: fields[n].tolist() for n in ("values", "slopes")}})
+    for matrix, part in ((matrix_with(), np.einsum("nij,nj->ni", M, u)), (None, 0.0)):
+        fitted = settings.fit(T, bias, {}).noting(matrix=matrix, sensitivity=held)
+        y = u + part + bias + np.einsum("nij,nj->ni", G, f)
+        np.testing.assert_allclose(fitted.corrected(y, T, force=f), u, rtol=0, atol=1e-14)
+        assert np.max(np.abs(fitted.corrected(y, T) - u)) > 1e-3  # the force is not known: the strain stays
+        fitted.save(tmp_path / "map.json")
+        again = settings.read(tmp_path / "map.json")
+        np.testing.assert_array_equal(again.corrected(y, T, force=f), fitted.corrected(y, T, force=f))
 
 
 def test_beyond_the_domain_the_matrix_is_that_of_its_end():

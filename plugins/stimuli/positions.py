@@ -1,0 +1,21 @@
+"""Placements by hand or by faces."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fusion_core.contracts import Stimulus
+from fusion_core.hookspecs import hookimpl
+from fusion_plugins.stimuli.placements import PlacedStimulus
+
+
+class Positions(PlacedStimulus):
+    """Placements by hand, or on six faces and between them."""
+
+    kind: Literal["positions"] = "positions"
+
+
+@hookimpl
+def stimuli() -> list[type[Stimulus]]:
+    """Register the plugin."""
+    return [Positions]
