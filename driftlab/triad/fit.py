@@ -49,6 +49,7 @@ PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
+SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 AHEAD = 2  # curves that are looked at beyond that of a term
 TINY = 1e-30
 
@@ -75,6 +76,8 @@ class TriadFit:
         Curves of the error, and the root of the covariance of their coefficients.
     noise : tuple of float
         Deviation of an equation in each group.
+    columns : tuple of int
+        How many of the columns of the root are of each of SOURCES.
     """
 
     stimulus: Stimulus
@@ -87,6 +90,7 @@ class TriadFit:
     design: Sequence[TermCurve]
     root: Array
     noise: tuple[float, ...]
+    columns: tuple[int, ...]
 
     @cached_property
     def grid(self) -> Array:
@@ -106,6 +110,11 @@ class TriadFit:
     def sigma(self, T: Array) -> Array:
         """Return the deviation (N, 12) of the terms at T (N,)."""
         return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    def parts(self, T: Array) -> dict[str, Array]:
+        """Return the deviation (N, 12) of the terms at T (N,) by source."""
+        parts = np.split(self.modes(T), np.cumsum(self.columns)[:-1])
+        return {name: np.sqrt(np.sum(part**2, axis=0)) for name, part in zip(SOURCES, parts, strict=True)}
 
     def change(self) -> tuple[Array, Array]:
         """Return the change of each term (12,) from the lowest to the highest temperature, and its deviation."""
@@ -452,10 +461,12 @@ class _Search:
         doubt = others * np.sqrt(share * (s**2 + b**2))
         freedom = max(len(self.z) - len(N) + len(pinned), 3)
         inside = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, doubt]) * np.sqrt(freedom / (freedom - 2))
-        root = np.hstack([inside, self._scatter_over_walks(starts), length])
+        scatter = self._scatter_over_walks(starts)
+        root = np.hstack([inside, scatter, length])
+        columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
-            tuple(self.s.tolist()),
+            tuple(self.s.tolist()), columns,
         )  # fmt: skip
 
     def _scatter_over_walks(self, starts: Array) -> Array:

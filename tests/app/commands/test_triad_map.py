@@ -127,7 +127,7 @@ def test_what_no_export_holds_is_said(folder):
         (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment; name those"),
         (["--stimulus", "tumble"], "--stimulus: is that of --terms"),
         (["--terms", TERMS, "--stimulus", "shaker"], "is none of rate_table, positions, tumble; name one of them"),
-        (["--terms", TERMS, "--compare"], "--terms: gives one map, and no page"),
+        (["--terms", TERMS, "--compare"], "--terms: tries the curves of one kind; leave --select, --compare and --family out"),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),
         (["--terms", TERMS, "--set", "stimulus.segments=no.csv"], "no.csv: cannot be read"),
