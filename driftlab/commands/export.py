@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -198,8 +198,6 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             if exporter.folder:
                 written.mkdir()
             loss = exporter.export(what, written)
-            if not exporter.holds_matrix:
-                loss = replace(loss, left_out=(*loss.left_out, *_matrices(exporter.kind, what)))
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
@@ -218,18 +216,6 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             for file in [files[0].parent / LOSS, *files]:
                 os.replace(file, folder / file.name)
     return loss
-
-
-def _matrices(kind: str, what: Export) -> Iterator[str]:
-    """Yield the size of scale factor and misalignment over temperature, which a form of export does not hold."""
-    for sensor in what.sensors:
-        matrix = sensor.matrix
-        if matrix is not None:
-            M = np.max(np.abs(matrix.at(np.linspace(matrix.T[0], matrix.T[-1], 100))), axis=0)
-            yield (
-                f"{sensor.channel}: scale factor and misalignment, up to {1e6 * np.max(np.diag(M)):.0f} ppm and "
-                f"{1e3 * np.max(M - np.diag(np.diag(M))):.2f} mrad; {kind} holds the bias alone"
-            )
 
 
 def key_of(path: Path) -> str:

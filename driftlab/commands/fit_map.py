@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from os import PathLike
@@ -229,9 +229,7 @@ def fit_map(
     if certificate and place is None:
         raise ConfigError("--certificate: is a file beside the map; give --out, the map's file")
     if _asks_for_triad(terms, stimulus, bool(neurons or compare or known)):
-        return fit_triad_map(
-            understood, recordings, str(terms), stimulus, kind, place, folder, certificate=certificate
-        )
+        return fit_triad_map(understood, recordings, str(terms), stimulus, kind, place, folder, certificate=certificate)
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
     for option, value in (("--kind", kind), ("--select", neurons)):

@@ -1,4 +1,4 @@
-"""Uncertainty budget of the bias, and of scale factor and misalignment, over temperature, after the GUM (JCGM 100:2008).
+"""Uncertainty budgets of bias, scale factor and misalignment over temperature, after the GUM (JCGM 100:2008).
 
 The measurand is the bias b(T) of a unit at rest where its thermometer reads T, in the mean of warming and cooling, with
 the level that it had in the mean over the soak. It is read off the fitted map; its sources are taken for independent::
@@ -120,7 +120,10 @@ def bias_budget(
 
 
 def matrix_budget(
-    matrix: TriadMatrix, *, thermometer: float | None = None, parts: Callable[[Array], Mapping[str, Array]] | None = None
+    matrix: TriadMatrix,
+    *,
+    thermometer: float | None = None,
+    parts: Callable[[Array], Mapping[str, Array]] | None = None,
 ) -> UncertaintyBudget:
     """Return the budget of scale factor and misalignment at a few round temperatures, M row by row.
 

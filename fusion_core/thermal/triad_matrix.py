@@ -45,8 +45,9 @@ class TriadMatrix(Frozen):
         The curve of each term.
     told : (9,) bools
         Whether the stimulus tells a term; one that it does not is zero.
-    error : CurveError
+    error : CurveError, optional
         Of the 9 terms, with how their errors go together. Its modes are those of the error of the bias, one by one.
+        None of a matrix that was imported: not known.
     """
 
     T: tuple[FiniteFloat, ...]
@@ -55,7 +56,7 @@ class TriadMatrix(Frozen):
     frame: Frame
     kinds: tuple[Plain, ...]
     told: tuple[bool, ...]
-    error: CurveError
+    error: CurveError | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -64,7 +65,7 @@ class TriadMatrix(Frozen):
             raise ValueError("the temperatures of the matrix do not rise")
         if np.shape(self.values) != shape or np.shape(self.slopes) != shape:
             raise ValueError(f"values and slopes of the matrix are not of the shape {shape}")
-        if not len(self.kinds) == len(self.told) == len(self.error.bend) == TERMS:
+        if {len(self.kinds), len(self.told), len(self.error.bend) if self.error else TERMS} != {TERMS}:
             raise ValueError(f"kinds, told and error of the matrix are not of its {TERMS} terms")
         rows = np.abs(np.asarray(self.values)).reshape(-1, 3, 3).sum(axis=2)
         if np.max(rows) >= SINGULAR:
@@ -90,8 +91,8 @@ class TriadMatrix(Frozen):
         return self.terms(T).reshape(-1, 3, 3)
 
     def sigma(self, T: Array) -> Array:
-        """Return the standard deviation (N, 9) of the terms at T (N,) degC."""
-        return np.asarray(np.sqrt(self.error.variance(T)))
+        """Return the standard deviation (N, 9) of the terms at T (N,) degC; NaN where it is not known."""
+        return np.full((len(T), TERMS), np.nan) if self.error is None else np.asarray(np.sqrt(self.error.variance(T)))
 
     def distortion(self, less: Array, T: Array) -> Array:
         """Return M u (N, 3), the part of readings less their bias (I + M) u (N, 3) that is no input."""
