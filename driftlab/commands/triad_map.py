@@ -27,7 +27,7 @@ from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_all, save, write_beside
 from driftlab.triad.fit import TriadFit, fit_triad
-from driftlab.triad.model import BIAS, SCALE, TERMS
+from driftlab.triad.model import BIAS, GROUPS, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
 from fusion_core.contracts import FittedMap, MapRecord, ThermalMap
@@ -36,7 +36,6 @@ from fusion_core.faults import Faults
 from fusion_core.settings import Settings
 from fusion_core.thermal.record_texts import recorded
 
-GROUPS = {"bias": BIAS, "scale": SCALE, "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 STIMULI: dict[str, type[Settings]] = {"rate_table": KnownRate, "positions": Placed, "tumble": Placed}
 USUAL_BIAS = {"rad/s": np.deg2rad(1.0), "m/s^2": 0.5}  # of a unit of which nothing is known
 POINTS = 400  # temperatures of the curve
@@ -153,9 +152,7 @@ def fit_triad_map(
     ConfigError, DataError, MapError
         If a recording does not hold the stimulus, or the config's map is of another sensor.
     """
-    names = [name.strip() for name in terms.split(",")]
-    if unknown := [name for name in names if name not in GROUPS]:
-        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(GROUPS)}; name those")
+    names = names_of_terms(terms)
     own, faults = _with_stimulus(config, stimulus), Faults()
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
@@ -176,6 +173,14 @@ def fit_triad_map(
     if out is not None:
         result.save(out, report=report, certificate=certificate)
     return result
+
+
+def names_of_terms(terms: str) -> list[str]:
+    """Return the groups of terms that an option names; raises ConfigError where one is unknown."""
+    names = [name.strip() for name in terms.split(",")]
+    if unknown := [name for name in names if name not in GROUPS]:
+        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(GROUPS)}; name those")
+    return names
 
 
 def _with_stimulus(config: Config, kind: str | None) -> Config:

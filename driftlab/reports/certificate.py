@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.config import CertificateTexts, Config, KnownRate
+from driftlab.config import CertificateTexts, Config
 from driftlab.evaluation.limits import OF_M, RULE, LimitResult, Measured, outcome, verdict
 from driftlab.evaluation.uncertainty import K, UncertaintyBudget, bias_budget, expanded, matrix_budget
 from driftlab.maps.fit import axes_of
@@ -288,7 +288,9 @@ class Certificate:
     @property
     def _turned(self) -> bool:
         """True if the axis of a turntable points up at a known latitude: the Earth rate is known, or averages out."""
-        return self.levelled and isinstance(self.config.stimulus, KnownRate) and self.config.latitude is not None
+        stimulus = self.config.stimulus
+        of_table = stimulus is not None and stimulus.kind == "rate_table"
+        return self.levelled and of_table and self.config.latitude is not None
 
     def _bias(self) -> dict[str, Any] | None:
         """Return the bias over temperature with its expanded uncertainty, and the budget where that is largest."""

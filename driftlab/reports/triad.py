@@ -12,11 +12,11 @@ from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.fit import TriadFit
-from driftlab.triad.model import AXES, BIAS, NARROW, PAIRS, SCALE, TERMS
+from driftlab.triad.model import AXES, BIAS, GROUPS, NARROW, SCALE, TERMS
 from driftlab.units import RATE, BiasUnit, number
 from fusion_core.chunk import Array
 
-CROSS = [len(BIAS) + k for k, (i, j) in enumerate(PAIRS) if i != j]  # of the terms: misalignments
+CROSS = GROUPS["misalignment"]
 TEMPERATURE = "temperature [°C]"
 MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the error, and where the errors are
     "rad/s": ("a turn of 360 deg", 360.0, "deg", "about its axis", "about another"),
@@ -100,7 +100,7 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
 
 
 def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
-    """Return scale factor and misalignment, the bias, and what the terms leave of each equation."""
+    """Return the charts of scale factor and misalignment, of the bias, and of the residuals."""
     T = fit.grid
     values, sigma = fit.terms.at(T) * unit.factor, fit.sigma(T) * unit.factor
 
@@ -112,14 +112,16 @@ def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
 
 
 def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
-    """Return what the terms leave of the equations, over the number of their segment or placement."""
+    """Return the residuals of the equations, over the number of their segment or placement."""
     e = fit.stimulus.equations(fit.terms.at(fit.stimulus.T))
     panels, last = [], None
     for g in np.unique(e.group):
         left, T, t = (values[e.group == g] for values in (e.left, e.T, e.t))
         a_place = int(np.argmax(np.append(t[1:] != t[:-1], True))) + 1  # equations of one moment
         place = np.arange(1, len(left) // a_place + 1) + 0.5 * g  # turns are between placements
-        name, shown, factor = ("residual", unit.shown, unit.factor) if g == 0 else ("direction after a turn", "mrad", 1e3)
+        name, shown, factor = (
+            ("residual", unit.shown, unit.factor) if g == 0 else ("direction after a turn", "mrad", 1e3)
+        )
         names = AXES if a_place == len(AXES) else [name] * a_place
         points = tuple(
             Line(place, left[k::a_place] * factor, names[k], f"series:{k}", style="points") for k in range(a_place)

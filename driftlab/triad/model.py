@@ -26,6 +26,7 @@ TERMS = tuple(f"bias {i}" for i in AXES) + tuple(
     f"scale {p[0]}" if p[0] == p[1] else f"misalignment {p}" for p in PAIRS
 )
 BIAS, SCALE = range(3), (3, 7, 11)
+GROUPS = {"bias": [*BIAS], "scale": [*SCALE], "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 BELOW = (6, 9, 10)  # of the terms: M below its diagonal, zero in the frame that the sensor itself defines
 NARROW = 2.0  # K: temperatures that move less have one value of each term
 ORDERS = 3  # highest order that is tried, where the map's kind names none
