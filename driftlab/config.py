@@ -310,6 +310,10 @@ class Limits(Settings):
     """Largest difference between warming and cooling at one temperature: a hysteresis, a lag, a relaxation."""
     noise: Annotated[float, Unit("bias/sqrt(Hz)", positive=True, example="4 deg/h/sqrt(Hz)")] | None = None
     """Density of the white noise."""
+    scale: Annotated[float, Unit("1", positive=True, example="500 ppm")] | None = None
+    """Largest error of the scale factors of a triad over temperature, as found."""
+    misalignment: Annotated[float, Unit("rad", positive=True, example="2 mrad")] | None = None
+    """Largest misalignment of a triad over temperature, as found."""
 
     @property
     def declared(self) -> dict[str, float]:

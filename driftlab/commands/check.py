@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import typer
 
 from driftlab.commands.console import print_json, say, say_lines, terminal
@@ -13,10 +14,14 @@ from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
 from driftlab.config import Config, maps_of
 from driftlab.filtering.setup import check_channels, loaded_map, prior
 from driftlab.recordings.screening import head
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import FittedMap, Sensor
 from fusion_core.host.config import quantities
 from fusion_core.host.registry import Entry, registry
 from fusion_core.host.schema import config_schema
 from fusion_core.units import Quantity
+
+TURNING, ROWS = np.deg2rad(1.0), 50  # rad/s, in means of so many rows: a slower unit does not turn
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
     if first is not None and understood.filter is not None:
         check_channels(understood.filter, first.chunk)
     remarks = [*_map_remarks(understood), *(() if first is None else first.lines)]
+    if first is not None and understood.filter is not None:
+        remarks += _turns(understood.filter.tracked, first.chunk)
     if understood.source is None:
         remarks.append("source: is missing, so no recording can be read; `driftlab init FILE` writes that of a file")
     return CheckResult(understood, dict(quantities(understood)), tuple(remarks))
@@ -71,7 +78,39 @@ def _map_remarks(config: Config) -> list[str]:
                 remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
             else:
                 remarks += map_lines(loaded_map(settings, sensor), sensor)
+    there = [settings for settings in config.tracked_maps() if settings.path is not None and settings.path.exists()]
+    if (
+        config.stimulus is not None
+        and config.filter is not None
+        and there
+        and _with_matrix(config.filter.tracked) is None
+    ):
+        remarks.append(
+            "stimulus: lies unused, since the map holds the bias alone; fit the rest with `driftlab fit-map --terms "
+            "bias,scale,misalignment`"
+        )
     return remarks
+
+
+def _with_matrix(sensor: Sensor) -> FittedMap | None:
+    """Return the map of a sensor that has scale factor and misalignment; None where there is none."""
+    there = (loaded_map(m, sensor) for m in maps_of(sensor) if m.path is not None and m.path.exists())
+    return next((fitted for fitted in there if fitted.record.matrix is not None), None)
+
+
+def _turns(sensor: Sensor, chunk: Chunk) -> Iterator[str]:
+    """Yield a remark where a map's scale factor and misalignment are of a gyro that does not turn."""
+    fitted = _with_matrix(sensor)
+    if fitted is None or sensor.unit != "rad/s" or not {sensor.channel, "temperature"} <= set(chunk.channels):
+        return
+    omega = chunk[sensor.channel] - fitted.bias(np.clip(chunk["temperature"], *fitted.domain), chunk.t)
+    parts = np.array_split(omega, max(len(omega) // ROWS, 1))
+    rate = max(float(np.linalg.norm(part.mean(axis=0))) for part in parts)
+    if rate < TURNING:
+        yield (
+            f"{sensor.channel}: turns by {np.rad2deg(rate):.2g} deg/s at most in its first {len(chunk):,} rows, so "
+            "nothing of scale factor and misalignment is seen there; a turn shows whether they are right"
+        )
 
 
 def content_of(result: CheckResult, given: Mapping[str, Any]) -> Any:

@@ -199,8 +199,6 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             if exporter.folder:
                 written.mkdir()
             loss = exporter.export(what, written)
-            if not exporter.holds_matrix:
-                loss = replace(loss, left_out=(*loss.left_out, *_matrices(exporter.kind, what)))
             loss = replace(loss, left_out=(*loss.left_out, *_sensitivities(exporter.kind, what)))
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
@@ -220,18 +218,6 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             for file in [files[0].parent / LOSS, *files]:
                 os.replace(file, folder / file.name)
     return loss
-
-
-def _matrices(kind: str, what: Export) -> Iterator[str]:
-    """Yield the size of scale factor and misalignment over temperature, which a form of export does not hold."""
-    for sensor in what.sensors:
-        matrix = sensor.matrix
-        if matrix is not None:
-            M = np.max(np.abs(matrix.at(np.linspace(matrix.T[0], matrix.T[-1], 100))), axis=0)
-            yield (
-                f"{sensor.channel}: scale factor and misalignment, up to {1e6 * np.max(np.diag(M)):.0f} ppm and "
-                f"{1e3 * np.max(M - np.diag(np.diag(M))):.2f} mrad; {kind} holds the bias alone"
-            )
 
 
 def _sensitivities(kind: str, what: Export) -> Iterator[str]:

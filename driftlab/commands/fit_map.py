@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from os import PathLike
@@ -27,15 +27,15 @@ from driftlab.maps.kind_selection import KindComparison, candidates, divide
 from driftlab.maps.kind_selection import compare as compare_kinds
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.reports import map_selection
-from driftlab.reports.certificate import SUFFIXES, Certificate
+from driftlab.reports.certificate import FILES as CERTIFICATE
+from driftlab.reports.certificate import Certificate
 from driftlab.reports.charts import Chart
 from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.map import chart, page_of
 from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
-from driftlab.storage.map_file import check_file, check_place, save, write_text
-from driftlab.storage.ownership import why_not_own
+from driftlab.storage.map_file import check_all, save, write_beside
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
@@ -120,7 +120,7 @@ class FitMapResult(Result):
         """
         path, folder, selection = Path(out), None if report is None else Path(report), self.selection
         names = _names(selected=selection is not None, certificate=certificate)
-        _check(path, folder, [], names)
+        check_all(path, folder, [], names, COMMAND)
         save(self.map, path, COMMAND)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
@@ -131,14 +131,8 @@ class FitMapResult(Result):
         if certificate:
             signed = self._certificate(sheet)
             texts += [signed.page(), signed.text()]
-        beside = _beside(path, folder, names)
-        for place, text in zip(beside, texts, strict=True):
-            write_text(place, text, COMMAND)
-        if not certificate:  # that of an earlier map is not of this one
-            for place in _beside(path, folder, _names(selected=False, certificate=True)[1:]):
-                if place.is_file() and not why_not_own(place, COMMAND):
-                    place.unlink()
-        self.written = (path, *beside)
+        written = dict(zip(names, texts, strict=True))  # a certificate of an earlier map is not of this one
+        self.written = (path, *write_beside(path, folder, written, COMMAND, CERTIFICATE))
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
@@ -232,19 +226,18 @@ def fit_map(
     recordings = [] if data is None else recordings_of(data, units, "data")
     place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
     _check_family(known, lot, bool(kind or neurons or compare or report or certificate))
-    others = bool(neurons or compare or report or certificate or known)
-    if _asks_for_triad(terms, stimulus, others):
-        return fit_triad_map(understood, recordings, str(terms), stimulus, kind, place)
-    if known is not None:
-        return fit_family_map(understood, recordings, known, lot or "", place, progress)
     if certificate and place is None:
         raise ConfigError("--certificate: is a file beside the map; give --out, the map's file")
+    if _asks_for_triad(terms, stimulus, bool(neurons or compare or known)):
+        return fit_triad_map(understood, recordings, str(terms), stimulus, kind, place, folder, certificate=certificate)
+    if known is not None:
+        return fit_family_map(understood, recordings, known, lot or "", place, progress)
     for option, value in (("--kind", kind), ("--select", neurons)):
         if compare and value is not None:
             raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
     if place is not None:
         read = [*understood.files_to_fit(), *paths_of(recordings)]
-        _check(place, folder, read, _names(selected=neurons is not None, certificate=certificate))
+        check_all(place, folder, read, _names(selected=neurons is not None, certificate=certificate), COMMAND)
     result = _fitted(understood, recordings, kind, neurons, compare, progress)
     if place is not None:
         result.save(place, report=folder, certificate=certificate)
@@ -313,21 +306,10 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
     return T, bias
 
 
-def _check(path: Path, report: Path | None, read: Collection[Path], names: Sequence[str]) -> None:
-    check_place(path, read, COMMAND)
-    for name in _beside(path, report, names):
-        check_file(name, COMMAND, str(name), "name another folder with --report")
-
-
 def _names(*, selected: bool, certificate: bool) -> list[str]:
     """Return the names of the page, of the selection's files and of the certificate."""
     more = ["select.json", "select.svg"] * selected
-    return ["report.html", *more, *(f"certificate.{suffix}" for suffix in SUFFIXES if certificate)]
-
-
-def _beside(path: Path, report: Path | None, names: Sequence[str]) -> list[Path]:
-    """Return the places of files: in the folder, or beside the map under its name."""
-    return [path.with_name(f"{path.stem}.{name}") if report is None else report / name for name in names]
+    return ["report.html", *more, *(CERTIFICATE if certificate else ())]
 
 
 def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
@@ -346,7 +328,7 @@ def _asks_for_triad(terms: str | None, stimulus: str | None, others: bool) -> bo
     if terms is None and stimulus is not None:
         raise ConfigError("--stimulus: is that of --terms; say which to fit, e.g. --terms bias,scale,misalignment")
     if terms is not None and others:
-        raise ConfigError("--terms: gives one map, and no page; leave --select, --compare, --report, --family out")
+        raise ConfigError("--terms: tries the curves of one kind; leave --select, --compare and --family out")
     return terms is not None
 
 

@@ -15,6 +15,7 @@ from driftlab import __version__
 from driftlab.commands.console import say_lines
 from driftlab.commands.export import SHOWN, exporter_of, installed
 from driftlab.commands.inputs import Place
+from driftlab.maps.fit import axes_of, term_lines
 from driftlab.storage.map_file import check_place, save
 from fusion_core.contracts import Calibrated, FittedMap, ReadBack, ThermalMap
 from fusion_core.errors import ConfigError, quote
@@ -94,7 +95,7 @@ def import_map(
     }
     fitted = model.model_validate({"kind": map_kind, **order}).fit(T, bias, provenance)
     # nothing is known of the samples that it once was fitted to
-    unknown = {"residual": None, "samples": 0, "error": None}
+    unknown = {"residual": None, "samples": 0, "error": None, "matrix": calibration.matrix}
     sensor = {"channel": calibration.channel, "unit": calibration.unit, "axes": calibration.axes}
     try:
         fitted = replace(fitted, record=fitted.record.model_copy(update={**unknown, **sensor}))
@@ -132,6 +133,7 @@ def show(result: Imported, given: Mapping[str, Any]) -> None:
             *read.notes,
             f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
             f"°C; the map is within {unit.said(np.array(result.apart))} {unit.shown} of it",
+            *(() if record.matrix is None else term_lines(record.matrix, axes_of(result.map))),
             "in a config, as the vehicle uses it:",
             "filter:",
             f"  {record.channel}:",

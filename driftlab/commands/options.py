@@ -49,7 +49,7 @@ METAVARS = {
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
     "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",
-    "terms": "TERM,...", "to": "URL", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
+    "table": "RATE", "terms": "TERM,...", "to": "URL", "train": RECORDING, "units": "CHANNEL=UNIT", "walk": "WALK",
     "web": "[PORT]", "without": "KIND",
 }  # fmt: skip
 PAIRS = {

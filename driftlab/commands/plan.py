@@ -13,6 +13,7 @@ import numpy as np
 from driftlab.commands.console import say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
+from driftlab.commands.triad_map import names_of_terms
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family
@@ -21,32 +22,39 @@ from driftlab.planning.chamber import Profile
 from driftlab.planning.continuation import Continuation, continuation_of, of_samples, read_parts
 from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
 from driftlab.planning.discrimination import DiscriminationCriterion, preferred
-from driftlab.planning.request import PlanRequest, parse_request
+from driftlab.planning.request import PlanRequest, parse_request, quantity
 from driftlab.planning.search import SearchResult, search
 from driftlab.planning.short_soak import ShortSoakPlan, shortened
 from driftlab.planning.simulated_search import still_channels
+from driftlab.planning.turntable import TurntablePlan, plan_turntable
 from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
 from driftlab.reports import plan_continuation, plan_effects, plan_short_soak
+from driftlab.reports import plan_turntable as plan_turntable_page
 from driftlab.reports.charts import Chart
 from driftlab.reports.plan import PlanPage, page_of_search, write_profile
 from driftlab.reports.tables import TextTable
 from driftlab.storage.folders import FILES
 from driftlab.storage.json import plain, write_json
+from driftlab.triad.model import AXES, GROUPS, TERMS
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 
+TABLE = "100 deg/s"  # fastest rate of a turntable
+
 
 class PlanResult(Result):
     """A plan: `time` and `set_point` (M,) of the chosen profile, `temperature` (G,) and `sigma` (G, d) of its map.
+
+    With terms of a turntable, `sigma` (G, 12) is that of each term.
 
     After recordings `sigma` is of the map so far, NaN where nothing was seen, and `sigma_after` (G, d) with the further
     profile. With a family, `without_family` (G, d) is the error of the best map without it after the same soak.
 
     Attributes
     ----------
-    found : SearchResult, Continuation or ShortSoakPlan
+    found : SearchResult, Continuation, ShortSoakPlan or TurntablePlan
         Every profile that was judged, and the chosen one.
     outlook : DetectabilityReport or None
         What the chosen profile would say of effects; None with a family.
@@ -61,7 +69,7 @@ class PlanResult(Result):
     def __init__(
         self,
         name: str,
-        rated: SearchResult | Continuation | ShortSoakPlan,
+        rated: SearchResult | Continuation | ShortSoakPlan | TurntablePlan,
         page: PlanPage,
         sigmas: Mapping[str, Array],
         axes: Sequence[str],
@@ -75,7 +83,8 @@ class PlanResult(Result):
         self._columns = {
             "time": profile.time, "set_point": profile.temperature, "temperature": rated.chosen.temperature, **sigmas,
         }  # fmt: skip
-        self.units = {"time": "s", "set_point": "degC", "temperature": "degC", **dict.fromkeys(sigmas, si)}
+        each = tuple(si if name.startswith("bias") else "1" for name in axes) if len(axes) == len(TERMS) else si
+        self.units = {"time": "s", "set_point": "degC", "temperature": "degC", **dict.fromkeys(sigmas, each)}
         self.labels = dict.fromkeys(sigmas, tuple(axes))
         self.summary = plain(page.document)
 
@@ -92,10 +101,12 @@ class PlanResult(Result):
         return self._page.chart
 
     def _write(self, folder: Path) -> None:
-        mark, setpoints, report = (folder / name for name in FILES["plan"])
+        mark, setpoints, report, segments = (folder / name for name in FILES["plan"])
         profile = self.found.chosen.profile
         write_profile(setpoints, profile)
         self._page.write(report, self.name[0].upper() + self.name[1:], profile)
+        if isinstance(self.found, TurntablePlan):
+            segments.write_text(self.found.chosen.table(), encoding="utf-8")
         write_json(mark, self.summary)
 
 
@@ -114,6 +125,8 @@ def plan(
     channel: str | None = None,
     after: DataLike = None,
     family: Place | None = None,
+    terms: str | None = None,
+    table: str | None = None,
     out: Place | None = None,
     progress: Progress | None = None,
 ) -> PlanResult:
@@ -154,6 +167,11 @@ def plan(
     family : path, optional
         Of a fleet: says how short a soak may be.
         Its `family.json`; noise and walk are those of its units.
+    terms : str, optional
+        Terms of a gyro to tell on a turntable: bias,scale,misalignment.
+        The plan is then of temperatures, faces and rates; segments.csv in `out` is what `fit-map --terms` reads.
+    table : str, optional
+        With --terms, the fastest rate of the table; default: 100 deg/s.
     out : path, optional
         Folder for set points and report.
     progress : callable, optional
@@ -173,8 +191,14 @@ def plan(
         sensor.
     """
     understood = config_of(config).tracking(channel)
+    if terms is None and table is not None:
+        raise ConfigError("--table: is the rate of a turntable; say which terms it is to tell, e.g. --terms scale")
     options = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
     inquiry = _Inquiry(understood, hours, range, options, effects, progress or (lambda *state: None))
+    if terms is not None:
+        if family is not None or after is not None or effects or sigma is not None:
+            raise ConfigError("--terms: plans a turntable; leave --family, --after, --effects and --sigma out")
+        return in_folder(out, "plan", understood.files(), partial(inquiry.turned, terms, table or TABLE))
     if family is not None:
         if after is not None or effects:
             raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
@@ -254,6 +278,21 @@ class _Inquiry:
         sigmas = {"sigma": rated.chosen.sigma, "without_family": rated.chosen.without_family}
         return PlanResult(name, rated, page, sigmas, law.axes, unit.si)
 
+    def turned(self, terms: str, table: str) -> PlanResult:
+        """Plan the sequence of a turntable."""
+        wanted = [j for name in names_of_terms(terms) for j in GROUPS[name]]
+        request, rate = self.request(self.range), quantity("table", table, "rad/s")
+        subject = request.subject
+        if len(subject.axes) != len(AXES) or subject.unit.si != "rad/s" or rate <= 0:
+            raise ConfigError(
+                f"--terms: a turntable tells of a gyro of three axes at a rate, not of {subject.channel} "
+                f"({', '.join(subject.axes)}) at {table}; give a gyro's config, and e.g. --table '100 deg/s'"
+            )
+        found = plan_turntable(subject, request.chamber, self.hours, rate, wanted)
+        page = plan_turntable_page.page_of(found)
+        return PlanResult(f"plan of a turntable for the {subject.channel}", found, page, {"sigma": found.chosen.sigma},
+                          [name.replace(" ", "_") for name in TERMS], "rad/s")  # fmt: skip
+
     def _outlook(self, unit: UnitModel, profile: Profile, lag: float) -> DetectabilityReport:
         self.report("effects")
         return predict_detectability(
@@ -282,4 +321,5 @@ def show(result: PlanResult, given: Mapping[str, Any]) -> None:
         terminal().print(plan_effects.table(result.outlook))
         say_lines(plan_effects.lines(result.outlook))
     if given["out"] is not None:
-        say(f"written to {given['out']}/: {', '.join(FILES['plan'])}\n")
+        names = FILES["plan"] if isinstance(result.found, TurntablePlan) else FILES["plan"][:3]
+        say(f"written to {given['out']}/: {', '.join(names)}\n")

@@ -34,7 +34,8 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.recordings.identity import beforehand
 from driftlab.recordings.prefetch import aside
-from driftlab.reports.certificate import SUFFIXES, Certificate
+from driftlab.reports.certificate import FILES as CERTIFICATE
+from driftlab.reports.certificate import Certificate
 from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import Sheet, sheet_of
 from driftlab.reports.run import bias_chart, page_of
@@ -126,8 +127,8 @@ class RunResult(Result):
         (folder / "report.html").write_text(page, encoding="utf-8")
         if certificate:
             signed = self._certificate(sheet)
-            for suffix, text in zip(SUFFIXES, (signed.page(), signed.text()), strict=True):
-                (folder / f"certificate.{suffix}").write_text(text, encoding="utf-8")
+            for name, text in zip(CERTIFICATE, (signed.page(), signed.text()), strict=True):
+                (folder / name).write_text(text, encoding="utf-8")
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         overview, T, fitted = self.overview, self.overview.curves.get("temperature_raw"), map_of(self.config)

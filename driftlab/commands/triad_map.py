@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -11,15 +11,21 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.commands.console import say, say_lines, terminal
+from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.result import Result
 from driftlab.config import Config, paths_of
+from driftlab.evaluation.limits import check_limits
+from driftlab.evaluation.limits import verdict as verdict_line
+from driftlab.evaluation.measurements import of_map
 from driftlab.filtering.setup import check_map
 from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
 from driftlab.reports import triad as words
+from driftlab.reports.certificate import FILES as CERTIFICATE
+from driftlab.reports.certificate import Certificate
 from driftlab.reports.charts import Chart
+from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.storage.json import plain
-from driftlab.storage.map_file import check_place, save
+from driftlab.storage.map_file import check_all, save, write_beside
 from driftlab.triad.fit import TriadFit, fit_triad
 from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
@@ -50,9 +56,23 @@ class TriadMapResult(Result):
     written : tuple of Path
     """
 
-    def __init__(self, config: Config, gathered: Gathered, fit: TriadFit, fitted: FittedMap, faults: Faults) -> None:
-        self.config, self.fit, self.map, self.faults = config, fit, fitted, faults
+    def __init__(
+        self,
+        config: Config,
+        recordings: Sequence[str],
+        gathered: Gathered,
+        fit: TriadFit,
+        fitted: FittedMap,
+        faults: Faults,
+        *,
+        levelled: bool = True,
+    ) -> None:
+        self.config, self.recordings, self.levelled = config, list(recordings) or None, levelled
+        self.fit, self.map, self.faults = fit, fitted, faults
         self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
+        self.measured = of_map(fitted, self.unit)
+        self.limits = check_limits(config.limits, self.measured)
+        self.limits_verdict = verdict_line(self.limits)
         self.written: tuple[Path, ...] = ()
         self.name = f"map of the {gathered.sensor.channel}, with scale factor and misalignment"
         T = np.linspace(*fitted.domain, POINTS)
@@ -62,7 +82,8 @@ class TriadMapResult(Result):
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
         self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
         self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
-            "triad": plain(words.as_json(fit, self.unit)), "serial": config.serial
+            "triad": plain(words.as_json(fit, self.unit)), "serial": config.serial,
+            "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }  # fmt: skip
 
     def lines(self) -> list[str]:
@@ -72,18 +93,53 @@ class TriadMapResult(Result):
     def _chart(self) -> Chart:
         return words.chart(self.fit, self.unit)
 
-    def save(self, out: str | PathLike[str]) -> None:
-        """Write the map to the file `out`; raises ConfigError, Unwritable or MapError."""
-        path = Path(out)
-        check_place(path, [], "fit-map")
-        save(self.map, path, "fit-map")
-        self.written = (path,)
+    def save(
+        self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False
+    ) -> None:
+        """Write the map to the file `out`, and its page; with `certificate` that too.
+
+        Page and certificate are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
+        """
+        path, folder, command = Path(out), None if report is None else Path(report), "fit-map"
+        check_all(path, folder, [], names_of(certificate=certificate), command)
+        save(self.map, path, command)
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits)
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
+        lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
+        texts = [words.page_of(self.fit, self.unit, self.sensor.channel, lead, self.faults.lines(), sheet)]
+        if certificate:
+            signed = self._certificate(sheet)
+            texts += [signed.page(), signed.text()]
+        written = dict(zip(names_of(certificate=certificate), texts, strict=True))
+        self.written = (path, *write_beside(path, folder, written, command, CERTIFICATE))
+
+    def _certificate(self, sheet: Sheet) -> Certificate:
+        none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
+        measured = {name: one for name, one in self.measured.items() if not self.levelled or name not in none}
+        return Certificate(
+            "fit-map", self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
+            levelled=self.levelled, remarks=self.fit.verdict(),
+        )  # fmt: skip
+
+
+def names_of(*, certificate: bool) -> list[str]:
+    """Return the names of the page and of the certificate."""
+    return ["report.html", *(CERTIFICATE if certificate else ())]
 
 
 def fit_triad_map(
-    config: Config, recordings: Sequence[str], terms: str, stimulus: str | None, kind: str | None, out: Path | None
+    config: Config,
+    recordings: Sequence[str],
+    terms: str,
+    stimulus: str | None,
+    kind: str | None,
+    out: Path | None,
+    report: Path | None = None,
+    *,
+    certificate: bool = False,
 ) -> TriadMapResult:
-    """Return the map of a triad that a stimulus gives; with `out`, write it there.
+    """Return the map of a triad that a stimulus gives; with `out`, write it there, and its page beside or in `report`.
 
     Parameters
     ----------
@@ -99,14 +155,12 @@ def fit_triad_map(
     ConfigError, DataError, MapError
         If a recording does not hold the stimulus, or the config's map is of another sensor.
     """
-    names = [name.strip() for name in terms.split(",")]
-    if unknown := [name for name in names if name not in ASKED]:
-        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(ASKED)}; name those")
+    names = names_of_terms(terms, ASKED)
     own, faults = _with_stimulus(config, stimulus), Faults()
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
         read = own.files_to_fit() if "bias" in names else own.files()
-        check_place(out, [*read, *paths_of(recordings)], "fit-map")
+        check_all(out, report, [*read, *paths_of(recordings)], names_of(certificate=certificate), "fit-map")
     known = None if "bias" in names else _known_bias(own, settings)
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
@@ -120,10 +174,18 @@ def fit_triad_map(
         None if walk is None else float(np.max(walk)),
     )  # fmt: skip
     fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
-    result = TriadMapResult(own, gathered, fit, fitted, faults)
+    result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, levelled=known is None)
     if out is not None:
-        result.save(out)
+        result.save(out, report=report, certificate=certificate)
     return result
+
+
+def names_of_terms(terms: str, known: Collection[str] = GROUPS) -> list[str]:
+    """Return the groups of terms that an option names; raises ConfigError where one is not known."""
+    names = [name.strip() for name in terms.split(",")]
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"--terms {quote(terms)}: '{quote(unknown[0])}' is none of {', '.join(known)}; name those")
+    return names
 
 
 def _with_stimulus(config: Config, kind: str | None) -> Config:
@@ -177,6 +239,8 @@ def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what the stimulus does not tell, and where the map was written."""
     terminal().print(words.table(result.fit, result.unit))
     say_lines([words.frame_line(result.fit), *result.fit.verdict()])
+    print_verdict(result.limits_verdict, "limits: ")
+    say_lines((row.line(result.unit) for row in result.limits), "  ")
     say_lines(result.faults.lines(), "note: ")
     say(f"written to {', '.join(map(str, result.written))}\n")
     line = f"{{kind: {result.map.record.kind}, path: {result.written[0]}}}"

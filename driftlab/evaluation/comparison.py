@@ -37,7 +37,7 @@ from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.units import BiasUnit, duration, listed, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import Sensor
+from fusion_core.contracts import FittedMap, Sensor
 from fusion_core.errors import ConfigError, NotAtRest
 
 OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7, 10 and 12
@@ -94,13 +94,15 @@ class Condition:
 class Comparison(ScoredRun):
     """One config: its nominal run, and its errors in both conditions.
 
-    `reference_residual` (d,) is the accuracy of its reference (table 5), `initial` the error of the other condition.
+    `reference_residual` (d,) is the accuracy of its reference (table 5), `initial` the error of the other condition,
+    `terms` those of the sensor's model that are taken off by a map: `bias x`, `scale x`, `misalignment xy`.
     """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
     initial: InitialError
+    terms: tuple[str, ...]
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
@@ -147,8 +149,19 @@ def _compared(name: str, config: Config, initial: InitialError | None, progress:
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    of_run = vars(scored(run, nominal.estimates))
-    return Comparison(**of_run, reference_residual=residual, nominal=nominal, offset=offset, initial=initial)
+    of_run, sensor = vars(scored(run, nominal.estimates)), run.model.tracked
+    terms = _terms(run.plan.fitted, sensor)
+    return Comparison(
+        **of_run, reference_residual=residual, nominal=nominal, offset=offset, initial=initial, terms=terms
+    )
+
+
+def _terms(fitted: FittedMap | None, sensor: Sensor) -> tuple[str, ...]:
+    """Return the terms of a sensor that its map takes off."""
+    axes, matrix = sensor.axes, None if fitted is None else fitted.record.matrix
+    bias = [] if fitted is None else [f"bias {axis}" for axis in axes]
+    pairs = () if matrix is None else np.argwhere(np.reshape(matrix.told, (3, 3)))
+    return (*bias, *(f"scale {axes[i]}" if i == j else f"misalignment {axes[i]}{axes[j]}" for i, j in pairs))
 
 
 def _condition(run: Run, recording: Chunk, initial_error: float, threshold: float) -> Condition:
@@ -232,11 +245,16 @@ def limit_lines(runs: Mapping[str, Comparison]) -> list[str]:
 
 
 def notes(runs: Mapping[str, Comparison]) -> list[str]:
-    """Return the remarks, each with the name of its config; one that holds for all stands once."""
+    """Return the remarks, each with the name of its config; one that holds for all stands once.
+
+    Where a map has scale factor and misalignment, the terms that each config takes off come first.
+    """
     first, *others = [run.remarks for run in runs.values()]
     shared = [line for line in first if others and all(line in lines for lines in others)]
     single = [f"{name}: {line}" for name, run in runs.items() for line in run.remarks if line not in shared]
-    return [*(f"all: {line}" for line in shared), *single]
+    moved = any(not term.startswith("bias") for run in runs.values() for term in run.terms)
+    terms = [f"{name}: takes off {', '.join(run.terms) or 'no term'}" for name, run in runs.items() if moved]
+    return [*terms, *(f"all: {line}" for line in shared), *single]
 
 
 def as_json(runs: Mapping[str, Comparison], recording: str) -> dict[str, Any]:
@@ -253,6 +271,7 @@ def as_json(runs: Mapping[str, Comparison], recording: str) -> dict[str, Any]:
             **({"coast_heading_error_rad": run.yardsticks.heading} if run.sensor.integral else {}),
             "share": run.yardsticks.share,
             "notes": run.remarks,
+            "terms": run.terms,
             **({"limits": [row.as_json(unit) for row in run.judged]} if run.judged else {}),
         }
         for name, run in runs.items()

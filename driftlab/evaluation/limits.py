@@ -41,8 +41,12 @@ NAMES = {
     "swing": "swing of the map",
     "noise": "white noise",
     "hysteresis": "hysteresis",
+    "scale": "error of the scale factor",
+    "misalignment": "misalignment",
 }
+OF_M = {"scale": BiasUnit("1", "ppm"), "misalignment": BiasUnit("rad", "mrad")}
 MEASURED_BY = {"bias_instability": "driftlab allan", "noise": "driftlab allan", "coast": "driftlab run"}
+MEASURED_BY |= dict.fromkeys(("scale", "misalignment"), "driftlab fit-map --terms")
 MEASURED_BY |= dict.fromkeys(("residual", "swing", "hysteresis"), "driftlab fit-map")
 
 
@@ -90,6 +94,8 @@ class LimitResult:
 
     def unit(self, unit: BiasUnit) -> BiasUnit:
         """Return the unit of the limit, of a sensor whose bias is in `unit`."""
+        if self.name in OF_M:
+            return OF_M[self.name]
         if self.name != "noise":
             return unit
         return BiasUnit(f"{unit.si}/sqrt(Hz)", f"{unit.shown}/sqrt(Hz)")

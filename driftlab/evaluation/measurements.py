@@ -7,7 +7,7 @@ where the unit did not move. It takes 86,400 averages a day, whatever the rate. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from driftlab.noise.allan_model import KEYS
 from driftlab.noise.recording import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
-from fusion_core.contracts import Alignment, FittedMap, Sensor
+from fusion_core.contracts import Alignment, FittedMap, Sensor, TriadMatrix
 from fusion_core.wandering import bounds, contrasts, rows_of
 
 COAST = "10 min"  # the horizon that a limit is about
@@ -32,6 +32,7 @@ MAX_ROWS = 120  # of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
 NOT_SURE = "its kind of map does not say how sure the curve is; take one that does"
+LONGER = "a longer stimulus would decide it, or larger rates"
 WHOLE = "`driftlab allan` measures it over the whole of a recording"
 SHORTEST = 1.0  # s, of an average
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
@@ -39,7 +40,7 @@ Less = Callable[[Mapping[str, Array]], Array]
 
 
 def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
-    """Return residual, swing and hysteresis of a fitted map, from the map and what its record says of the soak.
+    """Return residual, swing and hysteresis of a fitted map, and its terms of M, from the map and its record.
 
     The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
     its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
@@ -62,7 +63,33 @@ def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
         "residual": _residual(fitted, where, lasted),
         "swing": swing,
         "hysteresis": _hysteresis(fitted, lasted, unit),
+        **({} if record.matrix is None else dict(_of_matrix(record.matrix, axes))),
     }
+
+
+def _of_matrix(matrix: TriadMatrix, axes: Sequence[str]) -> Iterator[tuple[str, Measured]]:
+    """Yield the largest error of the scale factor, and misalignment, of each axis over temperature.
+
+    An axis is below a limit where it is at every temperature, with its guard.
+    """
+    T = np.linspace(matrix.T[0], matrix.T[-1], POINTS)
+    M, told = np.abs(matrix.at(T)), np.array(matrix.told).reshape(3, 3)
+    own = np.eye(3, dtype=bool)
+    free = np.triu(np.ones((3, 3), dtype=bool)) if matrix.frame == "sensor" else ~np.zeros((3, 3), dtype=bool)
+    sigma = None if matrix.error is None else matrix.sigma(T).reshape(-1, 3, 3)
+    for name, some in (("scale", own), ("misalignment", ~own & free)):
+        rows = np.any(some, axis=1)
+        names = [axis for axis, row in zip(axes, rows, strict=True) if row]
+        values = np.max(np.where(some, M, 0.0), axis=(0, 2))[rows]
+        measured = Measured(values, names, stands_on=f"M(T), {T[0]:.4g} to {T[-1]:.4g} °C", otherwise=LONGER)
+        if untold := [axes[i] + axes[j] for i, j in np.argwhere(some & ~told)]:
+            measured = replace(measured, missing=f"the stimulus does not tell {', '.join(untold)}")
+        elif sigma is not None:
+            low, high = (np.where(some, M + side * SIDE * sigma, 0.0) for side in (-1, 1))
+            at = np.argmax(np.where(some, M, 0.0).max(axis=2), axis=0)[rows]
+            lows = low.max(axis=2)[at, np.flatnonzero(rows)]
+            measured = replace(measured, low=lows, high=np.max(high, axis=(0, 2))[rows])
+        yield name, measured
 
 
 def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:

@@ -1,4 +1,4 @@
-"""Uncertainty budget of the bias over temperature, after the GUM (JCGM 100:2008).
+"""Uncertainty budgets of bias, scale factor and misalignment over temperature, after the GUM (JCGM 100:2008).
 
 The measurand is the bias b(T) of a unit at rest where its thermometer reads T, in the mean of warming and cooling, with
 the level that it had in the mean over the soak. It is read off the fitted map; its sources are taken for independent::
@@ -15,12 +15,19 @@ the level that it had in the mean over the soak. It is read off the fitted map; 
 - *placements* (A): the level of a triad in a field of known length (`driftlab.soak.placements`);
 - *thermometer* (B): |db/dT| U_T / 2 for a thermometer whose expanded uncertainty U_T is given.
 
+A term of M(T) of a triad has the uncertainty of its fit to a stimulus, by its parts where the fit is at hand:
+
+- *equations* (A): noise of the segments or placements, and the walk of the bias between them;
+- *choice* (A): a change over temperature that did not show, and the walks that are likely;
+- *input* (B): the size of the input, as of gravity; the same in all scale factors;
+- *stimulus* (A): all of these together, as the map's file keeps them.
+
 Source: JCGM 100:2008, 4.2, 4.3, 5.1.2, 6.2 and G.3. N temperatures, d axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +36,13 @@ from driftlab.evaluation.limits import SIDE, Measured
 from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap
+from fusion_core.contracts import FittedMap, TriadMatrix
 
 K = 2.0  # coverage factor
 COVERED = 0.9545  # of a normal law within K deviations
 MIN_RECORDINGS = 3  # of two, a deviation is known to a factor of ten
-MAX_ROWS = 9  # temperatures of a table
+MAX_ROWS, MATRIX_ROWS = 9, 5  # temperatures of a table, of bias and of M
+PAIRS, BELOW = tuple(i + j for i in "xyz" for j in "xyz"), ("yx", "zx", "zy")  # of M, and of it zero in its own frame
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0)  # K, between them
 NEAR = 0.4  # of a step: a round temperature so near to an end of the domain is left out
 
@@ -49,11 +57,11 @@ class UncertaintySource:
 
 
 @dataclass(frozen=True, eq=False)
-class BiasBudget:
-    """The bias at temperatures, its sources of uncertainty, and those that it does not know."""
+class UncertaintyBudget:
+    """Quantities at temperatures, their sources of uncertainty, and those that are not known."""
 
     T: Array  # (N,), degC
-    bias: Array  # (N, d), SI
+    values: Array  # (N, d), SI: the bias of each axis, or the terms of M
     sources: Sequence[UncertaintySource]  # empty where the uncertainty is not known
     missing: Sequence[str] = ()  # what U does not cover, in sentences
 
@@ -74,7 +82,7 @@ def bias_budget(
     thermometer: float | None = None,
     soak: SoakSummary | None = None,
     placements: Placements | None = None,
-) -> BiasBudget:
+) -> UncertaintyBudget:
     """Return the budget of a fitted map at round temperatures of its domain.
 
     `thermometer` is the expanded uncertainty of the thermometer, K. What a map's file does not keep, the power-ups of
@@ -83,7 +91,7 @@ def bias_budget(
     T, record = temperatures(*fitted.domain), fitted.record
     bias, shape = fitted.bias(T), (len(T), record.d)
     if record.error is None:
-        return BiasBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
+        return UncertaintyBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
     sources, missing = [UncertaintySource("curve", "A", fitted.sigma(T))], []
     left = np.zeros(record.d) if record.residual is None else np.asarray(record.residual)
     if record.samples and record.residual is not None:
@@ -108,14 +116,46 @@ def bias_budget(
         missing.append("the error of the thermometer: T is its reading")
     else:
         sources.append(UncertaintySource("thermometer", "B", np.abs(fitted.slope(T)) * thermometer / K))
-    return BiasBudget(T, bias, sources, missing)
+    return UncertaintyBudget(T, bias, sources, missing)
 
 
-def temperatures(low: float, high: float) -> Array:
-    """Return both ends of a domain and round temperatures between, degC; MAX_ROWS at most."""
+def matrix_budget(
+    matrix: TriadMatrix,
+    *,
+    thermometer: float | None = None,
+    parts: Callable[[Array], Mapping[str, Array]] | None = None,
+) -> UncertaintyBudget:
+    """Return the budget of scale factor and misalignment at a few round temperatures, M row by row.
+
+    `thermometer` is the expanded uncertainty of the thermometer, K; `parts` returns the deviations (N, 9) at T (N,) of
+    a fit that is at hand, by source.
+    """
+    low, high = matrix.T[0], matrix.T[-1]
+    T, h = temperatures(low, high, MATRIX_ROWS), 1e-3 * (high - low)
+    terms = matrix.terms(T)
+    if matrix.error is None:
+        return UncertaintyBudget(T, terms, [], ["scale factor and misalignment: the map was imported without"])
+    each = {"stimulus": matrix.sigma(T)} if parts is None else parts(T)
+    sources = [UncertaintySource(name, "B" if name == "input" else "A", u) for name, u in each.items() if np.any(u)]
+    if thermometer is not None:
+        ends = np.clip([T - h, T + h], low, high)
+        slope = (matrix.terms(ends[1]) - matrix.terms(ends[0])) / (ends[1] - ends[0])[:, None]
+        sources.append(UncertaintySource("thermometer", "B", np.abs(slope) * thermometer / K))
+    untold = [f"of {pair}" for pair, known in zip(PAIRS, matrix.told, strict=True) if not known]
+    missing = ["axes and rates of the stimulus, which are taken as exact"] if matrix.frame == "given" else []
+    if matrix.frame == "sensor":
+        untold = [one for one in untold if one[-2:] not in BELOW]
+        missing = ["the angles between the triad's own frame and the case"]
+    if untold:
+        missing.append(f"terms {', '.join(untold)}, which the stimulus does not tell")
+    return UncertaintyBudget(T, terms, sources, missing)
+
+
+def temperatures(low: float, high: float, most: int = MAX_ROWS) -> Array:
+    """Return both ends of a domain and round temperatures between, degC; `most` at most."""
     for step in STEPS:
         between = np.arange(np.ceil((low + NEAR * step) / step), np.floor((high - NEAR * step) / step) + 1) * step + 0.0
-        if len(between) <= MAX_ROWS - 2:
+        if len(between) <= most - 2:
             break
     return np.concatenate([[low], between, [high]])
 

@@ -22,7 +22,7 @@ from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import of_thermometer, soak_temperatures
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import FittedMap, Sensor, ThermalMap
+from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
@@ -131,6 +131,31 @@ def axes_of(fitted: FittedMap) -> tuple[str, ...]:
     return fitted.record.axes or tuple("xyz"[: fitted.record.d].ljust(fitted.record.d, "?"))
 
 
+def term_lines(matrix: TriadMatrix, axes: Sequence[str]) -> list[str]:
+    """Return each term of M that is known: its value in the middle, in SI too, its range, and its deviation there."""
+    ends = matrix.T[0], matrix.T[-1]
+    T = np.linspace(*ends, 201)
+    terms, sigma = matrix.terms(T), matrix.sigma(T)
+    over = f"over {ends[0]:.1f} to {ends[1]:.1f} °C"
+    lines = []
+    for k in np.flatnonzero(matrix.told):
+        i, j = divmod(int(k), len(axes))
+        name, shown, si, spec = ("scale", "ppm", "", "+.0f") if i == j else ("misalignment", "mrad", " rad", "+.3f")
+        factor, value, of = 1e6 if i == j else 1e3, terms[100, k], axes[i] if i == j else axes[i] + axes[j]
+        low, high = np.min(terms[:, k]) * factor, np.max(terms[:, k]) * factor
+        known = (
+            "sigma not known" if np.isnan(sigma[0, k]) else f"sigma up to {np.max(sigma[:, k]) * factor:.2g} {shown}"
+        )
+        lines.append(
+            f"{name} {of} {value * factor:{spec}} {shown} = {value:.4g}{si} at {T[100]:.1f} °C, {low:{spec}} to "
+            f"{high:{spec}} {shown} {over}, {known}"
+        )
+    free = np.triu(np.ones((3, 3))) if matrix.frame == "sensor" else np.ones((3, 3))
+    if untold := [axes[i] + axes[j] for i, j in np.argwhere(free * ~np.reshape(matrix.told, (3, 3)))]:
+        lines.append(f"terms of M that are not known, and taken as zero: {', '.join(untold)}")
+    return lines
+
+
 def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     """Return a map's file in sentences: its sensor, its deviation, temperatures without a sample.
 
@@ -141,7 +166,7 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} °C"]
     if record.matrix is not None:
-        lines.append(f"map {record.kind}: with scale factor and misalignment, {sum(record.matrix.told)} terms of M(T)")
+        lines += [f"map {record.kind}: {line}" for line in term_lines(record.matrix, axes_of(fitted))]
     if record.sensitivity is not None:
         told = sum(record.sensitivity.told)
         lines.append(f"map {record.kind}: with g-sensitivity, {told} terms of G(T), taken off where accel is recorded")

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,31 +21,37 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import CertificateTexts, Config
-from driftlab.evaluation.limits import RULE, LimitResult, Measured, outcome, verdict
-from driftlab.evaluation.uncertainty import BiasBudget, K, bias_budget, expanded
+from driftlab.evaluation.limits import OF_M, RULE, LimitResult, Measured, outcome, verdict
+from driftlab.evaluation.uncertainty import K, UncertaintyBudget, bias_budget, expanded, matrix_budget
 from driftlab.maps.fit import axes_of
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from driftlab.storage.json import plain, text_of
+from driftlab.triad.fit import TriadFit
+from driftlab.triad.model import AXES, PAIRS
 from driftlab.units import BiasUnit, default_unit, duration, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 
-SUFFIXES = ("html", "json")  # of its files
+FILES = ("certificate.html", "certificate.json")
 LARGE = {"rad/s": (np.deg2rad(1.0), "deg/s"), "m/s^2": (9.80665, "m/s^2")}  # beyond which another unit is the usual
 USUAL = {"rad/s": "deg/h", "m/s^2": "mg"}
 MAX_RECORDINGS = 3  # that are listed on the sheet; of more it has one hash of all
 MAX_DECIMALS = 6  # of a number without a power of ten
 EARTH = 7.292115e-5  # rad/s
 SOURCES = {
-    "curve": "noise and walk of the soak in the curve, smoothing, misfit",
+    "curve": "noise and walk of the recording in the curve, smoothing, misfit",
     "mean": "noise of the mean level, s / √n",
     "memory": "hysteresis or lag, half of warming less cooling",
     "placements": "level, by the placements",
     "power-ups": "level from one power-up to another",
     "thermometer": "thermometer, slope times its uncertainty",
+    "equations": "noise, walk of the bias",
+    "choice": "choice of curve and walk",
+    "input": "size of the input",
+    "stimulus": "fit to the stimulus",
 }
 NAMES = {
     "swing": "swing over temperature, as found",
@@ -96,9 +102,12 @@ def trade_unit(si: str, largest: float, unit: BiasUnit) -> BiasUnit:
     return BiasUnit(si, large if largest >= limit else USUAL[si])
 
 
-def statements(values: Array, widths: Array, unit: BiasUnit) -> list[str]:
-    """Return values (d,), each with its expanded uncertainty (d,), as the sheet has them; NaN: it is not known."""
-    pairs = (stated(float(v) * unit.factor, float(w) * unit.factor) for v, w in zip(values, widths, strict=True))
+def statements(values: Array, widths: Array, factors: Array) -> list[str]:
+    """Return values (d,) times factors, each with its expanded uncertainty (d,), as the sheet has them.
+
+    NaN: it is not known.
+    """
+    pairs = (stated(float(v), float(w)) for v, w in zip(values * factors, widths * factors, strict=True))
     return [f"{value} ± {width}" if width != "not known" else f"{value}, U not known" for value, width in pairs]
 
 
@@ -129,6 +138,10 @@ class Certificate:
         The unit's name in a fleet.
     remarks : sequence of str
         What one should know of it besides.
+    fit : TriadFit, optional
+        Of scale factor and misalignment, where it is at hand.
+    levelled : bool
+        Whether the stimulus tells the level of the bias.
     """
 
     command: str
@@ -143,6 +156,8 @@ class Certificate:
     domain: tuple[float, float] | None = None
     name: str = ""
     remarks: Sequence[str] = ()
+    fit: TriadFit | None = None
+    levelled: bool = False
 
     @property
     def texts(self) -> CertificateTexts:
@@ -157,7 +172,7 @@ class Certificate:
         return list(self.config.filter.tracked.axes) if self.config.filter is not None else []
 
     @cached_property
-    def budget(self) -> BiasBudget | None:
+    def budget(self) -> UncertaintyBudget | None:
         """The bias over temperature with its budget; None without a map."""
         if self.fitted is None:
             return None
@@ -196,7 +211,8 @@ class Certificate:
             "valid_degC": _within(domain, self.domain) if self.command == "run" else domain or self.domain,
             "coverage_factor": K,
             "bias": self._bias(),
-            "figures": [self._figure(name, one) for name, one in self.measured.items()],
+            "matrix": self._matrix(),
+            "figures": [self._figure(name, one) for name, one in self.measured.items() if name not in OF_M],
             "limits": [row.as_json(self.unit(row.limit)) for row in self.judged],
             "verdict": verdict(self.judged) or None,
             "rule": RULE if self.judged else None,
@@ -212,10 +228,12 @@ class Certificate:
 
     def page(self) -> str:
         """Return the certificate as a page of one sheet."""
+        matrix = self.content["matrix"]
         return page(
             "certificate",
             content=self.content,
             texts=TEXTS,
+            sensed=[k for k, one in enumerate(matrix["terms"]) if one["free"]] if matrix else [],
             limits=[row.cells(self.unit(row.limit)) for row in self.judged],
             outcome=outcome(verdict(self.judged)),
             listed=MAX_RECORDINGS,
@@ -232,6 +250,7 @@ class Certificate:
         own = (one for one in sheet.maps if fitted is not None and one["channel"] == fitted.record.channel)
         lines = "".join(f"{one.get('sha256', '')}  {one['name']}\n" for one in recordings)
         dated = sheet.date if sheet.dated != "page" else None
+        stimulus = None if self.fit is None or self.config.stimulus is None else self.config.stimulus.kind
         return {
             "performed": self.texts.performed or dated,
             "seconds": self.seconds or None,
@@ -244,6 +263,8 @@ class Certificate:
             "kind": None if fitted is None else fitted.record.kind,
             "samples": None if fitted is None else fitted.record.samples,
             "reference": self._reference(),
+            "stimulus": stimulus,
+            "placements": None if self.fit is None else len(self.fit.stimulus.T),
             "plugins": sheet.plugins,
             "versions": sheet.versions,
         }
@@ -264,30 +285,48 @@ class Certificate:
         sensors = () if self.config.filter is None else self.config.filter.sensors
         return self.config.latitude is not None and any(sensor.unit == "m/s^2" for sensor in sensors)
 
+    @property
+    def _turned(self) -> bool:
+        """True if the axis of a turntable points up at a known latitude: the Earth rate is known, or averages out."""
+        stimulus = self.config.stimulus
+        of_table = stimulus is not None and stimulus.kind == "rate_table"
+        return self.levelled and of_table and self.config.latitude is not None
+
     def _bias(self) -> dict[str, Any] | None:
         """Return the bias over temperature with its expanded uncertainty, and the budget where that is largest."""
         budget = self.budget
         if budget is None:
             return None
-        U, unit = budget.U, self.unit(budget.bias)
-        widths, factor = np.full_like(budget.bias, np.nan) if U is None else U, unit.factor
-        rows = [
-            {"temperature_degC": T, "value": bias, "U": width, "shown": statements(bias, width, unit)}
-            for T, bias, width in zip(budget.T, budget.bias, widths, strict=True)
-        ]
-        table = {"shown_unit": unit.shown, "rows": rows}
-        if U is None or budget.u is None:
-            return {**table, "budget": None}
-        worst = np.argmax(U, axis=0)
-        at = worst, np.arange(len(worst))
-        entries = [
-            {"source": one.name, "of": SOURCES[one.name], "type": one.kind, "u": one.u[at],
-             "shown": [two_digits(value * factor) for value in one.u[at]]}
-            for one in budget.sources
+        unit = self.unit(budget.values)
+        d = budget.values.shape[1]
+        return {"shown_unit": unit.shown, **_table(budget, np.full(d, unit.factor))}
+
+    @cached_property
+    def matrix_budget(self) -> UncertaintyBudget | None:
+        """Scale factor and misalignment over temperature with their budget; None of a map without."""
+        matrix = None if self.fitted is None else self.fitted.record.matrix
+        if matrix is None:
+            return None
+        fit, thermometer = self.fit, self.texts.temperature_uncertainty
+        return matrix_budget(matrix, thermometer=thermometer, parts=None if fit is None else partial(_of_matrix, fit))
+
+    def _matrix(self) -> dict[str, Any] | None:
+        """Return the terms of M over temperature with their expanded uncertainty, and the budget of each."""
+        budget = self.matrix_budget
+        if budget is None or self.fitted is None or self.fitted.record.matrix is None:
+            return None
+        matrix, axes = self.fitted.record.matrix, self.axes
+        pairs = [(i, j) for i in range(len(axes)) for j in range(len(axes))]
+        units = [OF_M["scale" if i == j else "misalignment"] for i, j in pairs]
+        terms = [
+            {"term": f"{axes[i]}{axes[j]}", "of": "scale" if i == j else "misalignment", "shown_unit": unit.shown,
+             "told": matrix.told[k], "free": matrix.frame == "given" or i <= j}
+            for k, ((i, j), unit) in enumerate(zip(pairs, units, strict=True))
         ]  # fmt: skip
-        texts = {f"shown_{name}": [two_digits(v * factor) for v in x[at]] for name, x in (("u", budget.u), ("U", U))}
-        total = {"u": budget.u[at], "U": U[at], **texts}
-        return {**table, "budget": {"at_degC": budget.T[worst], "sources": entries, **total}}
+        table = _table(budget, np.array([unit.factor for unit in units]))
+        for row in table["rows"]:
+            row["shown"] = [text if told else "not told" for text, told in zip(row["shown"], matrix.told, strict=True)]
+        return {"frame": matrix.frame, "terms": terms, **table}
 
     def _figure(self, name: str, measured: Measured) -> dict[str, Any]:
         """Return a measured quantity, or why there is none."""
@@ -298,7 +337,7 @@ class Certificate:
         highs = np.where(hidden, nothing if measured.high is None else measured.high, np.nan)
         widths = nothing if widths is None or why else np.where(hidden, np.nan, widths)
         unit = self.unit(values, highs)
-        texts = [f"not measured: {why}"] if why else statements(values, widths, unit)
+        texts = [f"not measured: {why}"] if why else statements(values, widths, np.full(len(values), unit.factor))
         if not why:
             bounds = [f"≤ {two_digits(v * unit.factor)}" if np.isfinite(v) else "not known" for v in highs]
             texts = [bound if below else text for below, bound, text in zip(hidden, bounds, texts, strict=True)]
@@ -312,11 +351,12 @@ class Certificate:
     def _missing(self) -> Iterator[str]:
         """Yield the sources that the uncertainties do not cover, in words."""
         yield from () if self.budget is None else self.budget.missing
-        if self.si == "rad/s" and not (self._vertical and self.config.heading is not None):
+        yield from () if self.matrix_budget is None else self.matrix_budget.missing
+        if self.si == "rad/s" and not self._turned and not (self._vertical and self.config.heading is not None):
             part = math.cos(self.config.latitude or 0.0) if self._vertical else 1.0
             which = "horizontal part of the " if self._vertical else ""
             yield f"the {which}Earth rate, which is in the bias: up to {self._size(EARTH * part)} an axis"
-        if self.si == "m/s^2" and self.fitted is not None and self.placements is None:
+        if self.si == "m/s^2" and self.fitted is not None and self.placements is None and not self.levelled:
             yield "the level: the map's file does not keep what the placements say of it"
         sensor = None if self.config.filter is None else self.config.filter.tracked
         walk = None if sensor is None else getattr(sensor.bias, "walk", None)
@@ -327,6 +367,36 @@ class Certificate:
     def _size(self, value: float) -> str:
         unit = self.unit(value)
         return f"{two_digits(value * unit.factor)} {unit.shown}"
+
+
+def _of_matrix(fit: TriadFit, T: Array) -> dict[str, Array]:
+    """Return the deviations (N, 9) of M at T (N,) by source."""
+    M = slice(len(AXES), len(AXES) + len(PAIRS))
+    return {name: sigma[:, M] for name, sigma in fit.parts(T).items()}
+
+
+def _table(budget: UncertaintyBudget, factors: Array) -> dict[str, Any]:
+    """Return quantities over temperature, and the budget of each where U is largest, with texts by the factors (d,)."""
+    U = budget.U
+    widths = np.full_like(budget.values, np.nan) if U is None else U
+    rows = [
+        {"temperature_degC": T, "value": value, "U": width, "shown": statements(value, width, factors)}
+        for T, value, width in zip(budget.T, budget.values, widths, strict=True)
+    ]
+    if U is None or budget.u is None:
+        return {"rows": rows, "budget": None}
+
+    def texts(x: Array) -> list[str]:
+        return [two_digits(value) for value in x * factors]
+
+    worst = np.argmax(U, axis=0)
+    at = worst, np.arange(len(worst))
+    entries = [
+        {"source": one.name, "of": SOURCES[one.name], "type": one.kind, "u": one.u[at], "shown": texts(one.u[at])}
+        for one in budget.sources
+    ]
+    total = {"u": budget.u[at], "U": U[at], "shown_u": texts(budget.u[at]), "shown_U": texts(U[at])}
+    return {"rows": rows, "budget": {"at_degC": budget.T[worst], "sources": entries, **total}}
 
 
 def _within(first: tuple[float, float] | None, second: tuple[float, float] | None) -> tuple[float, float] | None:

@@ -1,20 +1,29 @@
-"""Terms of a triad over temperature, bias to g-sensitivity: sentences, a table, a chart, JSON."""
+"""Terms of a triad over temperature, bias to g-sensitivity: sentences, a table, charts, a page, JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from driftlab.reports.charts import Chart, Line, axis_panels, band
+from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, band
+from driftlab.reports.pages import page
+from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.fit import TriadFit
-from driftlab.triad.model import AXES, SCALE, TERMS
-from driftlab.units import BiasUnit
+from driftlab.triad.model import AXES, BIAS, GROUPS, NARROW, SCALE, TERMS
+from driftlab.units import RATE, BiasUnit, number
 from fusion_core.chunk import Array
 
 GRAVITY = 9.80665  # m/s^2, in a g
+CROSS = GROUPS["misalignment"]
+TEMPERATURE = "temperature [°C]"
+MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the error, and where the errors are
+    "rad/s": ("a turn of 360 deg", 360.0, "deg", "about its axis", "about another"),
+    "m/s^2": ("a change of velocity by 10 m/s", 1e4, "mm/s", "along it", "across it"),
+}
+HOURLY = {"rad/s": (3600 * 180 / np.pi, "deg an hour"), "m/s^2": (1e3, "mm/s a second")}
 
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
@@ -61,6 +70,79 @@ def frame_line(fit: TriadFit) -> str:
     return "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)"
 
 
+def result(fit: TriadFit, channel: str) -> str:
+    """Return the number of terms that are known, and how well, in a sentence."""
+    M, (low, high) = [*SCALE, *CROSS], fit.domain
+    sigma = np.max(fit.sigma(fit.grid), axis=0)
+    told, free = int(np.sum(fit.told[M])), int(np.sum(fit.free[M]))
+    parts = [f"{channel}: {told} of {free} terms of scale factor and misalignment are known"]
+    for name, some in (("scale factors", SCALE), ("misalignments", CROSS)):
+        known = [j for j in some if fit.told[j]]
+        if known:
+            shown, factor = unit_of(known[0], RATE)
+            parts.append(f"{name} to {np.max(sigma[known]) * factor:.2g} {shown}")
+    over = f"from {low:.1f} to {high:.1f} °C" if high - low >= NARROW else f"at {(low + high) / 2:.1f} °C"
+    return f"{', '.join(parts)} (one sigma, where it is largest {over})" if told else parts[0]
+
+
+def use(fit: TriadFit, unit: BiasUnit) -> str:
+    """Return the error of an angle after a turn, or of a velocity after a change, by the terms, in sentences.
+
+    A motion along axis j is off by M_ij times its size about axis i; the worst axis and temperature count.
+    """
+    if unit.si not in MOTIONS:
+        return ""
+    motion, size, shown, about, others = MOTIONS[unit.si]
+    terms, sigma = np.max(np.abs(fit.terms.at(fit.grid)), axis=0), np.max(fit.sigma(fit.grid), axis=0)
+    scale, cross = list(SCALE), [j for j in CROSS if fit.free[j]]
+    along, across = (2 * size * float(np.max(sigma[some], initial=0.0)) for some in (scale, cross))
+    alone = size * float(np.max(terms[scale + cross]))
+    text = f"{motion} is right within {number(along)} {shown} {about}"
+    text += f" and {number(across)} {shown} {others}" if cross else ""
+    text += f" (two sigma); with the bias alone taken off, up to {number(alone)} {shown} of it were wrong."
+    if np.any(fit.free & ~fit.told):
+        text += " Terms that are not told count as 1 % or 10 mrad."
+    hour, hourly = HOURLY[unit.si]
+    level = 2 * float(np.max(sigma[list(BIAS)])) * hour
+    return f"{text} The bias adds up to {number(level)} {hourly} (two sigma), and what it wanders afterwards."
+
+
+def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
+    """Return the charts of scale factor and misalignment, of the bias, and of the residuals."""
+    T = fit.grid
+    values, sigma = fit.terms.at(T) * unit.factor, fit.sigma(T) * unit.factor
+
+    def lines(k: int) -> Iterator[Line]:
+        yield band(T, values[:, k], 2 * sigma[:, k], "bias")
+
+    bias = Chart(axis_panels(tuple(AXES), lines, "bias", unit.shown), TEMPERATURE, "Bias", "Bands: two sigma.")
+    return [chart(fit, unit), bias, _residual_chart(fit, unit)]
+
+
+def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
+    """Return the residuals of the equations, over the number of their segment or placement."""
+    e = fit.stimulus.equations(fit.terms.at(fit.stimulus.T))
+    panels, last = [], None
+    for g in np.unique(e.group):
+        left, T, t = (values[e.group == g] for values in (e.left, e.T, e.t))
+        a_place = int(np.argmax(np.append(t[1:] != t[:-1], True))) + 1  # equations of one moment
+        place = np.arange(1, len(left) // a_place + 1) + 0.5 * g  # turns are between placements
+        name, shown, factor = (
+            ("residual", unit.shown, unit.factor) if g == 0 else ("direction after a turn", "mrad", 1e3)
+        )
+        names = AXES if a_place == len(AXES) else [name] * a_place
+        points = tuple(
+            Line(place, left[k::a_place] * factor, names[k], f"series:{k}", style="points") for k in range(a_place)
+        )
+        noise = fit.noise[g] * factor
+        panels.append(Panel(points, f"{name} [{shown}]", rules=(Rule(-noise, ""), Rule(noise, f"noise {noise:.3g}"))))
+        last = last or (place, T[::a_place])
+    assert last is not None, "a stimulus has equations"
+    warm = Panel((Line(*last, "temperature", "temperature"),), "temperature [°C]", height=0.7)
+    caption = "What the terms leave of each segment or placement, in their order; the walk of the bias is in it."
+    return Chart((*panels, warm), "segment or placement", "Residuals", caption)
+
+
 def chart(fit: TriadFit, unit: BiasUnit) -> Chart:
     """Return, of each axis, its scale factor and its misalignments with their bands."""
     T = fit.grid
@@ -71,10 +153,27 @@ def chart(fit: TriadFit, unit: BiasUnit) -> Chart:
             at = 3 + 3 * k + j
             if fit.free[at]:
                 what = "scale" if j == k else f"misalignment to {other}"
-                yield band(T, values[:, at] * 1e3, 2 * sigma[:, at] * 1e3, what, f"series:{j}")
+                yield band(T, values[:, at] * 1e3, 2 * sigma[:, at] * 1e3, what, f"series:{3 if j == k else j}")
 
     panels = axis_panels(tuple(AXES), lines, "scale (0.1 %) and misalignment", "mrad")
-    return Chart(panels, "temperature [°C]", "Scale factor and misalignment", "bands: two sigma")
+    return Chart(panels, TEMPERATURE, "Scale factor and misalignment", "Bands: two sigma.")
+
+
+def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Sequence[str], sheet: Sheet) -> str:
+    """Return the page of a fit."""
+    return page(
+        "triad",
+        title=f"Bias, scale factor and misalignment of the {channel}",
+        lead=lead,
+        sheet=sheet,
+        result=result(fit, channel),
+        use=use(fit, unit),
+        untold=fit.verdict(),
+        terms=table(fit, unit),
+        frame=frame_line(fit),
+        charts=charts(fit, unit),
+        notes=notes,
+    )
 
 
 def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:

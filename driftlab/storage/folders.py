@@ -318,7 +318,7 @@ FILES = {  # of each command; the first says that all are there
     "run": ("summary.json", "estimates.h5", "report.html", "certificate.html", "certificate.json"),
     "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
     "compare": ("summary.json", "report.html"),
-    "plan": ("plan.json", "setpoints.csv", "report.html"),
+    "plan": ("plan.json", "setpoints.csv", "report.html", "segments.csv"),
     "vehicle": ("vehicle.json", "*.map.json", "vehicle.params", "vehicle.parm", "report.html"),
     "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
 }

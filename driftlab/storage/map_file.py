@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from driftlab.storage.folders import check_writable, refusals
-from driftlab.storage.ownership import check_own, put, seal, seal_of
+from driftlab.storage.ownership import check_own, put, seal, seal_of, why_not_own
 from driftlab.storage.system import sync
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError
@@ -38,6 +38,31 @@ def check_file(path: Path, command: str, subject: str, remedy: str) -> None:
     with refusals(str(path), "name a folder that can be"):
         folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
+
+
+def beside(path: Path, folder: Path | None, names: Iterable[str]) -> list[Path]:
+    """Return the places of files of a map: in the folder, or beside the map under its name."""
+    return [path.with_name(f"{path.stem}.{name}") if folder is None else folder / name for name in names]
+
+
+def check_all(path: Path, folder: Path | None, read: Collection[Path], names: Sequence[str], command: str) -> None:
+    """See that a map's file and those beside it may be written; raises as `check_place`."""
+    check_place(path, read, command)
+    for name in beside(path, folder, names):
+        check_file(name, command, str(name), "name another folder with --report")
+
+
+def write_beside(
+    path: Path, folder: Path | None, texts: Mapping[str, str], command: str, stale: Sequence[str] = ()
+) -> list[Path]:
+    """Write texts by the names of their files, and delete those that an earlier map left; return the places."""
+    places = beside(path, folder, texts)
+    for place, text in zip(places, texts.values(), strict=True):
+        write_text(place, text, command)
+    for place in beside(path, folder, [name for name in stale if name not in texts]):
+        if place.is_file() and not why_not_own(place, command):
+            place.unlink()
+    return places
 
 
 def write_text(path: Path, text: str, command: str) -> None:

@@ -7,7 +7,7 @@ Gauss-Newton steps on penalised least squares, with the noise that the residuals
 
 s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes.
 
-The curve of each term is chosen forward, by the largest fall of::
+The curve of each term is chosen step by step, by the largest fall of::
 
     m log(residual) + p (log m + 2 log q)
 
@@ -60,7 +60,8 @@ PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
-AHEAD = 2  # curves that are looked at beyond that of a term
+SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
+AHEAD = 2  # curves that are looked at beyond that of a term, to either side
 TINY = 1e-30
 
 
@@ -86,6 +87,8 @@ class TriadFit:
         Curves of the error, and the root of the covariance of their coefficients.
     noise : tuple of float
         Deviation of an equation in each group.
+    columns : tuple of int
+        How many of the columns of the root are of each of SOURCES.
     """
 
     stimulus: TriadInput
@@ -98,6 +101,7 @@ class TriadFit:
     design: Sequence[TermCurve]
     root: Array
     noise: tuple[float, ...]
+    columns: tuple[int, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -122,6 +126,11 @@ class TriadFit:
     def sigma(self, T: Array) -> Array:
         """Return the deviation (N, q) of the terms at T (N,)."""
         return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    def parts(self, T: Array) -> dict[str, Array]:
+        """Return the deviation (N, q) of the terms at T (N,) by source."""
+        parts = np.split(self.modes(T), np.cumsum(self.columns)[:-1])
+        return {name: np.sqrt(np.sum(part**2, axis=0)) for name, part in zip(SOURCES, parts, strict=True)}
 
     def change(self) -> tuple[Array, Array]:
         """Return the change of each term (q,) from the lowest to the highest temperature, and its deviation."""
@@ -426,20 +435,29 @@ class _Search:
             self.chosen[worst], self.x[worst] = 0, np.zeros(1)
 
     def choose(self) -> None:
-        """Give each term the curve that pays for its coefficients."""
-        self.chosen = [0] * len(self.free)
-        best = self._price(self.chosen)
+        """Give each term the curve that pays for its coefficients.
+
+        Where all terms move, one alone hardly lowers the residual of the others, and does not pay; so the search begins
+        with constants, and again with the curve that is best for all.
+        """
+        alike = [[k * int(told) for told in self.told] for k in range(len(self.curves))]
+        _, self.chosen = min(map(self._cheapest, (alike[0], min(alike, key=self._price))))
+        N, A = self._system(self._curves(self.chosen), self.told)
+        self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
+
+    def _cheapest(self, chosen: list[int]) -> tuple[float, list[int]]:
+        """Return the price and the curves where no other curve of one term is cheaper, from some curves on."""
+        best = self._price(chosen)
         while True:
             trials = []
             for j in np.flatnonzero(self.told):
-                for k in range(self.chosen[j] + 1, min(self.chosen[j] + 1 + AHEAD, len(self.curves))):
-                    tried = [*self.chosen[:j], k, *self.chosen[j + 1 :]]
+                for k in range(max(chosen[j] - AHEAD, 0), min(chosen[j] + 1 + AHEAD, len(self.curves))):
+                    tried = [*chosen[:j], k, *chosen[j + 1 :]]
                     trials.append((self._price(tried), tried))
-            if not trials or (least := min(trials))[0] >= best:
-                break
-            best, self.chosen = least
-        N, A = self._system(self._curves(self.chosen), self.told)
-        self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
+            least, tried = min(trials, default=(best, chosen))
+            if least >= best:
+                return best, chosen
+            best, chosen = least, tried
 
     def _price(self, chosen: list[int]) -> float:
         curves, m, p = self._curves(chosen), len(self.z), 0.0
@@ -481,10 +499,12 @@ class _Search:
         doubt = others * np.sqrt(share * (s**2 + b**2))
         freedom = max(len(self.z) - len(N) + len(pinned), 3)
         inside = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, doubt]) * np.sqrt(freedom / (freedom - 2))
-        root = np.hstack([inside, self._scatter_over_walks(starts), length])
+        scatter = self._scatter_over_walks(starts)
+        root = np.hstack([inside, scatter, length])
+        columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
-            tuple(self.s.tolist()),
+            tuple(self.s.tolist()), columns,
         )  # fmt: skip
 
     def _scatter_over_walks(self, starts: Array) -> Array:

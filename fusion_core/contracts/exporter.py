@@ -27,6 +27,7 @@ from fusion_core.contracts.calibration import TEMPERATURES, Calibrated, Export
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import line
+from fusion_core.thermal.triad_matrix import TriadMatrix
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class ReadBack:
         The degree of polynomial that holds it.
     notes : tuple of str
         What one should know of it.
+    matrix : TriadMatrix, optional
+        Scale factor and misalignment of a triad, where the target holds some.
     """
 
     channel: str
@@ -56,6 +59,7 @@ class ReadBack:
     bias: Callable[[Array], Array]
     order: int = 3
     notes: tuple[str, ...] = ()
+    matrix: TriadMatrix | None = None
 
 
 class Exporter(Plugin):
@@ -63,11 +67,6 @@ class Exporter(Plugin):
 
     suffix: ClassVar[str] = ""  # of the file; empty where it is a folder
     folder: ClassVar[bool] = False  # whether it writes several files, into a folder
-
-    @property
-    def holds_matrix(self) -> bool:
-        """True where the file has scale factor and misalignment too; `Loss` says then what of them is lost."""
-        return False
 
     @abstractmethod
     def export(self, what: Export, path: Path) -> Loss:
@@ -107,6 +106,47 @@ class Deviation:
 
 
 @dataclass(frozen=True)
+class MatrixLoss:
+    """The error G(T) (I + M(T)) - I of the input over the domain, where the target takes G(T) (reading - bias) for it.
+
+    Attributes
+    ----------
+    scale : Deviation
+        Of its diagonal, parts of one.
+    misalignment : Deviation
+        Of the rest of each row, root of the sum of squares, rad.
+    """
+
+    scale: Deviation
+    misalignment: Deviation
+
+    @classmethod
+    def measured(cls, sensor: Calibrated, gain: Callable[[Array], Array] | None = None) -> Self | None:
+        """Measure it by G(T) (N, 3, 3); without `gain` the target holds nothing of M. None where there is no M."""
+        if sensor.matrix is None:
+            return None
+        T, one = np.linspace(*sensor.fitted.domain, TEMPERATURES), np.eye(3)
+        G = one if gain is None else gain(T)
+        error = G @ (one + sensor.matrix.at(T)) - one
+        across = np.sqrt(np.sum((error * (1 - one)) ** 2, axis=2))
+        return cls(Deviation.of(np.diagonal(error, axis1=1, axis2=2)), Deviation.of(across))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers, in ppm and mrad."""
+        units = {"scale_ppm": (self.scale, 1e6), "misalignment_mrad": (self.misalignment, 1e3)}
+        return {
+            name: {what: (values * factor).tolist() for what, values in vars(deviation).items()}
+            for name, (deviation, factor) in units.items()
+        }
+
+    def __str__(self) -> str:
+        shown = ((self.scale, 1e6, "ppm of scale factor"), (self.misalignment, 1e3, "mrad of misalignment"))
+        return " and ".join(
+            f"{'/'.join(f'{v * factor:.3g}' for v in deviation.largest)} {what}" for deviation, factor, what in shown
+        )
+
+
+@dataclass(frozen=True)
 class SensorLoss:
     """The loss of one sensor.
 
@@ -119,6 +159,8 @@ class SensorLoss:
         Over the warm-up too: how much of it is from what, in words.
     flight : tuple of ((float, float), Deviation), or None
         Over the temperatures (degC) at which the unit is used, where they were given.
+    matrix : MatrixLoss or None
+        Of scale factor and misalignment; None where the map has none.
     """
 
     sensor: Calibrated
@@ -126,6 +168,7 @@ class SensorLoss:
     warm_up: Deviation
     causes: Mapping[str, Deviation] = field(default_factory=dict)
     flight: tuple[tuple[float, float], Deviation] | None = None
+    matrix: MatrixLoss | None = None
 
     @classmethod
     def measured(
@@ -135,6 +178,7 @@ class SensorLoss:
         running: Callable[[Chunk], Array] | None = None,
         causes: Mapping[str, Deviation] | None = None,
         flown: tuple[float, float] | None = None,
+        gain: Callable[[Array], Array] | None = None,
     ) -> Self:
         """Measure the loss.
 
@@ -150,6 +194,8 @@ class SensorLoss:
             What the loss over the warm-up is from.
         flown : (float, float), optional
             Temperatures within the domain at which the unit is used.
+        gain : function of T (N,) -> (N, 3, 3), optional
+            By which the target multiplies readings less their bias; without it scale factor and misalignment are lost.
         """
         domain = sensor.fitted.domain
 
@@ -165,6 +211,7 @@ class SensorLoss:
             Deviation.of(given - seen_in_a_warm_up(sensor).bias(recording)),
             causes or {},
             None if flown is None else (flown, over(flown)),
+            MatrixLoss.measured(sensor, gain),
         )
 
     def lines(self) -> list[str]:
@@ -179,6 +226,8 @@ class SensorLoss:
             f"{self._whose}: loses {self._said(self.warm_up)} over {warm_up}",
             *(f"{self._whose}: of that, {what}: {self._said(deviation)}" for what, deviation in self.causes.items()),
         ]
+        if self.matrix is not None:
+            lines.append(f"{self._whose}: loses {self.matrix} at most over {low:.4g} to {high:.4g} degC")
         residual = self.residual
         if residual is not None:
             lines.append(f"{self._whose}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
@@ -220,6 +269,7 @@ class SensorLoss:
             "warm_up": {"duration_s": HOUR, "time_constant_s": RISE, **in_shown_unit(self.warm_up)},
             "flight": None if self.flight is None else {"range": list(self.flight[0]), **in_shown_unit(self.flight[1])},
             "causes": {what: in_shown_unit(deviation) for what, deviation in self.causes.items()},
+            **({} if self.matrix is None else {"matrix": self.matrix.as_json()}),
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
         }
 

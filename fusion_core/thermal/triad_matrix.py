@@ -42,8 +42,9 @@ class MatrixCurve(Frozen):
         The curve of each term.
     told : (9,) bools
         Whether the stimulus tells a term; one that it does not is zero.
-    error : CurveError
+    error : CurveError, optional
         Of the 9 terms, with how their errors go together. Its modes are those of the error of the bias, one by one.
+        None of a matrix that was imported: not known.
     """
 
     T: tuple[FiniteFloat, ...]
@@ -51,7 +52,7 @@ class MatrixCurve(Frozen):
     slopes: Rows
     kinds: tuple[Plain, ...]
     told: tuple[bool, ...]
-    error: CurveError
+    error: CurveError | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -60,7 +61,7 @@ class MatrixCurve(Frozen):
             raise ValueError("the temperatures of the matrix do not rise")
         if np.shape(self.values) != shape or np.shape(self.slopes) != shape:
             raise ValueError(f"values and slopes of the matrix are not of the shape {shape}")
-        if not len(self.kinds) == len(self.told) == len(self.error.bend) == TERMS:
+        if {len(self.kinds), len(self.told), len(self.error.bend) if self.error else TERMS} != {TERMS}:
             raise ValueError(f"kinds, told and error of the matrix are not of its {TERMS} terms")
         return self
 
@@ -83,8 +84,8 @@ class MatrixCurve(Frozen):
         return self.terms(T).reshape(-1, 3, 3)
 
     def sigma(self, T: Array) -> Array:
-        """Return the standard deviation (N, 9) of the terms at T (N,) degC."""
-        return np.asarray(np.sqrt(self.error.variance(T)))
+        """Return the standard deviation (N, 9) of the terms at T (N,) degC; NaN where it is not known."""
+        return np.full((len(T), TERMS), np.nan) if self.error is None else np.asarray(np.sqrt(self.error.variance(T)))
 
 
 class TriadMatrix(MatrixCurve):

@@ -7,6 +7,7 @@ is left as it is unless `accel_offsets` is set: six placements know it, one does
 
     p(t) = (c1 + (c2 + c3 t) t) t 1e-6
     v <- v - p(clip(T) - 35) + p(clip(T_cal) - 35) - offset
+    v <- v scale                                                  of accelerometers, `INS_ACCSCAL_*`
 
 clip is to TMIN and TMAX; T_cal is the temperature at which the offset was taken (-300 where none was: that is clipped
 to TMIN). So the parameters hold no constant: it is in the offset, together with its temperature.
@@ -38,7 +39,7 @@ from fusion_plugins.exporters.autopilot import Autopilot, Corrections, FirmwareS
 SWING = 10.0  # K that the firmware asks of a calibration
 ROUNDED = 0.1  # K by which limits differ by rounding, and less
 LEARNING = 2  # of INS_TCALn_ENABLE
-SENSORS = (FirmwareSensor("GYR", "gyro", "rad/s"), FirmwareSensor("ACC", "accel", "m/s^2"))
+SENSORS = (FirmwareSensor("GYR", "gyro", "rad/s"), FirmwareSensor("ACC", "accel", "m/s^2", scaled=True))
 CORRECTED = "ArduPilot corrects gyros (rad/s) and accelerometers (m/s^2)"
 T_REF = np.float32(35.0)  # degC
 SCALE = np.float32(1e-6)  # of a stored coefficient
@@ -118,6 +119,8 @@ class Ardupilot(Autopilot):
             at = autopilot.places(self.kind, sensor)
             values |= {of_axes(names.offset)[axis]: held.offset[axis] for axis in at}
             values[names.caltemp] = held.T_cal
+        if (factors := self.scale(sensor, kind)) is not None:
+            values |= dict(zip(of_axes(names.scale), factors, strict=True))
         parameters = [Parameter(name, float(value)) for name, value in values.items()]
         return Corrections(parameters, loss, left_out, self._notes(sensor, names, low, high))
 
@@ -183,6 +186,11 @@ class Ardupilot(Autopilot):
                 f"{sensor.channel}: its offset stays as it is, and is right where {names.caltemp} is the temperature "
                 "at which it was taken; with --set accel_offsets=true the map's constant replaces it"
             )
+        if names.part == "ACC" and sensor.matrix is not None:
+            notes.append(
+                f"{sensor.channel}: {names.scale}_X to _Z hold its scale factors at one value; a calibration on six "
+                "faces replaces them"
+            )
         return notes
 
 
@@ -220,7 +228,8 @@ def _calibration(values: Mapping[str, float], kind: FirmwareSensor, imu: int) ->
     notes = [*autopilot.missing(values, _coefficients(names))]
     if T_cal <= UNCALIBRATED:
         notes.append(f"{kind.channel}: {names.caltemp} is not set, the firmware takes TMIN in its place")
-    return autopilot.read_back(kind, held, f"IMU {imu}", notes)
+    scale = np.array([values.get(name, 1.0) for name in of_axes(names.scale)]) if kind.scaled else None
+    return autopilot.read_back(kind, held, f"IMU {imu}", notes, scale=scale)
 
 
 @hookimpl

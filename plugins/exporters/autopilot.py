@@ -22,6 +22,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
@@ -31,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_core import contracts
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss
+from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss, TriadMatrix
 from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.escaping import comment
@@ -39,18 +40,23 @@ from fusion_core.units import Unit, same_dimension
 
 Single = NDArray[np.float32]
 TRIAD = ("x", "y", "z")
+SCALES = (0.7, 1.4)  # of a triad
 OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 times that where it does
 
 
 @dataclass(frozen=True)
 class FirmwareSensor:
-    """A kind of sensor that a firmware corrects for temperature; `short` stands in the parameters' names."""
+    """A kind of sensor that a firmware corrects for temperature; `short` stands in the parameters' names.
+
+    `scaled`: readings less their bias are multiplied by a constant scale, axis by axis.
+    """
 
     short: str
     channel: str
     unit: str
     order: int = 3
     axes: tuple[str, ...] = TRIAD
+    scaled: bool = False
 
 
 class Firmware:
@@ -147,6 +153,20 @@ class Autopilot(contracts.Exporter):
             )
         return low, high
 
+    def scale(self, sensor: Calibrated, kind: FirmwareSensor) -> Single | None:
+        """Return the constant scale (3,), by the firmware's axes, that is closest to 1 / (1 + M_ii) where it flies.
+
+        None where map or firmware has none.
+        """
+        matrix = sensor.matrix
+        if matrix is None or not kind.scaled:
+            return None
+        T = np.linspace(*(self.flown(sensor.fitted.domain) or sensor.fitted.domain), TEMPERATURES)
+        ratio = 1 + np.diagonal(matrix.at(T), axis1=1, axis2=2)
+        scale = np.ones(len(kind.axes), dtype=np.float32)
+        scale[places(self.kind, sensor)] = np.sum(ratio, axis=0) / np.sum(ratio**2, axis=0)
+        return scale
+
     def fit(
         self,
         sensor: Calibrated,
@@ -192,8 +212,24 @@ class Autopilot(contracts.Exporter):
             "single precision": target(T),
             "its renewal in stairs": renewed(recording),
         }
-        loss = SensorLoss.measured(modelled, target, renewed, contracts.causes(steps), flown)
+        scale = self.scale(sensor, kind)
+        gain = None if scale is None else partial(_constant, scale[at].astype(np.float64))
+        loss = SensorLoss.measured(modelled, target, renewed, contracts.causes(steps), flown, gain)
         return held, loss, (*left_out, *(uncorrected(sensor) if len(kind.axes) > 1 else ()))
+
+
+def _constant(scale: Array, T: Array) -> Array:
+    """Return the matrices (N, 3, 3) of a constant scale (3,) at T (N,)."""
+    return np.broadcast_to(np.diag(scale), (len(T), len(scale), len(scale)))
+
+
+def _matrix(scale: Array, domain: tuple[float, float]) -> TriadMatrix:
+    """Return the matrix of a target that multiplies by `scale` (3,) at all temperatures of a domain, degC."""
+    M = np.diag(1 / np.asarray(scale, dtype=np.float64) - 1)
+    return TriadMatrix(
+        T=domain, values=(tuple(M.ravel().tolist()),) * 2, slopes=((0.0,) * 9,) * 2, frame="given",
+        told=tuple(np.eye(3, dtype=bool).ravel().tolist()), kinds=("constant",) * 9,
+    )  # fmt: skip
 
 
 def _without_repeats(parameters: Sequence[Parameter]) -> list[Parameter]:
@@ -220,18 +256,34 @@ def kind_of(kinds: Sequence[Kind], sensor: Calibrated, exporter: str, corrected:
 
 
 def read_back(
-    kind: FirmwareSensor, held: Firmware, whose: str, notes: Sequence[str], besides: Array | None = None
+    kind: FirmwareSensor,
+    held: Firmware,
+    whose: str,
+    notes: Sequence[str],
+    besides: Array | None = None,
+    scale: Array | None = None,
 ) -> ReadBack:
-    """Return the calibration that a firmware holds; `besides` (d,) is what it takes off at all temperatures."""
+    """Return the calibration that a firmware holds.
+
+    `besides` (d,) is what it takes off at all temperatures, `scale` (3,) what it multiplies readings by then.
+    """
     low, high = held.T_min, held.T_max
 
     def bias(T: Array) -> Array:
         taken_off = held.bias(T).astype(np.float64)
         return taken_off if besides is None else taken_off + besides
 
+    domain = float(low), float(high)
+    scaled = scale is not None and np.any(scale) and np.any(scale != 1)  # all are zero where none was determined
+    if scale is not None and scaled and not (SCALES[0] < np.min(scale) and np.max(scale) < SCALES[1]):
+        raise ConfigError(
+            f"{kind.channel}: its scale is {'/'.join(f'{v:.3g}' for v in scale)}, near 1 was expected; calibrate that "
+            "vehicle before its parameters are read"
+        )
     first = f"{kind.channel}: {whose}, clamped below {low:g} and above {high:g} °C"
     axes = kind.axes if len(kind.axes) > 1 else ("x",)
-    return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, (first, *notes))
+    matrix = None if scale is None or not scaled else _matrix(scale, domain)
+    return ReadBack(kind.channel, kind.unit, axes, domain, bias, kind.order, (first, *notes), matrix)
 
 
 def places(kind: str, sensor: Calibrated) -> list[int]:

@@ -15,7 +15,9 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Export, Exporter, Factor, Inflation, Loss, warm_up
+from fusion_core.contracts import Calibrated, Export, Exporter, Factor, Inflation, Loss, TriadMatrix, warm_up
+from fusion_core.contracts.calibration import TEMPERATURES
+from fusion_core.contracts.exporter import MatrixLoss
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import comment
 from fusion_core.units import Quantity, Unit
@@ -54,13 +56,55 @@ class ImuNoise(Exporter):
     horizon: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
     """Time over which the program goes by a bias before it sees it anew: the walk covers what the bias does in it."""
 
+    at: Annotated[float, Unit("degC", example="25 degC")] | None = None
+    """Temperature of scale factor and misalignment; without it the middle of the map's range."""
+
     @abstractmethod
     def text(self, what: Export, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the lines of the file, but for the comments, from the noise of `gyro` and `accel`."""
 
+    @property
+    def intrinsic(self) -> bool:
+        """True where the file has scale factor and misalignment too."""
+        return True
+
+    def matrices(self, what: Export) -> Iterator[tuple[Calibrated, TriadMatrix]]:
+        """Yield the sensors that have scale factor and misalignment, with them."""
+        for channel in SENSORS:
+            sensor = what.sensor(channel)
+            if sensor is not None and sensor.matrix is not None:
+                yield sensor, sensor.matrix
+
     def notes(self, what: Export) -> Iterator[str]:
-        """Yield notes beside those on the noise."""
-        yield from ()
+        """Yield the temperature of scale factor and misalignment, and how far they are off at others."""
+        for sensor, matrix in self.matrices(what) if self.intrinsic else ():
+            at, (low, high) = self._temperature(sensor), sensor.fitted.domain
+            change = matrix.at(np.linspace(low, high, TEMPERATURES)) - matrix.at(np.array([at]))
+            yield (
+                f"{sensor.channel}: scale factor and misalignment are those of {at:.4g} degC; from {low:.4g} to "
+                f"{high:.4g} degC they lose {1e6 * np.max(np.abs(change).sum(axis=2)):.3g} ppm of the input at most"
+            )
+
+    def triangle_and_rotation(self, what: Export, channel: str) -> tuple[Array, Array]:
+        """Return L, lower triangular with a positive diagonal, and the rotation R, (3, 3) each, with L R = I + M."""
+        whole = np.eye(3)
+        for sensor, matrix in self.matrices(what):
+            if sensor.channel == channel:
+                whole = whole + matrix.at(np.array([self._temperature(sensor)]))[0]
+        Q, U = np.linalg.qr(whole.T)
+        signs = np.sign(np.diag(U))
+        return np.asarray((signs[:, None] * U).T), np.asarray((Q * signs).T)
+
+    def _temperature(self, sensor: Calibrated) -> float:
+        """Return the temperature for the matrix of a sensor, degC."""
+        low, high = sensor.fitted.domain
+        at = (low + high) / 2 if self.at is None else float(self.at)
+        if not low <= at <= high:
+            raise ConfigError(
+                f"export {self.kind}: at {at:.4g} degC is beyond the map of {sensor.channel}, {low:.4g} to {high:.4g} "
+                "degC; give one within"
+            )
+        return at
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write the largest density of each sensor's axes."""
@@ -69,9 +113,12 @@ class ImuNoise(Exporter):
             raise ConfigError(f"export {self.kind}: the rate of the messages is not known; add --set 'rate=200 Hz'")
         noise = {channel: self._noise(what, channel) for channel in SENSORS}
         maps = [sensor for sensor in what.sensors if sensor.map is not None]
-        left_out = tuple(f"the {sensor.channel}'s thermal map and effects" for sensor in maps)
+        left_out = [f"the {sensor.channel}'s thermal map and effects" for sensor in maps]
+        if not self.intrinsic:
+            lost = ((sensor, MatrixLoss.measured(sensor)) for sensor, _ in self.matrices(what))
+            left_out += [f"{sensor.channel}: {loss} at most" for sensor, loss in lost]
         notes = (note for sensor in noise.values() for note in sensor.notes)
-        loss = Loss((), left_out, (*notes, *self.notes(what)))
+        loss = Loss((), tuple(left_out), (*notes, *self.notes(what)))
         first, *rest = self.text(what, rate, noise)
         head = [first] if first.startswith("%") else []
         comments = [comment(line) for line in self._comments(what, noise, loss)]
@@ -127,6 +174,15 @@ class ImuNoise(Exporter):
             f"{channel}: over a warm-up of an hour through the map's range temperature alone moves the bias like a "
             f"walk of {moved:.3g} {sensor.unit}/sqrt(s) over {float(self.horizon):g} s, at most"
         )
+
+
+def matrix_lines(name: str, matrix: Array) -> list[str]:
+    """Return the lines of a matrix (n, n) in YAML."""
+    return [f"{name}:", *(f"  - [{', '.join(_exact(float(value)) for value in row)}]" for row in matrix)]
+
+
+def _exact(value: float) -> str:
+    return f"{value:.1f}" if value in (0.0, 1.0) else f"{value:.9e}"
 
 
 def _largest(

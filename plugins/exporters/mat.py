@@ -1,9 +1,11 @@
-"""A .mat file (version 5) for MATLAB and Octave: a struct for each sensor, with its map as a table.
+r"""A .mat file (version 5) for MATLAB and Octave: a struct for each sensor, with its map as a table.
 
 ::
 
     load gyro.mat
     b = interp1(gyro.temperature, gyro.bias, T, 'spline');     % rad/s, one column an axis
+    M = reshape(interp1(gyro.temperature, gyro.matrix, T), 3, 3)';   % of a triad, at one temperature
+    u = (eye(3) + M) \ (reading - b)';
 
 Rows are a fixed step apart. The loss of straight lines between them is measured, and that of a spline. A file that is
 read back is read element by element, and no further than the budget of a reader.
@@ -18,10 +20,21 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import ValidationError
 
 from fusion_core.budget import FILE, check_regular, check_size
 from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
+from fusion_core.contracts import (
+    Calibrated,
+    Deviation,
+    Export,
+    Exporter,
+    Loss,
+    ReadBack,
+    SensorLoss,
+    TriadMatrix,
+    beyond_a_map,
+)
 from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, quote
 from fusion_core.escaping import is_plain, line, matlab_name
@@ -52,7 +65,7 @@ class Mat(Exporter):
         for sensor in what.mapped:
             T = rows_of(sensor.fitted.domain, self.step)
             bias = sensor.fitted.bias(T)
-            lost.append(SensorLoss.measured(sensor, between(T, bias, self.method)))
+            lost.append(SensorLoss.measured(sensor, between(T, bias, self.method), gain=self._gain(sensor, T)))
             left_out += beyond_a_map(replace(sensor, walk=None))[1]  # the struct has the walk
             notes.append(self._other(sensor, T, bias))
             name = matlab_name(sensor.channel)
@@ -73,6 +86,13 @@ class Mat(Exporter):
         savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
         _without_date(path)
         return loss
+
+    def _gain(self, sensor: Calibrated, T: Array) -> Any:
+        """Return the function of temperature (N,) -> (N, 3, 3) that the rows T (n,) of M are."""
+        if sensor.matrix is None:
+            return None
+        terms = between(T, sensor.matrix.terms(T), self.method)
+        return lambda at: np.linalg.inv(np.eye(3) + terms(at).reshape(-1, 3, 3))
 
     def read(self, path: Path) -> list[ReadBack]:
         """Return the maps that a .mat file of this form has."""
@@ -129,6 +149,9 @@ def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict
         "residual": np.full(len(sensor.axes), np.nan) if residual is None else residual,
         "effects": [_effect(effect) for effect in sensor.effects] or np.empty((0, 0)),
     }
+    if (matrix := sensor.matrix) is not None:
+        content |= {"matrix": matrix.terms(T), "matrix_sigma": matrix.sigma(T), "frame": matrix.frame,
+                    "told": np.array(matrix.told, dtype=float)[None, :]}  # fmt: skip
     densities = {"noise": sensor.noise, "walk": sensor.walk}
     return {**content, **{name: values for name, values in densities.items() if values is not None}}
 
@@ -170,7 +193,25 @@ def _read_back(fields: Mapping[str, Variable], method: str) -> ReadBack:
     axes = _texts_of(fields["axes"])
     unit = (fields["units"].fields or {})["bias"].text
     domain = (float(T[0]), float(T[-1]))
-    return ReadBack(fields["channel"].text, unit, axes, domain, between(T, bias, method), order=7)
+    matrix = _matrix(T, fields) if "matrix" in fields else None
+    return ReadBack(fields["channel"].text, unit, axes, domain, between(T, bias, method), order=7, matrix=matrix)
+
+
+def _matrix(T: Array, fields: Mapping[str, Variable]) -> TriadMatrix:
+    """Return the cubic spline of the rows of M; its error is not known."""
+    from scipy.interpolate import CubicSpline
+
+    terms = np.asarray(fields["matrix"].array, dtype=np.float64).reshape(T.size, -1)
+    slopes = CubicSpline(T, terms)(T, 1)
+    told = np.asarray(fields["told"].array).ravel() > 0
+    frame: Any = fields["frame"].text
+    try:
+        return TriadMatrix(
+            T=tuple(T.tolist()), values=tuple(map(tuple, terms.tolist())), slopes=tuple(map(tuple, slopes.tolist())),
+            frame=frame, kinds=("table",) * len(told), told=tuple(told.tolist()),
+        )  # fmt: skip
+    except ValidationError as error:
+        raise ConfigError(f"import mat: its matrix is none ({quote(error.errors()[0]['msg'], 120)}); mend it") from None
 
 
 def structs_of(path: Path) -> dict[str, Mapping[str, Variable]]:

@@ -24,22 +24,16 @@ vins_estimator/src/factor/integration_base.h, `midPointIntegration`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
-from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Export, Exporter
-from fusion_core.contracts.calibration import TEMPERATURES
-from fusion_core.errors import ConfigError
+from fusion_core.contracts import Export, Exporter
 from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Unit
-from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise
+from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise, matrix_lines
 from fusion_plugins.exporters.kalibr import densities
 
 FIRST = "%YAML:1.0"
-ONE, NONE = ("[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]", "[0.0, 0.0, 1.0]"), ("[0.0, 0.0, 0.0]",) * 3
-POSE = ("[1.0, 0.0, 0.0, 0.0]", "[0.0, 1.0, 0.0, 0.0]", "[0.0, 0.0, 1.0, 0.0]", "[0.0, 0.0, 0.0, 1.0]")
 INTRINSICS = {"gyro": ("Tw", "R_IMUtoGYRO"), "accel": ("Ta", "R_IMUtoACC")}
 
 
@@ -49,54 +43,25 @@ class OpenVins(ImuNoise):
     kind: Literal["openvins"] = "openvins"
     form: Literal["openvins", "vins"] = "openvins"
     """Format: `vins` writes acc_n, acc_w, gyr_n and gyr_w, of single samples at `rate`."""
-    at: Annotated[float, Unit("degC", example="25 degC")] | None = None
-    """Temperature of scale factor and misalignment; without it the middle of the map's range."""
 
     @property
-    def holds_matrix(self) -> bool:
-        """True but for VINS, which has no place for them."""
+    def intrinsic(self) -> bool:
+        """True but for VINS, which has no place for scale factor and misalignment."""
         return self.form == "openvins"
-
-    def notes(self, what: Export) -> Iterator[str]:
-        """Yield the temperature of scale factor and misalignment, and how far they are off at others."""
-        for channel in INTRINSICS if self.holds_matrix else ():
-            sensor = what.sensor(channel)
-            if sensor is not None and sensor.matrix is not None:
-                at, (low, high) = self._temperature(sensor), sensor.fitted.domain
-                change = sensor.matrix.at(np.linspace(low, high, TEMPERATURES)) - sensor.matrix.at(np.array([at]))
-                yield (
-                    f"{channel}: scale factor and misalignment are those of {at:.4g} degC; from {low:.4g} to "
-                    f"{high:.4g} degC they lose {1e6 * np.max(np.abs(change).sum(axis=2)):.3g} ppm of the input at most"
-                )
-
-    def _temperature(self, sensor: Calibrated) -> float:
-        """Return the temperature for the matrix of a sensor, degC."""
-        low, high = sensor.fitted.domain
-        at = (low + high) / 2 if self.at is None else float(self.at)
-        if not low <= at <= high:
-            raise ConfigError(
-                f"export {self.kind}: at {at:.4g} degC is beyond the map of {sensor.channel}, {low:.4g} to {high:.4g} "
-                "degC; give one within"
-            )
-        return at
 
     def _intrinsics(self, what: Export) -> Iterator[str]:
         """Yield the lines of the matrices and rotations of both sensors."""
         for channel, names in INTRINSICS.items():
-            sensor, both = what.sensor(channel), [ONE, ONE]
-            if sensor is not None and sensor.matrix is not None:
-                whole = np.eye(3) + sensor.matrix.at(np.array([self._temperature(sensor)]))[0]
-                both = [_rows(part) for part in triangle_and_rotation(whole)]
-            for name, rows in zip(names, both, strict=True):
-                yield from _matrix(name, rows)
-        yield from _matrix("Tg", NONE)
+            for name, part in zip(names, self.triangle_and_rotation(what, channel), strict=True):
+                yield from matrix_lines(name, part)
+        yield from matrix_lines("Tg", np.zeros((3, 3)))
 
     def text(self, what: Export, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the keys that OpenVINS reads, or those of VINS."""
         if self.form == "vins":
             return [FIRST, "", f'imu_topic: "{self.topic}"', *_of_samples(rate, noise)]
         inner = [
-            *_matrix("T_i_b", POSE),
+            *matrix_lines("T_i_b", np.eye(4)),
             *densities(noise),
             f'rostopic: "{self.topic}"',
             "time_offset: 0.0",
@@ -105,22 +70,6 @@ class OpenVins(ImuNoise):
             *self._intrinsics(what),
         ]
         return [FIRST, "", "imu0:", *(f"  {line}" for line in inner)]
-
-
-def triangle_and_rotation(whole: Array) -> tuple[Array, Array]:
-    """Return L, lower triangular with a positive diagonal, and the rotation R, (3, 3) each, whose product L R it is."""
-    Q, U = np.linalg.qr(whole.T)
-    signs = np.sign(np.diag(U))
-    return np.asarray((signs[:, None] * U).T), np.asarray((Q * signs).T)
-
-
-def _rows(matrix: Array) -> tuple[str, str, str]:
-    x, y, z = (f"[{', '.join(f'{float(value):.9e}' for value in row)}]" for row in matrix)
-    return x, y, z
-
-
-def _matrix(name: str, rows: tuple[str, ...]) -> list[str]:
-    return [f"{name}:", *(f"  - {row}" for row in rows)]
 
 
 def _of_samples(rate: float, noise: dict[str, SensorNoise]) -> list[str]:

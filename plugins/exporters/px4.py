@@ -3,7 +3,8 @@
 `TC_G<n>_*` of a gyro (rad/s), `TC_A<n>_*` of an accelerometer (m/s^2), both cubics on three axes, and `TC_B<n>_*` of a
 barometer (Pa), of fifth order. A sensor is corrected only where `TC_?<n>_ID` is its device id: nothing says so in
 flight where it is not. X0 is subtracted *besides* the offset in `CAL_GYRO<n>_?OFF`, which is therefore set to zero.
-The firmware computes in single precision, in this order of operations::
+Readings of an accelerometer less all this are multiplied by `CAL_ACC<n>_?SCALE`, those of a gyro are not. The firmware
+computes in single precision, in this order of operations::
 
     d = clip(T, TMIN, TMAX) - TREF
     gyro, accelerometer:  X0 + X1 d + X2 d2 + X3 d3,    d2 = d d,  d3 = d2 d
@@ -15,8 +16,8 @@ publishes another sensor's, this one's goes with it: with `TC_A_ENABLE` the stai
 
 Products and sums are rounded one by one, as C without contraction does; a compiler that fuses them differs in the last
 bit. Sources: PX4-Autopilot, src/modules/temperature_compensation: TemperatureCompensation.cpp,
-TemperatureCompensationModule.cpp; src/lib/sensor_calibration/Gyroscope.hpp; QGroundControl, ParameterManager (the
-vehicle's system id must be that of each line). N samples, n coefficients, d axes.
+TemperatureCompensationModule.cpp; src/lib/sensor_calibration/Gyroscope.hpp and Accelerometer.hpp; QGroundControl,
+ParameterManager (the vehicle's system id must be that of each line). N samples, n coefficients, d axes.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Px4Sensor(FirmwareSensor):
 
 SENSORS = (
     Px4Sensor("G", "gyro", "rad/s", topic="sensor_gyro", calibration="GYRO"),
-    Px4Sensor("A", "accel", "m/s^2", topic="sensor_accel", setting="accel_device_id", calibration="ACC"),
+    Px4Sensor("A", "accel", "m/s^2", scaled=True, topic="sensor_accel", setting="accel_device_id", calibration="ACC"),
     Px4Sensor("B", "baro", "Pa", 5, ("",), topic="sensor_baro", setting="baro_device_id", calibration="BARO"),
 )
 CORRECTED = "PX4 corrects sensors in " + ", ".join(f"{kind.unit} ({kind.channel})" for kind in SENSORS)
@@ -111,6 +112,8 @@ class Px4(Autopilot):
     """Number in the parameters' names. Without it, that of the sensor in the log of which the map was made, else 0."""
     calibration: Number | None = None
     """The n of the CAL_GYROn_ID that is the gyro's. Without it, that of the log, else as `instance`."""
+    accel_calibration: Number | None = None
+    """The same of the CAL_ACCn_ID, for the scale factors of the accelerometer."""
     system: Annotated[int, Field(ge=1, le=255)] = 1
     """The vehicle's MAV_SYS_ID."""
 
@@ -131,12 +134,17 @@ class Px4(Autopilot):
 
         held, loss, left_out = self.fit(sensor, kind, float(T_ref), hold)
         instance = _log_number(sensor, "instance", 0) if self.instance is None else self.instance
-        slot = _log_number(sensor, "calibration", instance) if self.calibration is None else self.calibration
+        given = self.accel_calibration if kind.short == "A" else self.calibration
+        slot = _log_number(sensor, "calibration", instance) if given is None else given
         begin = f"TC_{kind.short}{instance}"
         values = {f"{begin}_TMIN": low, f"{begin}_TMAX": high, f"{begin}_TREF": T_ref}
         values |= {kind.coefficient(instance, *at): value for at, value in np.ndenumerate(held.X)}
         if kind.short == "G":
             values |= {f"CAL_GYRO{slot}_{axis.upper()}OFF": np.float32(0.0) for axis in sensor.axes}
+        if (scale := self.scale(sensor, kind)) is not None:
+            begin_cal = f"CAL_{kind.calibration}{slot}"
+            values |= {f"{begin_cal}_{axis.upper()}OFF": np.float32(0.0) for axis in kind.axes}
+            values |= {f"{begin_cal}_{axis.upper()}SCALE": value for axis, value in zip(kind.axes, scale, strict=True)}
         parameters = [
             Parameter(f"TC_{kind.short}_ENABLE", 1, whole=True),
             Parameter(f"{begin}_ID", device, whole=True),
@@ -195,7 +203,10 @@ def _notes(sensor: Calibrated, kind: Px4Sensor, device: int, slot: int) -> list[
     besides = {
         "G": f"CAL_GYRO{slot}{zero} are set to 0, as X0 has the offset; where not CAL_GYRO{slot}_ID but another "
         f"CAL_GYROn_ID is {device}, give --set calibration=n",
-        "A": "calibrate the accelerometers anew after the reboot, as X0 has the offset, and CAL_ACC would take it off "
+        "A": f"CAL_ACC{slot}{zero} are set to 0, as X0 has the offset, and _XSCALE to _ZSCALE hold its scale factors "
+        f"at one value; where not CAL_ACC{slot}_ID but another CAL_ACCn_ID is {device}, give --set accel_calibration=n"
+        if sensor.matrix is not None
+        else "calibrate the accelerometers anew after the reboot, as X0 has the offset, and CAL_ACC would take it off "
         "again",
         "B": "the CAL_BAROn_OFF of this device is taken off besides; set it to 0",
     }
@@ -232,20 +243,21 @@ def _calibration(values: Mapping[str, float], kind: Px4Sensor, instance: int, wa
         raise _UnusedSensor(f"{begin}{instance}_X0 to _X{kind.order} are all 0 or missing")
     if not (low < high and np.isfinite(T_ref)):
         raise _UnusedSensor(f"{begin}{instance}_TMIN {low:g}, _TMAX {high:g}, _TREF {T_ref:g} are no range")
-    offset, note = _offset(values, kind, ids[instance])
+    offset, scale, note = _calibrated(values, kind, ids[instance])
     notes = [*autopilot.missing(values, names), *note]
     whose = f"device id {ids[instance]}"
-    return autopilot.read_back(kind, Px4Parameters(X, T_ref, low, high), whose, notes, offset)
+    return autopilot.read_back(kind, Px4Parameters(X, T_ref, low, high), whose, notes, offset, scale)
 
 
-def _offset(values: Mapping[str, float], kind: Px4Sensor, device: int) -> tuple[Array, list[str]]:
-    """Return the constant calibration of the same device (d,), which is taken off besides, and a note of it."""
+def _calibrated(values: Mapping[str, float], kind: Px4Sensor, device: int) -> tuple[Array, Array | None, list[str]]:
+    """Return the constant calibration of the same device: offset (d,), scale (d,) where it has one, and a note."""
     slots = (n for n in INSTANCES if autopilot.integer(values, f"CAL_{kind.calibration}{n}_ID") == device)
     begin = f"CAL_{kind.calibration}{next(slots, None)}"
     names = [f"{begin}_{axis.upper()}OFF" for axis in kind.axes]
     offset = np.array([values.get(name, 0.0) for name in names])
     text = f"{kind.channel}: {', '.join(names)} are not 0, and taken off besides; so they are here"
-    return offset, [text] if np.any(offset) else []
+    scales = (values.get(f"{begin}_{axis.upper()}SCALE", 1.0) for axis in kind.axes)
+    return offset, np.array(list(scales)) if kind.scaled else None, [text] if np.any(offset) else []
 
 
 def published(t: ArrayLike, temperature: ArrayLike) -> Single:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -20,12 +21,11 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, SensorLoss
-from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.contracts.exporter import Deviation, warm_up
 from fusion_core.errors import ConfigError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension
-from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, inverse_of, program_of, why_not
+from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, program_of, why_not
 
 _OF_KNOWN = 0.1  # of what the map itself is good to: the loss where none is set
 _OF_SWING = 1e-4  # at least
@@ -43,11 +43,6 @@ class C99(Exporter):
 
     knots: Literal["smallest", "float"] = "smallest"
     """As what knots are kept: 16-bit integers with a scale where these are fine enough for the loss, or float."""
-
-    @property
-    def holds_matrix(self) -> bool:
-        """True: as a table beside that of the bias."""
-        return True
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write header, source and self-test of each sensor that has a map."""
@@ -78,7 +73,7 @@ class C99(Exporter):
         loss = Loss(
             (self._measured(sensor, held, program),),
             tuple(f"{sensor.channel}: {effect.kind}: {reason}" for effect, reason in left),
-            (*self._notes(held), *_matrix_notes(held, program)),
+            tuple(self._notes(held)),
         )
         size = sum(table.size for table in program.lookups)
         effects = [f"{effect.kind} of {effect.subject}" for effect in held.effects]
@@ -113,7 +108,7 @@ class C99(Exporter):
 
     def _measured(self, sensor: Calibrated, held: Calibrated, program: Program) -> SensorLoss:
         """Measure what the program of `held` loses of `sensor`, without effects of channels that a warm-up lacks."""
-        from fusion_plugins.exporters.c.emulation import at_rest, run
+        from fusion_plugins.exporters.c.emulation import at_rest, gain, run
 
         here = [effect for effect in sensor.effects if not channels_of(effect)]
         known = replace(sensor, effects=tuple(here))
@@ -135,7 +130,7 @@ class C99(Exporter):
             for effect in here
             if effect not in held.effects
         }
-        return SensorLoss.measured(known, resting, running, causes)
+        return SensorLoss.measured(known, resting, running, causes, gain=partial(gain, program))
 
     def _notes(self, sensor: Calibrated) -> Iterator[str]:
         low, high = sensor.fitted.domain
@@ -144,17 +139,6 @@ class C99(Exporter):
             channels = " and ".join(sorted(channels_of(effect)))
             if channels:
                 yield f"{sensor.channel}: {effect.kind} of {channels} is in the code; the warm-up has no such channel"
-
-
-def _matrix_notes(sensor: Calibrated, program: Program) -> Iterator[str]:
-    """Yield the loss of scale factor and misalignment in the code's own arithmetic."""
-    from fusion_plugins.exporters.c.emulation import look_up
-
-    if program.matrix is not None:
-        T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
-        error = np.abs(look_up(program.matrix, T.astype(np.float32)) - inverse_of(sensor)(T))
-        largest = 1e6 * np.max(error.reshape(-1, 3, 3).sum(axis=2))
-        yield f"{sensor.channel}: scale factor and misalignment lose {largest:.2g} ppm of the input at most"
 
 
 def usual_loss(sensor: Calibrated) -> Array:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fusion_core.chunk import Array
 from fusion_core.contracts.effect import Behind, Elapsed, Fading, Limited, PlayState, Product, Reading, Signal, Weighted
 from fusion_core.fast import compiled
 from fusion_plugins.exporters.c.program import LookupTable, Program, Single
@@ -35,6 +36,12 @@ def at_rest(program: Program, T: Single) -> Single:
     for other in others:
         bias = bias + other
     return bias
+
+
+def gain(program: Program, T: Array) -> Array:
+    """Return the matrices (N, 3, 3) by which readings less their bias are multiplied at T (N,)."""
+    assert program.matrix is not None
+    return np.eye(3) + look_up(program.matrix, T.astype(np.float32)).reshape(-1, 3, 3)
 
 
 def inputs(program: Program, T: Single, bias: Single, reading: Single) -> Single:

@@ -164,7 +164,7 @@ def _matrix_loss(sensor: Calibrated) -> Array:
     """Return a tenth (9,) of what the terms are known to, 0.1 to 10 ppm."""
     matrix = sensor.matrix
     assert matrix is not None
-    known = matrix.sigma(np.linspace(*sensor.fitted.domain, MATRIX_PLACES))
+    known = np.nan_to_num(matrix.sigma(np.linspace(*sensor.fitted.domain, MATRIX_PLACES)))
     return np.asarray(np.clip(0.1 * np.sqrt(np.mean(known**2, axis=0)), 1e-7, 1e-5))
 
 

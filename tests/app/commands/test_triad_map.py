@@ -147,11 +147,155 @@ def test_without_the_bias_that_of_the_configs_map_stays(folder):
     assert "misalignment" not in alone.stdout.partition("frame")[0]
 
 
-def test_what_no_export_holds_is_said(folder):
-    done = run("export", "csv_table", "gyro.json", "--out", "table_of_bias.csv", cwd=folder)
+def test_terms_that_all_move_are_all_followed(tmp_path):
+    """One curve alone would hardly lower what the constants of the others leave."""
+
+    def bent(T):
+        x = (T - 20.0) / 40.0
+        return matrix_of(20.0) + 0.004 * x * (np.eye(3) - 0.5) + 0.003 * x**2 * (0.7 - np.eye(3))
+
+    t, y, T, table = turntable(3, [-20.0, 20.0, 60.0], hold=12.0, matrix=bent)
+    (tmp_path / "table.csv").write_text(table)
+    config = GYRO.replace("table.csv", str(tmp_path / "table.csv"))
+    data = {"time": (t, "s"), "gyro": (y, "rad/s"), "temperature": (T, "degC")}
+    fit = driftlab.fit_map(config, data, terms=TERMS).fit
+    for at in (-20.0, 20.0, 60.0):
+        off = fit.terms.at(np.array([at]))[0, 3:] - bent(at).ravel()
+        assert np.max(np.abs(off / fit.sigma(np.array([at]))[0, 3:])) < 4
+        assert np.max(np.abs(off)) < 1e-4
+
+
+def test_check_shows_each_term_and_whether_the_unit_turns(folder):
+    turning = driftlab.check(folder / "gyro.yaml").remarks
+    lines = [line.partition(": ")[2] for line in turning if " ppm = " in line or " mrad = " in line]
+    assert len(lines) == 9
+    first = lines[0].split()
+    assert first[:2] == ["scale", "x"]
+    assert float(first[2]) == pytest.approx(4000, abs=40)
+    assert float(first[5]) == pytest.approx(0.004, abs=4e-5)
+    assert not any("nothing of scale factor" in line for line in turning)
+    rng = np.random.default_rng(0)
+    still = np.c_[
+        np.arange(500) * 0.1, rng.normal(0, 3e-4, (500, 3)) + bias_of(20.0, np.deg2rad(1.0)), np.full(500, 20)
+    ]
+    np.savetxt(folder / "still.csv", still, delimiter=",", header="t,gx,gy,gz,T", comments="")
+    (folder / "still.yaml").write_text(GYRO.replace("turned.csv", "still.csv"))
+    (said,) = (line for line in driftlab.check(folder / "still.yaml").remarks if "nothing of scale factor" in line)
+    assert said.startswith("gyro: turns by 0.0")
+
+    driftlab.fit_map(GYRO.replace("stimulus", "#"), {
+        "time": (np.arange(300.0), "s"), "temperature": (np.linspace(-20, 60, 300), "degC"),
+        "gyro": (rng.normal(0, 1e-6, (300, 3)), "rad/s"),
+    }, out=folder / "alone.json")  # fmt: skip
+    (folder / "alone.yaml").write_text(GYRO.replace("gyro.json", "alone.json"))
+    assert any(line.startswith("stimulus: lies unused") for line in driftlab.check(folder / "alone.yaml").remarks)
+    assert not any("lies unused" in line for line in turning)
+
+
+def test_compare_states_the_terms_that_each_config_takes_off(folder):
+    driftlab.fit_map(GYRO.replace("stimulus", "#"), {
+        "time": (np.arange(300.0), "s"), "temperature": (np.linspace(-20, 60, 300), "degC"),
+        "gyro": (np.random.default_rng(0).normal(0, 1e-6, (300, 3)), "rad/s"),
+    }, out=folder / "bias.json")  # fmt: skip
+    N = 4000
+    data = {"time": (np.arange(N) * 0.1, "s"), "temperature": (np.linspace(10, 30, N), "degC"),
+            "gyro": (np.random.default_rng(0).normal(0, 3e-4, (N, 3)), "rad/s")}  # fmt: skip
+    configs = {}
+    for name in ("bias", "gyro"):
+        (folder / f"with_{name}.yaml").write_text(GYRO.replace("gyro.json", f"{name}.json"))
+        configs[name] = folder / f"with_{name}.yaml"
+    result = driftlab.compare(configs, data)
+    terms = {name: one["terms"] for name, one in result.summary["configs"].items()}
+    assert list(terms["bias"]) == ["bias x", "bias y", "bias z"]
+    assert list(terms["gyro"])[:5] == ["bias x", "bias y", "bias z", "scale x", "misalignment xy"]
+    assert "bias: takes off bias x, bias y, bias z" in result.lines()
+    assert not any(
+        "takes off" in line for line in driftlab.compare({"a": configs["bias"], "b": configs["bias"]}, data).lines()
+    )
+
+
+@pytest.mark.parametrize("form", ["csv_table", "px4"])
+def test_what_an_export_does_not_hold_is_measured(folder, form):
+    out = f"without_{form}{'.csv' if form == 'csv_table' else '.params'}"
+    more = ["--set", "device_id=7"] if form == "px4" else []
+    done = run("export", form, "gyro.json", "--out", out, *more, cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "left out: gyro: scale factor and misalignment, up to 1" in done.stdout
-    assert "csv_table holds the bias alone" in (folder / "loss.json").read_text()
+    M = np.array([matrix_of(T) for T in np.linspace(-20, 60, 400)])
+    scale = 1e6 * np.max(np.abs(M[:, range(3), range(3)]), axis=0)
+    across = 1e3 * np.max(np.linalg.norm(M * (1 - np.eye(3)), axis=2), axis=0)
+    (lost,) = json.loads((folder / "loss.json").read_text())["exports"][out]["loss"]
+    np.testing.assert_allclose(lost["matrix"]["scale_ppm"]["largest"], scale, atol=60)
+    np.testing.assert_allclose(lost["matrix"]["misalignment_mrad"]["largest"], across, atol=0.06)
+    for text in (done.stdout, (folder / out).read_text()):
+        assert "ppm of scale factor and " in " ".join(text.replace("#", "").split())
+
+
+def corrected_in_flight(form, parameters, reading, T, bias):
+    """The input as the firmware takes it: less its bias at T, times its scale; offsets are zero."""
+    begin = {"px4": "CAL_ACC0_{}SCALE", "ardupilot": "INS_ACCSCAL_{}"}[form]
+    scale = np.array([parameters[begin.format(axis)] for axis in "XYZ"])
+    return (reading - bias(T)) * scale
+
+
+@pytest.mark.parametrize("form", ["px4", "ardupilot"])
+def test_autopilots_hold_constant_scale_factors_of_accelerometers(tmp_path, form):
+    t, y, T = tumble(0, [-20.0, 0.0, 20.0, 40.0, 60.0], placements=14, hold=4.0)
+    sensors = {"gyro": {"noise": "1 deg/s/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1 deg/s/sqrt(s)"}}}
+    accel = {"noise": "5e-4 m/s^2/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1e-5 m/s^2/sqrt(s)"}}
+    config = {"filter": {**sensors, "track": "accel", "accel": accel},
+              "stimulus": {"kind": "tumble", "gravity": "9.80665 m/s^2"}}  # fmt: skip
+    quiet = np.random.default_rng(0).normal(0, 1e-3, y.shape)
+    data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (quiet, "rad/s"), "temperature": (T, "degC")}
+    made = driftlab.fit_map(config, data, kind="polynomial", terms=TERMS, out=tmp_path / "accel.json")
+    more = ["--set", "accel_device_id=7"] if form == "px4" else ["--set", "accel_offsets=true"]
+    suffix = ".params" if form == "px4" else ".parm"
+    done = run("export", form, "accel.json", "--out", f"out{suffix}", *more, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split() for line in (tmp_path / f"out{suffix}").read_text().splitlines() if line[0] != "#"]
+    parameters = {line[-3 if form == "px4" else 0]: float(line[-2 if form == "px4" else 1]) for line in lines}
+    at = np.linspace(-20, 60, 81)
+    (lost,) = json.loads((tmp_path / "loss.json").read_text())["exports"][f"out{suffix}"]["loss"]
+    for axis, u in enumerate(10 * np.eye(3)):
+        reading = u + made.fit.terms.matrix(at) @ u + made.map.bias(at)
+        off = corrected_in_flight(form, parameters, reading, at, made.map.bias) - u
+        assert np.max(np.abs(off[:, axis])) / 10 * 1e6 == pytest.approx(
+            lost["matrix"]["scale_ppm"]["largest"][axis], abs=5
+        )
+        assert np.max(np.abs(off[:, axis])) / 10 < 0.7 * np.max(np.abs(made.fit.terms.matrix(at)[:, axis, axis]))
+    if form == "px4":
+        assert {parameters[f"CAL_ACC0_{axis}OFF"] for axis in "XYZ"} == {0.0}
+
+    with (tmp_path / f"out{suffix}").open("a") as file:  # which a vehicle has
+        file.write("1\t1\tCAL_ACC0_ID\t7\t6\n" if form == "px4" else "")
+    back = run("import", form, f"out{suffix}", "--channel", "accel", "--out", "back.json", cwd=tmp_path)
+    assert back.returncode == 0, back.stderr
+    assert "scale x " in back.stdout
+    from driftlab.storage.map_file import read_map
+
+    taken = read_map(tmp_path / "back.json")
+    reading = np.array([[1.0, 2.0, 9.0]] * len(at)) + made.map.bias(at)
+    np.testing.assert_allclose(
+        taken.corrected(reading, at), corrected_in_flight(form, parameters, reading, at, taken.bias), atol=1e-6
+    )
+
+
+def test_a_mat_file_holds_all_terms_and_gives_them_back(folder):
+    from scipy.io import loadmat
+
+    from driftlab.storage.map_file import read_map
+
+    assert run("export", "mat", "gyro.json", "--out", "gyro.mat", cwd=folder).returncode == 0
+    done = run("import", "mat", "gyro.mat", "--kind", "spline", "--out", "again.json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    struct = loadmat(folder / "gyro.mat", simplify_cells=True)["gyro"]
+    row = int(np.argmin(np.abs(struct["temperature"] - 20.0)))
+    np.testing.assert_allclose(struct["matrix"][row].reshape(3, 3), matrix_of(20.0), atol=3e-5)
+    known, again = (read_map(folder / name).record.matrix for name in ("gyro.json", "again.json"))
+    T = np.linspace(-19.9, 59.9, 37)
+    np.testing.assert_allclose(again.terms(T), known.terms(T), atol=1e-8)
+    np.testing.assert_allclose(struct["matrix_sigma"][row], known.sigma(np.array([20.0]))[0], rtol=0.05)
+    assert (again.frame, again.told, again.error) == (known.frame, known.told, None)
+    assert np.all(np.isnan(again.sigma(T)))
 
 
 @pytest.mark.parametrize(
@@ -160,7 +304,10 @@ def test_what_no_export_holds_is_said(folder):
         (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment, g_sensitivity; name those"),
         (["--stimulus", "tumble"], "--stimulus: is that of --terms"),
         (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
-        (["--terms", TERMS, "--compare"], "--terms: gives one map, and no page"),
+        (
+            ["--terms", TERMS, "--compare"],
+            "--terms: tries the curves of one kind; leave --select, --compare and --family out",
+        ),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),
         (["--terms", TERMS, "--set", "stimulus.segments=no.csv"], "no.csv: cannot be read"),

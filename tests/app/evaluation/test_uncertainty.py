@@ -35,11 +35,11 @@ def verdict():
 def test_the_sources_add_up_by_their_squares_and_u_is_twice_that(verdict):
     budget = bias_budget(verdict.map, thermometer=0.3)
     assert [source.name for source in budget.sources] == ["curve", "mean", "memory", "thermometer"]
-    total = np.zeros_like(budget.bias)
+    total = np.zeros_like(budget.values)
     for source in budget.sources:
         total += source.u * source.u
     assert np.allclose(budget.U, 2 * np.sqrt(total), rtol=1e-12)
-    assert np.array_equal(budget.bias, verdict.map.bias(budget.T))
+    assert np.array_equal(budget.values, verdict.map.bias(budget.T))
 
 
 def test_a_thermometer_counts_by_the_slope(verdict):
@@ -73,7 +73,7 @@ def test_a_memory_that_is_seen_covers_both_ways():
     budget = bias_budget(verdict_on(T, bias + way).map)
     for sign in (1, -1):
         truth = DEG_H * np.outer(budget.T, [0.5, -1, 0.2]) + sign * DEG_H * np.array([20, 10, 0])
-        assert np.all(np.abs(budget.bias - truth)[:, :2] <= budget.U[:, :2])
+        assert np.all(np.abs(budget.values - truth)[:, :2] <= budget.U[:, :2])
     assert np.all(budget.U[:, 0] < 2 * DEG_H * 40)
 
 
@@ -122,7 +122,7 @@ def test_the_level_of_a_triad_is_as_sure_as_its_placements_say(ups, missing):
     (level,) = (source for source in budget.sources if source.name == "placements")
     assert bool(missing) == any("tilt" in text for text in budget.missing)
     if not missing:
-        assert np.all(np.abs(budget.bias - (1e-3 * budget.T)[:, None]) <= 1.5 * budget.U)
+        assert np.all(np.abs(budget.values - (1e-3 * budget.T)[:, None]) <= 1.5 * budget.U)
         assert np.array_equal(level.u[0], placements.levels.sigma)
 
 

@@ -71,6 +71,14 @@ def test_openvins_has_what_its_reader_wants(tmp_path):
     np.testing.assert_array_equal(read["Tg"], np.zeros((3, 3)))
 
 
+def constant_matrix(M, domain):
+    """M (3, 3) at all temperatures."""
+    return TriadMatrix(
+        T=domain, values=(tuple(M.ravel().tolist()),) * 2, slopes=((0.0,) * 9,) * 2, frame="given",
+        kinds=("constant",) * 9, told=(True,) * 9,
+    )  # fmt: skip
+
+
 def test_openvins_takes_off_scale_factor_and_misalignment_at_a_temperature(tmp_path):
     """By its own arithmetic: R_GYROtoIMU Dw (reading - bias), Dw lower triangular, R the inverse of the file's."""
     rng, T = np.random.default_rng(4), np.array([-20.0, 5.0, 60.0])
@@ -103,9 +111,36 @@ def test_openvins_takes_off_scale_factor_and_misalignment_at_a_temperature(tmp_p
     with pytest.raises(ConfigError, match="at 80 degC is beyond the map of gyro, -20 to 60 degC; give one within"):
         written(OpenVins(at=Quantity(80.0, "80 degC")), what, tmp_path)
     vins = OpenVins(form="vins")
-    assert exporter.holds_matrix
-    assert not vins.holds_matrix
-    assert not any("misalignment" in note for note in written(vins, what, tmp_path)[1].notes)
+    lost = written(vins, what, tmp_path)[1]
+    assert not any("misalignment" in note for note in lost.notes)
+    for channel, matrix in matrices.items():
+        M = np.abs(matrix.at(np.linspace(-20, 60, 2001)))
+        largest = "/".join(f"{1e6 * M[:, k, k].max():.3g}" for k in range(3))
+        assert any(text.startswith(f"{channel}: {largest} ppm of scale factor and ") for text in lost.left_out)
+
+
+def test_kalibr_takes_off_scale_factor_and_misalignment_at_a_temperature(tmp_path):
+    """By its model: accelerations are M a, rates M C_gyro_i omega in the frame of the accelerometer's M."""
+    rng, what = np.random.default_rng(6), unit("gyro", "accel")
+    assert "model" not in yaml.safe_load(written(Kalibr(), what, tmp_path)[0])
+    matrices = {s.channel: constant_matrix(rng.normal(0, 0.02, (3, 3)), (-20.0, 60.0)) for s in what.sensors}
+    sensors = (replace(s, map=s.map.noting(matrix=matrices[s.channel], domain=(-20.0, 60.0))) for s in what.sensors)
+    text, loss = written(Kalibr(), replace(what, sensors=tuple(sensors)), tmp_path)
+    read = yaml.safe_load(text)
+    assert read["model"] == "scale-misalignment"
+    of_accel, of_gyro, turn = (
+        np.array(m) for m in (read["accelerometers"]["M"], read["gyroscopes"]["M"], read["gyroscopes"]["C_gyro_i"])
+    )
+    for triangle in (of_accel, of_gyro):
+        np.testing.assert_array_equal(triangle[np.triu_indices(3, 1)], 0.0)
+    np.testing.assert_array_equal(read["gyroscopes"]["A"], np.zeros((3, 3)))
+    whole = {channel: np.eye(3) + matrix.at(np.array([0.0]))[0] for channel, matrix in matrices.items()}
+    frame = np.linalg.solve(of_accel, whole["accel"])  # from the map's frame to Kalibr's i
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-8)
+    np.testing.assert_allclose(of_gyro @ turn @ frame, whole["gyro"], atol=1e-8)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    assert any("are those of 20 degC; from -20 to 60 degC they lose" in note for note in loss.notes)
+    assert any(note.startswith("C_gyro_i: is right where both maps are in one frame") for note in loss.notes)
 
 
 def test_vins_integrates_to_the_same_variances(tmp_path):
