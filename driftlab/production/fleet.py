@@ -14,15 +14,13 @@ from typing import Any, TypeVar
 from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
-from driftlab.family.parallel import serial
 from driftlab.production.family import analyse
 from driftlab.production.manifest import read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, UnitStore, fleet_folder
+from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, fleet_folder, stored_units
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
-from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import alarms
@@ -34,7 +32,7 @@ __all__ = ["FleetOptions", "fleet"]
 
 T = TypeVar("T")
 SHOWN = 10  # failures that are named outside of the tables
-ALONE = 100  # units for whose family no further process is begun
+ALONE = 20  # units for whose family no further process is asked
 
 
 def fleet(
@@ -161,6 +159,10 @@ class _Command:
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
+        with self.jobs:
+            return self._stages()
+
+    def _stages(self) -> dict[str, Any]:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
@@ -175,16 +177,16 @@ class _Command:
             self._tell(before["family"].get("odd", {}))
             return self._mark(**{name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark()
-        units = UnitStore(folder.path, [(record.unit, record.lot) for record in status.done])
         # of matrices of forty rows more threads make less
-        with threadpool_limits(1), Pool(options.workers) as pool:
-            each = pool.ordered if len(units) > ALONE else serial
-            learned = partial(analyse, units, status, self.config, options.family, progress, each, options.rules)
+        with threadpool_limits(1), folder.scratch() as scratch:
+            names = [(record.unit, record.lot) for record in status.done]
+            units = stored_units(folder.path, names, jobs.engine() if len(names) > ALONE else map, scratch)
+            learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
             pages = self._timed("pages", partial(jobs.make_pages, odd))
-            written = partial(write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, each)
+            written = partial(write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, units)
             self._timed("tables", written)
         family = FamilySummary(
             units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,

@@ -13,7 +13,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,14 +24,13 @@ from driftlab.config import Config
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
-from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.posterior_map import informed_where_unknown, posterior_of
+from driftlab.family.partitions import Partitions, UnitOfLot
+from driftlab.family.posterior_map import UnitPosterior, informed_where_unknown, posterior_of
 from driftlab.family.record import UnitRecord
-from driftlab.family.shared_effect import SharedEffect, of_effect
-from driftlab.family.shared_effects import SharedEffects
+from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder, UnitRef
+from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
@@ -43,7 +42,6 @@ from fusion_core.chunk import Array
 
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
 PIECE = 10_000  # rows that are made a frame at once
-AT_ONCE = 25  # units that a process is given at once, with the family
 Row = dict[str, Any]
 
 
@@ -55,9 +53,12 @@ def write_fleet(
     yields: Yield | None,
     pages: Collection[str],
     progress: FleetProgress,
-    each: ParallelMap = serial,
+    units: Partitions[Sequence[UnitOfLot]],
 ) -> None:
-    """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
+    """Write family, table and report, each whole or not at all; `pages` are the units that have one.
+
+    `units` are those of the status that are done.
+    """
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
         common = analysis.common.model_dump(mode="json") if analysis.common.effects else None
@@ -67,7 +68,7 @@ def write_fleet(
         )  # fmt: skip
     curves: list[Array] = []
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
-    rows = _rows(folder.path, status, analysis, curves, progress, each)
+    rows = _rows(folder.path, status, analysis, curves, progress, units)
     write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
@@ -83,14 +84,17 @@ def _rows(
     analysis: FamilyAnalysis,
     curves: list[Array],
     progress: FleetProgress,
-    each: ParallelMap,
+    units: Partitions[Sequence[UnitOfLot]],
 ) -> Iterator[Row]:
     """Yield the rows of the table, write the units' maps with the family, and add each unit's curve to `curves`."""
     stage = Stage("tables and maps", total=len(status.records))
     progress(stage)
     family, common, reasons = analysis.family, analysis.common, analysis.reasons
-    units = ((UnitRef(folder, one.unit, one.lot), one, common.of_unit(one.unit)) for one in status.done)
-    parts = iter(()) if family is None else each(partial(_of_the_family, family), units, at_once=AT_ONCE)
+    parts: Iterator[tuple[list[Row], Array]] = iter(())
+    if family is not None:
+        sizes, noise = ([of.get(one.unit) for one in status.done] for of in (common.of_units, common.noise))
+        of_partitions = units.map(partial(_of_the_family, folder, family, common.effects), status.done, noise, sizes)
+        parts = chain.from_iterable(of_partitions)
     for record in status.records:
         part = next(parts, None) if record.state == "done" else None
         if part is None:
@@ -107,21 +111,35 @@ def temperatures(family: Family) -> Array:
     return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
 
 
-def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) -> tuple[list[Row], Array]:
+def _of_the_family(
+    folder: Path,
+    family: Family,
+    effects: Sequence[SharedEffect],
+    units: Sequence[UnitOfLot],
+    records: Sequence[UnitRecord],
+    noise: Sequence[UnitDensities | None],
+    sizes: Sequence[Sequence[OfUnit] | None],
+) -> list[tuple[list[Row], Array]]:
+    """Write the maps of units with the family; return the family's part of each one's rows, and that map's curve."""
+    found = []
+    for (soaked, lot), record, own, size in zip(units, records, noise, sizes, strict=True):
+        if effects:
+            soaked = without_effects(soaked, lot, effects, own)
+        else:
+            soaked = informed_where_unknown(soaked, family, record)
+        found.append(_posterior_rows(folder, posterior_of(family, soaked, lot), size))
+    return found
+
+
+def _posterior_rows(folder: Path, of_unit: UnitPosterior, size: Sequence[OfUnit] | None) -> tuple[list[Row], Array]:
     """Write the map of a unit with the family; return the family's part of its rows, and that map's curve (d, G).
 
     `shape_distance` is that of its coefficients from the mean of its lot, in deviations: 1 is usual.
     """
-    place, record, common = unit
-    soaked, lot = place.read()
-    soaked = common.apart(soaked, lot)
-    if not common.effects:
-        soaked = informed_where_unknown(soaked, family, record)
-    of_unit = posterior_of(family, soaked, lot)
-    posterior = of_unit.posterior
-    path = place.folder / UNITS / place.unit / FAMILY_MAP
+    family, name, lot, posterior = of_unit.family, of_unit.soaked.unit, of_unit.lot, of_unit.posterior
+    path = folder / UNITS / name / FAMILY_MAP
     new = path.with_name(f".{FAMILY_MAP}{NEW}")
-    of_unit.map({"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}).save(new)
+    of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot}).save(new)
     seal(new)
     if why_not_own(path, COMMAND):
         os.rename(path, free(path))
@@ -134,7 +152,7 @@ def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffect
         "family_sigma": np.sqrt(np.mean(of_unit.sigma_at(T) ** 2, axis=0)),
         "shape_distance": np.sqrt(np.array(off) / family.knots.q),
     }
-    for first in common.of_units.get(place.unit, ())[:1]:
+    for first in (size or ())[:1]:
         columns |= {"common_effect": first.c[:, 0], "common_effect_sigma": first.sigma[:, 0]}
     knots = family.knots.peaks.tolist()
     rows = [{"knots": knots, **{name: values[k].tolist() for name, values in columns.items()}} for k in range(len(off))]

@@ -11,24 +11,25 @@ import json
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import filter as matching
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
 from driftlab.evaluation.limits import verdict_of_units, worst
+from driftlab.family.partitions import Engine
 from driftlab.family.record import UnitRecord
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
-from driftlab.production.store import PAGE, FleetFolder
+from driftlab.production.store import PAGE, FleetFolder, UnitPlace
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
-from driftlab.production.unit import Task, certificate_of, key_of, work
+from driftlab.production.unit import Task, UnitResult, certificate_of, key_of, work
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
 from driftlab.spc.yields import COLUMNS
@@ -91,6 +92,24 @@ class UnitJobs:
     again: list[str] = field(default_factory=list)  # units of these that were replaced
     without_recordings: list[str] = field(default_factory=list)  # units that were left as they are
 
+    def __enter__(self) -> Self:
+        self._held = ExitStack()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.close()
+
+    @cached_property
+    def workers(self) -> Workers:
+        """The workers of the whole command, from when they are asked for the first time; raises WorkersError."""
+        return self._held.enter_context(self.options.crew())
+
+    def engine(self) -> Engine:
+        """Return those who go through the units in the folder: the workers, if they reach it, or some of our own."""
+        if self.workers.all_say(self.folder.place.reached):
+            return self.workers.ordered
+        return self._held.enter_context(Pool(self.options.workers)).ordered
+
     def do(self) -> None:
         """Do every unit that is not done, and put it into the folder."""
         stamps = dict(self._to_do())
@@ -100,16 +119,18 @@ class UnitJobs:
         first = next(tasks, None)
         if first is None:
             return
-        with self.options.crew() as workers:
-            for task, result in workers.map(work, chain([first], tasks)):
-                record, files = (
-                    (_failed(task, result), {}) if isinstance(result, WorkerLost) else (result.record, result.files)
-                )
-                self.folder.put(record, files, stamps[task.unit] if record.key else "")  # without: to be done again
-                self.done += 1
-                stage.done += 1
-                stage.failed += record.state == "failed"
-                self.progress(stage)
+        self.folder.begin()
+        done = partial(work_in_place, self.folder.place)
+        for task, result in self.workers.map(done, chain([first], tasks)):
+            if isinstance(result, WorkerLost):
+                result = UnitResult(_failed(task, result), {})
+            if isinstance(result, UnitResult):
+                result = self.folder.place.put(result.record, result.files)
+            self.folder.noted(result, stamps[task.unit] if result.key else "")  # without: to be done again
+            self.done += 1
+            stage.done += 1
+            stage.failed += result.state == "failed"
+            self.progress(stage)
 
     def _to_do(self) -> Iterator[tuple[str, str]]:
         """Yield the units whose stamp is another than when they were done, with the stamp.
@@ -195,13 +216,11 @@ class UnitJobs:
         self.progress(stage)
         records = ((entry, self.folder.record(entry.unit)) for entry in missing)
         todo = [self._task(entry, page=True) for entry, record in records if record and record.state == "done"]
-        if todo:
-            with self.options.crew() as workers:
-                for task, result in workers.map(work, todo):
-                    if not isinstance(result, WorkerLost):
-                        self.folder.put_page(task.unit, result.files)
-                    stage.done += 1
-                    self.progress(stage)
+        for task, result in self.workers.map(work, todo) if todo else ():
+            if not isinstance(result, WorkerLost):
+                self.folder.put_page(task.unit, result.files)
+            stage.done += 1
+            self.progress(stage)
         return [entry.unit for entry in wanted if self._has_page(entry.unit)]
 
     def make_certificates(self, config: Config, records: Sequence[UnitRecord]) -> list[str]:
@@ -225,6 +244,12 @@ class UnitJobs:
             stage.done += 1
         self.progress(stage)
         return failed
+
+
+def work_in_place(place: UnitPlace, task: Task) -> UnitRecord | UnitResult:
+    """Do a unit and put it into the folder, where that is reached from here; return its record, else all of it."""
+    result = work(task)
+    return place.put(result.record, result.files) if place.reached() else result
 
 
 def _failed(task: Task, lost: WorkerLost) -> UnitRecord:
