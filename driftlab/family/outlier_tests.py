@@ -180,16 +180,16 @@ def tests_of(
     laws: TailLaws | None,
 ) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
-    of = {record.unit: record for record in records if record.state == "done"}
     d, names, lots = len(family.axes), list[str](), list[str]()
     curves = np.empty((len(units), len(CURVES), d))
     for own, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
         curves[len(names) : len(names) + len(own)] = table
         names += own
         lots += of_lots
-    none = np.full((2, len(FIGURES), d), np.nan)
-    figures = np.array([of[name].table(FIGURES, d) if name in of else none for name in names])
-    figures = figures.reshape(-1, 2, len(FIGURES), d)
+    figures, places = np.full((len(names), 2, len(FIGURES), d), np.nan), {name: k for k, name in enumerate(names)}
+    for record in records:
+        if record.state == "done" and record.unit in places:
+            figures[places[record.unit]] = record.table(FIGURES, d)
     values = [*curves.swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}

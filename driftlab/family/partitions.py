@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate, chain, islice
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, Generic, Protocol, TypeVar
 
 from driftlab.family.unit_information import UnitInformation
@@ -129,17 +130,13 @@ class Partitions(Generic[C]):
         return tree(self.engine(partial(_sum, function, add), self._blocks(of_units)), add)
 
     def keep(self, name: str, function: Callable[..., R], *of_units: Any) -> Partitions[R]:
-        """Return the function's results as partitions, which stay where they were made; see `map`.
-
-        Those of an earlier pass with this name are no more.
-        """
+        """Return the function's results as partitions, which stay where they were made; see `map`."""
         if self.folder is None:
             results = self.map(function, *of_units)
             held = [InMemory(result, len(part)) for part, result in zip(self.parts, results, strict=True)]
             return Partitions(held, self.engine)
-        files: list[Partition[R]] = [
-            InFile(self.folder / f"{name}-{k}", len(part)) for k, part in enumerate(self.parts)
-        ]
+        own = f"{name}-{token_hex(6)}"  # no worker of another pass, or of a command that has ended, writes these
+        files: list[Partition[R]] = [InFile(self.folder / f"{own}-{k}", len(part)) for k, part in enumerate(self.parts)]
         paths = [[file.path] * len(file) for file in files if isinstance(file, InFile)]
         for _ in self.map(partial(_write, function), [*chain.from_iterable(paths)], *of_units):
             pass

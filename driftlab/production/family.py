@@ -148,7 +148,7 @@ def _fitted(
     try:
         progress(Stage("effects that the units share"))
         common = find_common(units, bias_unit=status.bias_unit)
-        noise = [common.noise.get(record.unit) for record in status.done]
+        noise = [common.noise.get(unit) for unit in status.done.units]
         apart = units.keep("apart", partial(_bare, common.effects), noise)
         progress(Stage("the family"))
         family = fit_family(apart, channel=status.channel, bias_unit=status.bias_unit)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
-from driftlab.production.family import analyse
+from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.manifest import read_manifest
 from driftlab.production.result import FleetResult
 from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, fleet_folder, stored_units
@@ -168,7 +168,7 @@ class _Command:
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
         self._timed("units", jobs.do)
         status = self.status = self._timed("reading", jobs.status)
-        self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done))
+        self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done.units))
         key, before = self._key(), folder.mark
         files = (TABLE, REPORT, *([FAMILY] if before.get("family", {}).get("fitted", True) else ()))
         as_it_was = before.get("key") == key and before.get("complete")
@@ -179,26 +179,21 @@ class _Command:
         self._mark()
         # of matrices of forty rows more threads make less
         with threadpool_limits(1), folder.scratch() as scratch:
-            names = [(record.unit, record.lot) for record in status.done]
-            units = stored_units(folder.path, names, jobs.engine() if len(names) > ALONE else map, scratch)
+            engine = jobs.engine() if len(status.done) > ALONE else map
+            units, whole = (
+                stored_units(folder.path, of.units, [record.lot for record in of], engine, scratch)
+                for of in (status.done, status.records)
+            )
             learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
             pages = self._timed("pages", partial(jobs.make_pages, odd))
-            written = partial(write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, units)
+            written = partial(
+                write_fleet, folder, status, self.config, analysis, self.yields, pages, progress, whole, scratch
+            )
             self._timed("tables", written)
-        family = FamilySummary(
-            units=len(status.done), fitted=analysis.family is not None, odd=odd, lines=analysis.lines,
-            line=analysis.line.sentences, judged=analysis.judged,
-            alarms={analysis.line.units[k]: why for k, why in alarms(analysis.line).items()},
-            capability=[
-                row.as_json(analysis.line.shown(row.quantity).si, analysis.line.units[row.since])
-                for row in analysis.line.capability
-            ],
-            charts=[chart.as_json(analysis.line) for chart in analysis.line.controls],
-        )  # fmt: skip
-        return self._mark(complete=True, key=key, family=family, pages=pages)
+        return self._mark(complete=True, key=key, family=_summary(analysis, len(status.done)), pages=pages)
 
     def _tell(self, odd: Collection[str]) -> None:
         """Count the yield by the columns that were asked for, or by lot."""
@@ -244,3 +239,15 @@ class _Command:
             **more,
         )
         return folder.write_mark(summary.content())
+
+
+def _summary(analysis: FamilyAnalysis, units: int) -> FamilySummary:
+    """Return what `fleet.json` has of the family of so many units, and of their line."""
+    line = analysis.line
+    return FamilySummary(
+        units=units, fitted=analysis.family is not None, odd=analysis.reasons, lines=analysis.lines,
+        line=line.sentences, judged=analysis.judged,
+        alarms={line.units[k]: why for k, why in alarms(line).items()},
+        capability=[row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability],
+        charts=[chart.as_json(line) for chart in line.controls],
+    )  # fmt: skip

@@ -4,7 +4,8 @@ A fleet takes hours, so what is done is not kept back until all is (docs/adr/005
 writer, by a lock; what driftlab did not write is never removed, not even from a unit's folder; and what cannot be done
 again, since its recordings are not there any more, is replaced only on demand.
 
-Records of units (`unit.json`) are read once a command; their soaks (`unit.npz`) one at a time, as they are needed.
+Records of units (`unit.json`) are read once a command, and kept in brief; their soaks (`unit.npz`) are read one at a
+time, as they are needed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pydantic import ValidationError
 from driftlab.family.partitions import SIZE, Engine, Partitions, UnitOfLot
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
+from driftlab.production.unit_records import UnitRecords
 from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
@@ -67,7 +69,7 @@ class FleetFolder:
             (self.path / UNITS).mkdir(exist_ok=True)
             self._finish()
             self.stamps = dict(_stamps(self.path / STAMPS))
-            self._records: dict[str, UnitRecord | None] = {}
+            self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")
         except BaseException:
             self.lock.release()
@@ -97,9 +99,16 @@ class FleetFolder:
 
     def record(self, name: str) -> UnitRecord | None:
         """Return the record of a unit; None where there is none that can be read."""
-        if name not in self._records:
-            self._records[name] = record_of(self.unit(name))
-        return self._records[name]
+        return record_of(self.unit(name))
+
+    def brief(self, name: str) -> UnitRecord | None:
+        """Return what all units need of the record of one; its file is read once."""
+        if name not in self.records:
+            record = self.record(name)
+            if record is None:
+                return None
+            self.records[name] = record
+        return self.records[name]
 
     @property
     def place(self) -> UnitPlace:
@@ -111,9 +120,14 @@ class FleetFolder:
         if self.mark.get("complete"):
             self.write_mark({**self.mark, "complete": False})
 
+    def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
+        """Put a unit in its place, for the one that was there; what others put there is taken along."""
+        self.begin()
+        self.noted(self.place.put(record, files), stamp)
+
     def noted(self, record: UnitRecord, stamp: str) -> None:
         """Note a unit that was put in its place."""
-        self._records[record.unit] = record
+        self.records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
 
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
@@ -158,7 +172,7 @@ class FleetFolder:
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already; one that was edited is put aside."""
         self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
-        self._records[record.unit] = record
+        self.records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
         """Note the state of a unit's recordings: as long as it stays, their contents need not be read."""
@@ -388,14 +402,11 @@ class StoredUnits(Sequence[UnitOfLot]):
 
 
 def stored_units(
-    folder: Path, units: Sequence[tuple[str, str]], engine: Engine = map, scratch: Path | None = None
+    folder: Path, units: Sequence[str], lots: Sequence[str], engine: Engine = map, scratch: Path | None = None
 ) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
-    """Return units of a fleet's folder that were soaked, by names and lots; workers keep files in `scratch`."""
-    parts = [
-        StoredUnits(folder, *(tuple(column) for column in zip(*units[k : k + SIZE], strict=True)))
-        for k in range(0, len(units), SIZE)
-    ]
-    return Partitions(parts, engine, scratch)
+    """Return units of a fleet's folder by names and lots; workers keep files in `scratch`."""
+    cuts = [slice(k, k + SIZE) for k in range(0, len(units), SIZE)]
+    return Partitions([StoredUnits(folder, tuple(units[k]), tuple(lots[k])) for k in cuts], engine, scratch)
 
 
 def record_of(folder: Path) -> UnitRecord | None:

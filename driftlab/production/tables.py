@@ -12,12 +12,11 @@ import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
@@ -30,7 +29,18 @@ from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder
+from driftlab.production.store import (
+    COMMAND,
+    FAMILY,
+    FAMILY_MAP,
+    NEW,
+    REPORT,
+    TABLE,
+    UNITS,
+    FleetFolder,
+    StoredUnits,
+    record_of,
+)
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
@@ -39,9 +49,14 @@ from driftlab.spc.yields import Yield, reasons
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
+from fusion_core.errors import UnreadableFile
+
+if TYPE_CHECKING:
+    import polars as pl
 
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
-PIECE = 10_000  # rows that are made a frame at once
+ROWS = 20_000  # of a group, which is written at once
+MOST_CURVES = 5000  # maps that the report draws
 Row = dict[str, Any]
 
 
@@ -54,10 +69,11 @@ def write_fleet(
     pages: Collection[str],
     progress: FleetProgress,
     units: Partitions[Sequence[UnitOfLot]],
+    scratch: Path,
 ) -> None:
     """Write family, table and report, each whole or not at all; `pages` are the units that have one.
 
-    `units` are those of the status that are done.
+    `units` are all of the status; whoever works on them writes their rows to `scratch`.
     """
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
@@ -66,69 +82,84 @@ def write_fleet(
             folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
             odd_lots=[lot.sentence for lot in analysis.lots],
         )  # fmt: skip
-    curves: list[Array] = []
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
-    rows = _rows(folder.path, status, analysis, curves, progress, units)
-    write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
+    drawn = _drawn(status, analysis)
+    table = _Table(folder.path, analysis.family, analysis.common.effects, tuple(more))
+    stage = Stage("tables and maps", total=len(status.records))
+    progress(stage)
+    names, common = status.records.units, analysis.common
+    shown = np.isin(np.array(names), np.array(drawn))
+    of_units = ([of.get(name) for name in names] for of in (analysis.reasons, common.noise, common.of_units))
+    paths = [scratch / f"table-{k}" for k, part in enumerate(units.parts) for _ in range(len(part))]
+    curves: list[Array] = []
+    for count, own in units.map(table.write, shown, *of_units, paths):
+        curves += own
+        stage.done += count
+        progress(stage)
+    join_tables(folder.hidden(TABLE), dict.fromkeys(paths), more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
-    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
+    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves, drawn)
     overview = replace(overview, yields=yields)
     write_fleet_report(folder.hidden(REPORT), overview)
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
 
-def _rows(
-    folder: Path,
-    status: FleetStatus,
-    analysis: FamilyAnalysis,
-    curves: list[Array],
-    progress: FleetProgress,
-    units: Partitions[Sequence[UnitOfLot]],
-) -> Iterator[Row]:
-    """Yield the rows of the table, write the units' maps with the family, and add each unit's curve to `curves`."""
-    stage = Stage("tables and maps", total=len(status.records))
-    progress(stage)
-    family, common, reasons = analysis.family, analysis.common, analysis.reasons
-    parts: Iterator[tuple[list[Row], Array]] = iter(())
-    if family is not None:
-        sizes, noise = ([of.get(one.unit) for one in status.done] for of in (common.of_units, common.noise))
-        of_partitions = units.map(partial(_of_the_family, folder, family, common.effects), status.done, noise, sizes)
-        parts = chain.from_iterable(of_partitions)
-    for record in status.records:
-        part = next(parts, None) if record.state == "done" else None
-        if part is None:
-            yield from rows_of(record)
-        else:
-            yield from rows_of(record, part[0], reasons.get(record.unit, ()))
-            curves.append(part[1])
-        stage.done += 1
-        progress(stage)
+def _drawn(status: FleetStatus, analysis: FamilyAnalysis) -> list[str]:
+    """Return the units whose curves the report draws: all, or an even sample and the first of an odd shape."""
+    if analysis.family is None:
+        return []
+    names, done = list(analysis.odd), status.done.units
+    bent = {name for name in names if any(one.T is not None for one in analysis.odd[name])}
+    even = set(done[:: max(1, -(-len(done) // MOST_CURVES))])
+    first = set([name for name in done if name in bent][:MOST_CURVES])
+    return [name for name in done if name in even or name in first]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Writer of a partition's rows, and of its units' maps with the family."""
+
+    folder: Path
+    family: Family | None
+    effects: Sequence[SharedEffect]
+    more: tuple[str, ...]  # names of the manifest's own columns
+
+    def write(
+        self,
+        units: StoredUnits,
+        shown: NDArray[np.bool_],
+        odd: Sequence[Sequence[str] | None],
+        noise: Sequence[UnitDensities | None],
+        sizes: Sequence[Sequence[OfUnit] | None],
+        paths: Sequence[Path],
+    ) -> tuple[int, list[Array]]:
+        """Write rows and maps; return the number of the units, and the curves (d, G) of those that are `shown`."""
+        rows, curves = list[Row](), list[Array]()
+        for k, name in enumerate(units.names):
+            record = record_of(self.folder / UNITS / name)
+            if record is None:
+                raise UnreadableFile(
+                    f"{self.folder / UNITS / name}: has no record any more; give the same command again"
+                )
+            if self.family is None or record.state != "done":
+                rows += rows_of(record)
+                continue
+            soaked, lot = units[k]
+            if self.effects:
+                soaked = without_effects(soaked, lot, self.effects, noise[k])
+            else:
+                soaked = informed_where_unknown(soaked, self.family, record)
+            part, curve = _posterior_rows(self.folder, posterior_of(self.family, soaked, lot), sizes[k])
+            rows += rows_of(record, part, odd[k] or ())
+            curves += [curve] * bool(shown[k])
+        frame_of(rows, self.more).write_parquet(paths[0])
+        return len(units), curves
 
 
 def temperatures(family: Family) -> Array:
     """Return temperatures (G,) over the family's domain, degC."""
     return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
-
-
-def _of_the_family(
-    folder: Path,
-    family: Family,
-    effects: Sequence[SharedEffect],
-    units: Sequence[UnitOfLot],
-    records: Sequence[UnitRecord],
-    noise: Sequence[UnitDensities | None],
-    sizes: Sequence[Sequence[OfUnit] | None],
-) -> list[tuple[list[Row], Array]]:
-    """Write the maps of units with the family; return the family's part of each one's rows, and that map's curve."""
-    found = []
-    for (soaked, lot), record, own, size in zip(units, records, noise, sizes, strict=True):
-        if effects:
-            soaked = without_effects(soaked, lot, effects, own)
-        else:
-            soaked = informed_where_unknown(soaked, family, record)
-        found.append(_posterior_rows(folder, posterior_of(family, soaked, lot), size))
-    return found
 
 
 def _posterior_rows(folder: Path, of_unit: UnitPosterior, size: Sequence[OfUnit] | None) -> tuple[list[Row], Array]:
@@ -203,26 +234,30 @@ def _loop(record: UnitRecord) -> Row:
     return {"loop": record.loop.get("verdict") or record.loop.get("why_not"), "effects": added}
 
 
-def write_table(path: Path, rows: Iterable[Row], more: Iterable[str], metadata: Mapping[str, str]) -> None:
-    """Write rows as a Parquet file, with units and meanings of its columns in its metadata beside `metadata`.
-
-    `more` are the names of the manifest's own columns.
-    """
+def frame_of(rows: Iterable[Row], more: Iterable[str]) -> pl.DataFrame:
+    """Return rows as a frame; `more` are the names of the manifest's own columns."""
     import polars as pl
     from polars import selectors
 
-    columns, left = all_columns(more), iter(rows)
     types = {
         "text": pl.String(), "texts": pl.List(pl.String()), "number": pl.Float64(), "numbers": pl.List(pl.Float64()),
         "count": pl.Int64(), "flag": pl.Boolean(),
     }  # fmt: skip
-    schema = {name: types[column.type] for name, column in columns.items()}
-    pieces = [pl.DataFrame(schema=schema)]
-    while piece := list(islice(left, PIECE)):
-        pieces.append(pl.DataFrame(piece, schema=schema))
-    described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in columns.items()}
-    table = pl.concat(pieces).with_columns(selectors.float().fill_nan(None))
-    table.write_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
+    schema = {name: types[column.type] for name, column in all_columns(more).items()}
+    return pl.DataFrame(list(rows), schema=schema).with_columns(selectors.float().fill_nan(None))
+
+
+def join_tables(path: Path, parts: Iterable[Path], more: Iterable[str], metadata: Mapping[str, str]) -> None:
+    """Write tables one behind the other as a Parquet file, in so many rows at a time.
+
+    Units and meanings of its columns are in its metadata, beside `metadata`.
+    """
+    import polars as pl
+
+    described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in all_columns(more).items()}
+    pl.scan_parquet(list(parts)).sink_parquet(
+        path, metadata={**metadata, "columns": json.dumps(described)}, row_group_size=ROWS
+    )
 
 
 Type = Literal["text", "texts", "number", "numbers", "count", "flag"]
@@ -311,6 +346,7 @@ def _overview(
     analysis: FamilyAnalysis,
     pages: Collection[str],
     curves: Sequence[Array],
+    drawn: Sequence[str],
 ) -> FleetOverview:
     family, axes = analysis.family, analysis.line.axes
     T = np.zeros(0) if family is None else temperatures(family)
@@ -321,7 +357,7 @@ def _overview(
         line=analysis.line,
         T=T,
         curves=np.stack(curves) if curves else np.zeros((0, len(axes), len(T)), dtype=np.float32),
-        drawn=[record.unit for record in status.done] if curves else [],
+        drawn=drawn,
         mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
         odd=analysis.odd,
         effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],

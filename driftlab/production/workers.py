@@ -344,7 +344,9 @@ class Pool(Workers):
     def _begin(self, function: Callable[..., Any], item: Any) -> Worker:
         """Return a worker that has the item in work."""
         while True:
-            worker = self._idle.pop() if self._idle else Worker(function.__module__)
+            worker = (
+                self._idle.pop() if self._idle else Worker(getattr(function, "func", function).__module__)
+            )  # of a partial
             try:
                 worker.take(function, item)
             except OSError:  # it died while it had nothing to do

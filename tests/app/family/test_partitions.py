@@ -11,10 +11,9 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
-from driftlab.family import mixed_model, partitions
+from driftlab.family import mixed_model, outlier_tests, partitions
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.outlier_tests import CurveStatistics, tests_of
 from driftlab.family.partitions import InMemory, Partitions, added, in_partitions, tree
 from driftlab.production.workers import Pool
 
@@ -67,7 +66,8 @@ def _with_names(own: list[partitions.UnitOfLot], names: list[str], places: np.nd
 def _found(units: Partitions[list[partitions.UnitOfLot]]) -> tuple[Family, np.ndarray]:
     family = fit_family(units)
     family = family.model_copy(update={"bands": measure_bands(family, units)})
-    return family, tests_of(family, CurveStatistics(family, fitted=True), units, [], None).values
+    statistics = outlier_tests.CurveStatistics(family, fitted=True)
+    return family, outlier_tests.tests_of(family, statistics, units, [], None).values
 
 
 @pytest.mark.parametrize("sample", [1500, 40])  # all units, and some of them

@@ -19,8 +19,10 @@ def reml(
     """Return the law of highest restricted likelihood, every unit's weight 1, and the expectations under it."""
     w, lots = np.ones(len(J)), int(lot.max()) > 0
     law = start if lots else replace(start, Lambda=np.zeros_like(start.Sigma))
-    units = Partitions([InMemory(OfAxes(J[k : k + 3, None], h[k : k + 3, None]), len(J[k : k + 3]))
-                        for k in range(0, len(J), 3)])  # fmt: skip
+    parts = [
+        InMemory(OfAxes(J[k : k + 90, None], h[k : k + 90, None]), len(J[k : k + 90])) for k in range(0, len(J), 90)
+    ]
+    units = Partitions(parts)
     for _ in range(most):
         later = m_step(e_step(law, units, 0, lot, w), w, None, lots=lots)
         law, moved = later, change(law, later)

@@ -33,7 +33,7 @@ def kept(tmp_path_factory):
         soaked = UnitInformation.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
         (folder / UNITS / soaked.unit).mkdir(parents=True)
         (folder / UNITS / soaked.unit / "unit.npz").write_bytes(soaked.to_bytes())
-    return stored_units(folder, [(f"{k:02d}", f"L{k % 2}") for k in range(COUNT)])
+    return stored_units(folder, [f"{k:02d}" for k in range(COUNT)], [f"L{k % 2}" for k in range(COUNT)])
 
 
 @pytest.fixture(scope="module")
