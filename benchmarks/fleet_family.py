@@ -105,7 +105,7 @@ def _others() -> list[tuple[float, float]]:
 
 
 def measured(folder: Path, count: int, workers: int) -> dict[str, object]:
-    """Return what `driven` says of so many units, done in a process group of its own."""
+    """Return the result of `driven` of so many units, in a process group of its own."""
     out = folder / f"fleet-{count}"
     manifest = put_units(out, count)
     config = folder / "family.yaml"

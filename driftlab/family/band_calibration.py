@@ -46,7 +46,7 @@ SAMPLE = 400  # units of a larger family that the bands are to be measured on
 
 def sample_of(count: int) -> list[int]:
     """Return the places of the sampled units, of so many."""
-    return np.unique(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int)).tolist()
+    return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int))]
 
 
 def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
@@ -118,7 +118,7 @@ def _measured(
 def _alike(units: Partitions[Sequence[UnitOfLot]]) -> list[UnitInformation]:
     """Return some units that have rows, which tell a walk that units have alike."""
     have = [k for k, known in enumerate(one for own in units.map(_have_rows) for one in own) if known]
-    some = np.unique(np.linspace(0, len(have) - 1, ALIKE).astype(int)) if have else []
+    some = np.unique(np.linspace(0, len(have) - 1, ALIKE if have else 0).astype(int))
     return [soaked for soaked, _ in units.chosen(have[k] for k in some).read()]
 
 

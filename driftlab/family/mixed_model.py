@@ -147,7 +147,7 @@ def _survey(
 def _spans(
     axes: tuple[str, ...], step: float, units: Sequence[UnitOfLot]
 ) -> tuple[Counter[tuple[int, int]], list[str]]:
-    """Return how many units saw each range of knots, by its first and its intervals, and each unit's lot."""
+    """Return the number of units that saw each range of knots, by its first and its intervals, and each unit's lot."""
     spans, lots = Counter[tuple[int, int]](), []
     for soaked, lot in units:
         if soaked.axes != axes or soaked.knots.step != step:
@@ -191,7 +191,9 @@ def _means_of_all(
 def _of_their_lots(
     knots: SplineBasis, L: Array, limits: Array, units: Sequence[UnitOfLot], lot: Index, centres: Mapping[int, Array]
 ) -> dict[int, tuple[Array, Array]]:
-    """Return what units say of the means of their lots, (d, q, q) and (d, q) in the coordinates L, by lot.
+    """Return the information of units on the means of their lots, and that times their values, by lot.
+
+    (d, q, q) and (d, q), in the coordinates L.
 
     Weighted by their distances from `centres` (d, q), which are in those coordinates.
     """

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, chain, islice
 from pathlib import Path
@@ -37,6 +37,9 @@ class Engine(Protocol):
     def __call__(self, function: Callable[[Any], R], items: Iterable[Any]) -> Iterator[R]:
         """Yield the result of each item."""
         ...
+
+
+serial: Engine = map  # type: ignore[assignment]  # in this process
 
 
 class Partition(Protocol[C]):
@@ -106,7 +109,7 @@ class Partitions(Generic[C]):
     """
 
     parts: Sequence[Partition[C]]
-    engine: Engine = field(default=map)  # type: ignore[assignment]
+    engine: Engine = serial
     folder: Path | None = None
 
     def __len__(self) -> int:

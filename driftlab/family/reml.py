@@ -199,7 +199,7 @@ def e_step(law: VarianceComponents, units: Partitions[OfAxes], axis: int, lot: I
 
 
 def _of_lots(axis: int, L: Array, units: OfAxes, lot: Index, w: Array) -> dict[int, tuple[Array, Array]]:
-    """Return what units say of the means of their lots, (q, q) and (q,), by lot."""
+    """Return the information of units on the means of their lots, (q, q), and that times their values (q,), by lot."""
     _, own, K = _expected(L, units.J[:, axis], units.h[:, axis], w)
     n, q = own.shape
     present = np.unique(lot)

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
+from driftlab.family.partitions import serial
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.manifest import read_manifest
 from driftlab.production.result import FleetResult
@@ -179,7 +180,7 @@ class _Command:
         self._mark()
         # of matrices of forty rows more threads make less
         with threadpool_limits(1), folder.scratch() as scratch:
-            engine = jobs.engine() if len(status.done) > ALONE else map
+            engine = jobs.engine() if len(status.done) > ALONE else serial
             units, whole = (
                 stored_units(folder.path, of.units, [record.lot for record in of], engine, scratch)
                 for of in (status.done, status.records)
@@ -242,7 +243,7 @@ class _Command:
 
 
 def _summary(analysis: FamilyAnalysis, units: int) -> FamilySummary:
-    """Return what `fleet.json` has of the family of so many units, and of their line."""
+    """Return the part of `fleet.json` on the family of so many units, and on their line."""
     line = analysis.line
     return FamilySummary(
         units=units, fitted=analysis.family is not None, odd=analysis.reasons, lines=analysis.lines,

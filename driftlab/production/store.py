@@ -23,7 +23,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from driftlab.family.partitions import SIZE, Engine, Partitions, UnitOfLot
+from driftlab.family.partitions import SIZE, Engine, Partitions, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.unit_records import UnitRecords
@@ -102,7 +102,7 @@ class FleetFolder:
         return record_of(self.unit(name))
 
     def brief(self, name: str) -> UnitRecord | None:
-        """Return what all units need of the record of one; its file is read once."""
+        """Return the record of a unit in brief, of which the file is read once; None where it cannot be read."""
         if name not in self.records:
             record = self.record(name)
             if record is None:
@@ -402,7 +402,7 @@ class StoredUnits(Sequence[UnitOfLot]):
 
 
 def stored_units(
-    folder: Path, units: Sequence[str], lots: Sequence[str], engine: Engine = map, scratch: Path | None = None
+    folder: Path, units: Sequence[str], lots: Sequence[str], engine: Engine = serial, scratch: Path | None = None
 ) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
     """Return units of a fleet's folder by names and lots; workers keep files in `scratch`."""
     cuts = [slice(k, k + SIZE) for k in range(0, len(units), SIZE)]

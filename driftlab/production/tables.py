@@ -87,9 +87,11 @@ def write_fleet(
     table = _Table(folder.path, analysis.family, analysis.common.effects, tuple(more))
     stage = Stage("tables and maps", total=len(status.records))
     progress(stage)
-    names, common = status.records.units, analysis.common
+    names = status.records.units
     shown = np.isin(np.array(names), np.array(drawn))
-    of_units = ([of.get(name) for name in names] for of in (analysis.reasons, common.noise, common.of_units))
+    of_units = (
+        [of.get(name) for name in names] for of in (analysis.reasons, analysis.common.noise, analysis.common.of_units)
+    )
     paths = [scratch / f"table-{k}" for k, part in enumerate(units.parts) for _ in range(len(part))]
     curves: list[Array] = []
     for count, own in units.map(table.write, shown, *of_units, paths):

@@ -7,7 +7,7 @@ key, its numbers in one array, and texts that it has in common with others.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 
@@ -20,7 +20,7 @@ OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
 
 class _Brief(NamedTuple):
     key: str
-    state: str
+    state: Literal["done", "failed"]
     error: str
     common: tuple[Any, ...]  # lot, date, other columns, channel, bias_unit, axes, driftlab, limits
     numbers: bytes
