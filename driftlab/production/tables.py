@@ -102,8 +102,7 @@ def write_fleet(
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
     overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves, drawn)
-    overview = replace(overview, yields=yields)
-    write_fleet_report(folder.hidden(REPORT), overview)
+    write_fleet_report(folder.hidden(REPORT), replace(overview, yields=yields))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
 
