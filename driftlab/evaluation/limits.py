@@ -195,14 +195,16 @@ def verdict_of_units(units: Iterable[Sequence[Mapping[str, Any]]]) -> str:
 
     Of each unit, `units` has the rows of its limits as JSON has them.
     """
-    judged = [(word, rows) for rows in units if (word := worst(rows)) is not None]
+    counts, by = Counter[str](), Counter[tuple[str, str]]()
+    for rows in units:
+        if (word := worst(rows)) is not None:
+            counts[word] += 1
+            by.update((word, NAMES[row["name"]]) for row in rows if row["verdict"] == word != "pass")
     parts = []
     for word in ("pass", "fail", "undecided", "not measured"):
-        of_word = [rows for verdict, rows in judged if verdict == word]
-        names = Counter(NAMES[row["name"]] for rows in of_word for row in rows if row["verdict"] == word != "pass")
-        by = ", ".join(f"{name} {count:,}" for name, count in names.most_common())
-        parts += [f"{len(of_word):,} {word}{f' ({by})' * bool(by)}"] if of_word or word == "pass" else []
-    return f"limits: {'; '.join(parts)}" if judged else ""
+        names = ", ".join(f"{name} {count:,}" for (of, name), count in by.most_common() if of == word)
+        parts += [f"{counts[word]:,} {word}{f' ({names})' * bool(names)}"] if counts[word] or word == "pass" else []
+    return f"limits: {'; '.join(parts)}" if counts else ""
 
 
 def outcome(line: str) -> str:

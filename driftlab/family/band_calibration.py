@@ -15,7 +15,7 @@ share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import NormalDist
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
 from driftlab.family.mixed_model import Family, Posterior, fit_family
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
@@ -43,15 +43,13 @@ ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk,
 GAINED = 0.05  # of a variance, that the whole soak must have taken away
 SAMPLE = 400  # units of a larger family that the bands are to be measured on
 
-Pairs = Sequence[tuple[UnitInformation, str]]
 
-
-def sample_of(count: int) -> set[int]:
+def sample_of(count: int) -> list[int]:
     """Return the places of the sampled units, of so many."""
-    return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
+    return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int))]
 
 
-def measure_bands(family: Family, units: Pairs, each: ParallelMap = serial) -> Bands | None:
+def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
     A part in which no unit has samples is left out: the nearest other part is taken for it.
@@ -59,42 +57,50 @@ def measure_bands(family: Family, units: Pairs, each: ParallelMap = serial) -> B
     Parameters
     ----------
     family : Family
-    units : sequence of (UnitInformation, str)
-        Its units and their lots, or a sample of them.
-    each : ParallelMap, optional
-        Goes through the folds.
+    units : FamilyUnits
+        Its units and their lots, or a sample of them; with their rows.
     """
-    first, last = np.array([soaked.knots.domain for soaked, _ in units]).T
+    units = in_partitions(units, A_FEW)
+    rows = [row for own in units.map(_ranges) for row in own]
+    first, last = np.array([domain for domain, _ in rows]).T
     whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
     long = long[np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
-    folds = list(each(partial(_measured, family, whole), _folds(units, long), at_once=1))
+    fold = np.full(len(units), -1)
+    fold[long] = np.arange(len(long)) % FOLDS
+    bare = units.keep("bare", _bare)
+    families = [fit_family(bare.chosen(np.flatnonzero(fold != k)), start=family) for k in range(FOLDS)]
+    measured = units.chosen(long, A_FEW).reduce(partial(_measured, families, whole), fold[long])
     parts, factors, far = [], [], []
-    for k, part in enumerate(PARTS):
-        if measured := [pair for fold in folds for pair in fold[k]]:
+    for part, pairs in zip(PARTS, measured, strict=True):
+        if pairs:
             parts.append(part)
-            factors.append(_factors([scores for scores, _ in measured], len(long)))
-            far.append(tuple(np.quantile([distances for _, distances in measured], 1 - FAR, axis=0).tolist()))
-    noise = _typical([soaked for soaked, _ in units])
+            factors.append(_factors([scores for scores, _ in pairs], len(long)))
+            far.append(tuple(np.quantile([distances for _, distances in pairs], 1 - FAR, axis=0).tolist()))
+    noise = _typical(np.array([noise for _, noise in rows]), _alike(units))
     return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
-def _folds(units: Pairs, long: NDArray[np.intp]) -> Iterator[tuple[Pairs, Pairs]]:
-    """Yield the units that are left in each fold, without their rows, and those of `long` that are left out."""
-    bare = [(replace(soaked, recordings=()), lot) for soaked, lot in units]
-    for fold in range(FOLDS):
-        out = set(long[fold::FOLDS].tolist())
-        yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
+def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array]]]:
+    """Return the range of each unit, degC, and the densities of its white noise and its walk."""
+    return [(soaked.knots.domain, (soaked.white, soaked.walk)) for soaked, _ in units]
 
 
-def _measured(of_all: Family, whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[list[tuple[Array, Array]]]:
-    """Return, of each part, z and g of the units that were left out of their family in a fold, and their distances."""
-    family, measured = fit_family(fold[0], start=of_all), [list[tuple[Array, Array]]() for _ in PARTS]
-    marginal = {lot: family.marginal(lot) for _, lot in fold[1]}
-    for soaked, lot in fold[1]:
-        before = marginal[lot]
+def _bare(units: Sequence[UnitOfLot]) -> list[UnitOfLot]:
+    """Return units without their rows."""
+    return [(replace(soaked, recordings=()), lot) for soaked, lot in units]
+
+
+def _measured(
+    families: Sequence[Family], whole: tuple[float, float], units: Sequence[UnitOfLot], fold: NDArray[np.intp]
+) -> tuple[list[tuple[Array, Array]], ...]:
+    """Return, of each part, z and g of units by the families that they were left out of, and their distances."""
+    measured: tuple[list[tuple[Array, Array]], ...] = tuple([] for _ in PARTS)
+    for (soaked, lot), k in zip(units, fold.tolist(), strict=True):
+        family = families[k]
+        before = family.marginal(lot)
         more = before.informed(*family.information_of(soaked))
         (low, high), (first, last) = soaked.knots.domain, family.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
@@ -109,25 +115,33 @@ def _measured(of_all: Family, whole: tuple[float, float], fold: tuple[Pairs, Pai
     return measured
 
 
-def _typical(units: Sequence[UnitInformation]) -> Typical:
-    """Return the noise of units; their walk, which a soak may hardly show, as some of them have it alike.
+def _alike(units: Partitions[Sequence[UnitOfLot]]) -> list[UnitInformation]:
+    """Return some units that have rows, which tell a walk that units have alike."""
+    have = [k for k, known in enumerate(one for own in units.map(_have_rows) for one in own) if known]
+    some = np.unique(np.linspace(0, len(have) - 1, ALIKE if have else 0).astype(int))
+    return [soaked for soaked, _ in units.chosen(have[k] for k in some).read()]
+
+
+def _have_rows(units: Sequence[UnitOfLot]) -> list[bool]:
+    return [bool(soaked.recordings) for soaked, _ in units]
+
+
+def _typical(noise: Array, some: Sequence[UnitInformation]) -> Typical:
+    """Return the noise of units with white noise and walk (n, 2, d); the walk, which a soak may hardly show, of `some`.
 
     Where their sweeps need a larger walk than is likely by neighbouring rows, that is in it too.
     """
     tiny = np.finfo(float).tiny
-    logs = {name: np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny)) for name in ("white", "walk")}
-    middle = {name: np.median(of, axis=0) for name, of in logs.items()}
-    spread = {name: 1.4826 * np.median(np.abs(of - middle[name]), axis=0) for name, of in logs.items()}
-    with_rows = [soaked for soaked in units if soaked.recordings]
-    if with_rows:
-        some = [with_rows[k] for k in np.unique(np.linspace(0, len(with_rows) - 1, ALIKE).astype(int))]
+    logs = np.log(np.maximum(noise, tiny))
+    white, walk = middle = np.median(logs, axis=0)
+    spread = 1.4826 * np.median(np.abs(logs - middle), axis=0)
+    if some:
         alike, likely = common_walk([soaked.recordings for soaked in some], some[0].knots.step)
-        more = np.exp(middle["walk"]) / np.maximum(np.median(likely, axis=0), tiny)
-        walk = np.exp(middle["white"]) * alike * np.where(more > PASSES, more, 1.0)
-        middle["walk"] = np.log(np.maximum(walk, tiny))
+        more = np.exp(walk) / np.maximum(np.median(likely, axis=0), tiny)
+        walk = np.log(np.maximum(np.exp(white) * alike * np.where(more > PASSES, more, 1.0), tiny))
     return Typical(
-        white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
-        white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
+        white=tuple(np.exp(white).tolist()), walk=tuple(np.exp(walk).tolist()),
+        white_spread=tuple(spread[0].tolist()), walk_spread=tuple(spread[1].tolist()),
     )  # fmt: skip
 
 

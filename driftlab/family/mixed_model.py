@@ -7,10 +7,11 @@ information on the rest: its posterior there is that of a unit like it. d axes, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated, Any, Literal, Protocol
+from functools import cached_property, partial
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -28,10 +29,13 @@ from driftlab import __version__
 from driftlab.family.bands import Bands
 from driftlab.family.baseline import Baseline
 from driftlab.family.basis import SplineBasis
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import FamilyUnits, Partitions, UnitOfLot, added, in_partitions
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
 from driftlab.family.reml import (
+    ByLot,
+    Index,
     Means,
+    OfAxes,
     RemlFit,
     VarianceComponents,
     fit_axis,
@@ -57,9 +61,8 @@ MIN_SHARE = 0.02  # of all units, likewise
 
 
 def fit_family(
-    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0,
-    each: ParallelMap = serial, start: Family | None = None,
-) -> Family:  # fmt: skip
+    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, start: Family | None = None
+) -> Family:
     """Return the family of units.
 
     Parameters
@@ -69,8 +72,6 @@ def fit_family(
         Whose bias, and its SI unit.
     seed : int
         Of the sample of SAMPLE units that Sigma is of, where there are more.
-    each : ParallelMap, optional
-        Goes through the axes.
     start : Family, optional
         One of nearly these units: its domain is taken, and EM begins with its law.
 
@@ -80,114 +81,147 @@ def fit_family(
         If there are fewer than MIN_UNITS units, they differ in axes or in the step of their knots, or no temperature
         was seen by MIN_UNITS of them.
     """
-    knots, axes, lots = _survey(units)
+    units = in_partitions(units)
+    knots, axes, lots, lot = _survey(units)
     knots = knots if start is None else start.knots
-    n, d, numbers = len(lots), len(axes), numbered(lots)
+    n, d = len(units), len(axes)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
-    present, lot = np.unique([numbers[lots[k]] for k in chosen], return_inverse=True)
-    J, h, names = _sample(units, knots, set(chosen.tolist()))
+    present, own = np.unique(lot[chosen], return_inverse=True)
+    sample = (units if n <= SAMPLE else units.chosen(chosen)).keep("sample", partial(_stacked, knots))
     laws = [None] * d if start is None else list(map(VarianceComponents, start.Sigma, start.Lambda))
-    of_axes = ((J[:, axis], h[:, axis], lot, knots.peaks, laws[axis]) for axis in range(d))
-    fits = list(each(fit_axis, of_axes, at_once=1))
+    fits = [fit_axis(sample, axis, own, knots.peaks, laws[axis]) for axis in range(d)]
     w = np.stack([fit.w for fit in fits], axis=1)
-    if n > SAMPLE:
-        del J, h
-        means = _means_of_all(units, knots, fits, present, [numbers[name] for name in lots])
-    else:
-        means = [fit.expected.means for fit in fits]
+    means = _means_of_all(units, knots, fits, present, lot) if n > SAMPLE else [fit.expected.means for fit in fits]
+    low = np.flatnonzero(np.any(w < 0.5, axis=1))
+    names = [soaked.unit for soaked, _ in units.chosen(chosen[low]).read()]
     return Family(
         channel=channel, bias_unit=bias_unit, axes=axes, first=knots.first, intervals=knots.intervals,
         step=knots.step, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
         mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
-        Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, numbers, means),
-        weights={name: w[k].tolist() for k, name in enumerate(names) if np.any(w[k] < 0.5)},
+        Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, means),
+        weights={name: w[k].tolist() for name, k in zip(names, low, strict=True)},
         steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
     )  # fmt: skip
 
 
-def _survey(units: FamilyUnits) -> tuple[SplineBasis, tuple[str, ...], list[str]]:
-    """Return the knots over the temperatures that enough units saw, the axes, and each unit's lot.
+def _survey(
+    units: Partitions[Sequence[UnitOfLot]],
+) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Index]:
+    """Return the knots over the temperatures that enough units saw, and the axes.
+
+    And of each lot its number and its units; and each unit's lot by number (n,).
 
     Raises
     ------
     ValueError
         As `fit_family`.
     """
-    lots, spans, axes, step = [], [], None, 0.0
+    if len(units) < MIN_UNITS:
+        raise ValueError(f"a family of {len(units)} units; at least {MIN_UNITS} are needed to know how units differ")
+    first = next(units.read())[0]
+    axes, step = first.axes, first.knots.step
+    spans, places, columns = Counter[tuple[int, int]](), dict[str, int](), []
+    for own, lots in units.map(partial(_spans, axes, step)):
+        spans.update(own)
+        columns.append(np.array([places.setdefault(lot, len(places)) for lot in lots]))
+    numbers = numbered(places, len(units))
+    lot = np.array([numbers[name] for name in places])[np.concatenate(columns)]
+    counts = np.bincount(np.concatenate(columns))
+    lowest = min(low for low, _ in spans)
+    seen = np.zeros(max(sum(span) for span in spans) - lowest, dtype=int)
+    for (low, intervals), count in spans.items():
+        seen[low - lowest : low - lowest + intervals] += count
+    least = max(MIN_UNITS, MIN_SHARE * len(units))
+    enough = np.flatnonzero(seen >= least)
+    if len(enough) == 0:
+        raise ValueError(
+            f"no temperature was seen by {int(np.ceil(least))} of {len(units)} units; soak the units of a family over "
+            "one range"
+        )
+    knots = SplineBasis(lowest + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
+    return knots, axes, {name: (numbers[name], int(counts[places[name]])) for name in numbers}, lot
+
+
+def _spans(
+    axes: tuple[str, ...], step: float, units: Sequence[UnitOfLot]
+) -> tuple[Counter[tuple[int, int]], list[str]]:
+    """Return the number of units that saw each range of knots, by its first and its intervals, and each unit's lot."""
+    spans, lots = Counter[tuple[int, int]](), []
     for soaked, lot in units:
-        lots.append(lot)
-        spans.append((soaked.knots.first, soaked.knots.intervals))
-        axes, step = axes or soaked.axes, step or soaked.knots.step
         if soaked.axes != axes or soaked.knots.step != step:
             raise ValueError(
                 f"unit {soaked.unit} has axes {', '.join(soaked.axes)} and knots {soaked.knots.step} K apart, others "
                 f"{', '.join(axes)} and {step} K; a family is of one type of unit, soaked alike"
             )
-    if axes is None or len(lots) < MIN_UNITS:
-        raise ValueError(f"a family of {len(lots)} units; at least {MIN_UNITS} are needed to know how units differ")
-    first = min(span[0] for span in spans)
-    seen = np.zeros(max(sum(span) for span in spans) - first, dtype=int)
-    for start, count in spans:
-        seen[start - first : start - first + count] += 1
-    least = max(MIN_UNITS, MIN_SHARE * len(lots))
-    enough = np.flatnonzero(seen >= least)
-    if len(enough) == 0:
-        raise ValueError(
-            f"no temperature was seen by {int(np.ceil(least))} of {len(lots)} units; soak the units of a family over "
-            "one range"
-        )
-    knots = SplineBasis(first + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
-    return knots, axes, lots
+        spans[soaked.knots.first, soaked.knots.intervals] += 1
+        lots.append(lot)
+    return spans, lots
 
 
-def numbered(lots: list[str]) -> dict[str, int]:
+def numbered(lots: Iterable[str], units: int) -> dict[str, int]:
     """Return a number for each lot; 0 for all where every unit has one of its own, which tells nothing of lots."""
-    names = sorted(set(lots))
-    return dict.fromkeys(names, 0) if len(names) == len(lots) else {name: k for k, name in enumerate(names)}
+    names = sorted(lots)
+    return dict.fromkeys(names, 0) if len(names) == units else {name: k for k, name in enumerate(names)}
 
 
-def _sample(units: FamilyUnits, knots: SplineBasis, chosen: set[int]) -> tuple[Array, Array, list[str]]:
-    """Return J (n, d, q, q), h (n, d, q) and the names of the chosen units."""
-    sample = ((soaked.unit, *marginalised(soaked, knots)) for k, (soaked, _) in enumerate(units) if k in chosen)
-    names, J, h = zip(*sample, strict=True)
-    return np.stack(J), np.stack(h), list(names)
+def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
+    """Return the information of units on knots."""
+    J, h = zip(*(marginalised(soaked, knots) for soaked, _ in units), strict=True)
+    return OfAxes(np.stack(J), np.stack(h))
 
 
 def _means_of_all(
-    units: FamilyUnits, knots: SplineBasis, fits: list[RemlFit], present: Array, lot: list[int]
+    units: Partitions[Sequence[UnitOfLot]], knots: SplineBasis, fits: list[RemlFit], present: Index, lot: Index
 ) -> list[Means]:
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
-    d, q, G, one = len(fits), knots.q, max(lot) + 1, np.eye(knots.q)
+    d, q, G = len(fits), knots.q, int(lot.max()) + 1
     L, inverse, spread = (np.stack(part) for part in zip(*(fit.law.root() for fit in fits), strict=True))
-    limits, back = np.array([fit.limit for fit in fits]), L.transpose(0, 2, 1)
-    centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[:, None], G, axis=1)
-    centres[:, present] += np.stack([fit.expected.means.shifts for fit in fits])
+    centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[None], G, axis=0)
+    centres[present] += np.stack([fit.expected.means.shifts for fit in fits], axis=1)
+    told = partial(_of_their_lots, knots, L, np.array([fit.limit for fit in fits]))
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
-    for g, (soaked, _) in zip(lot, units, strict=True):
-        J, h = marginalised(soaked, knots)
-        A, a = back @ J @ L, back @ h[..., None]
-        K = one - np.linalg.inv(A + one)
-        z = (a - K @ (a + inverse @ centres[:, g, :, None]))[..., 0]
-        w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
-        V = np.linalg.inv(A + w * one)
-        information[:, g] += w * (one - w * V)
-        weighted[:, g] += (w * V @ a)[..., 0]
+    at_centres = np.einsum("dij,gdj->gdi", inverse, centres)
+    for g, (own_information, own_weighted) in units.reduce(told, lot, ByLot(at_centres, lot)).items():
+        information[:, g], weighted[:, g] = own_information, own_weighted
     return [means_of(*own).turned(L[k]) for k, own in enumerate(zip(information, weighted, spread, strict=True))]
 
 
-def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, LotEffect]:
-    """Return the effects of the lots that have a name, or of the only one."""
-    if len(set(numbers.values())) < len(numbers):
+def _of_their_lots(
+    knots: SplineBasis, L: Array, limits: Array, units: Sequence[UnitOfLot], lot: Index, centres: Mapping[int, Array]
+) -> dict[int, tuple[Array, Array]]:
+    """Return the information of units on the means of their lots, and that times their values, by lot.
+
+    (d, q, q) and (d, q), in the coordinates L.
+
+    Weighted by their distances from `centres` (d, q), which are in those coordinates.
+    """
+    one, back = np.eye(knots.q), L.transpose(0, 2, 1)
+    sums: dict[int, tuple[Array, Array]] = {}
+    for (soaked, _), g in zip(units, lot.tolist(), strict=True):
+        J, h = marginalised(soaked, knots)
+        A, a = back @ J @ L, back @ h[..., None]
+        K = one - np.linalg.inv(A + one)
+        z = (a - K @ (a + centres[g][..., None]))[..., 0]
+        w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
+        V = np.linalg.inv(A + w * one)
+        own = w * (one - w * V), (w * V @ a)[..., 0]
+        sums[g] = added(sums[g], own) if g in sums else own
+    return sums
+
+
+def _lots(lots: Mapping[str, tuple[int, int]], means: list[Means]) -> dict[str, LotEffect]:
+    """Return the effects of the lots that have a name, or of the only one; of each its number and its units."""
+    if len({number for number, _ in lots.values()}) < len(lots):
         return {}
     return {
         name: LotEffect(
-            units=lots.count(name), shift=np.stack([m.shifts[g] for m in means]),
+            units=count, shift=np.stack([m.shifts[g] for m in means]),
             sigma=np.sqrt(np.stack([np.diag(m.shifts_covariance[g]) for m in means])),
             mean_covariance=_symmetric([m.of_lot[g] for m in means]),
         )
-        for name, g in numbers.items() if name or len(numbers) == 1
+        for name, (g, count) in lots.items() if name or len(lots) == 1
     }  # fmt: skip
 
 
@@ -195,14 +229,6 @@ def _symmetric(matrices: Sequence[Array]) -> Array:
     """Return matrices (d, q, q) without what rounding made of their symmetry."""
     stacked = np.stack(matrices)
     return (stacked + stacked.transpose(0, 2, 1)) / 2
-
-
-class FamilyUnits(Protocol):
-    """The units of a family with their lots; may be gone through several times, each time in the same order."""
-
-    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]: ...
-
-    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)

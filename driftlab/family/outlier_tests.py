@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.mixed_model import Family, FamilyUnits
+from driftlab.family.mixed_model import Family
+from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import UnitRecord
 from driftlab.family.reml import WEIGHT
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
@@ -179,15 +180,17 @@ def tests_of(
     laws: TailLaws | None,
 ) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
-    of = {record.unit: record for record in records if record.state == "done"}
-    d, names, lots, rows, curves = len(family.axes), [], [], [], []
-    for soaked, lot in units:
-        names.append(soaked.unit)
-        lots.append(lot)
-        curves.append(statistics.of(soaked, lot))
-        rows.append(of[soaked.unit].table(FIGURES, d) if soaked.unit in of else np.full((2, len(FIGURES), d), np.nan))
-    figures = np.array(rows).reshape(-1, 2, len(FIGURES), d)
-    values = [*np.array(curves).reshape(-1, len(CURVES), d).swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
+    d, names, lots = len(family.axes), list[str](), list[str]()
+    curves = np.empty((len(units), len(CURVES), d))
+    for own, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
+        curves[len(names) : len(names) + len(own)] = table
+        names += own
+        lots += of_lots
+    figures, places = np.full((len(names), 2, len(FIGURES), d), np.nan), {name: k for k, name in enumerate(names)}
+    for record in records:
+        if record.state == "done" and record.unit in places:
+            figures[places[record.unit]] = record.table(FIGURES, d)
+    values = [*curves.swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}
     p, odd_lots = [], []
@@ -206,6 +209,12 @@ def tests_of(
         names, tests, np.concatenate(p, axis=1), np.concatenate(values, axis=1),
         TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots,
     )  # fmt: skip
+
+
+def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[list[str], list[str], Array]:
+    """Return the names of units, their lots, and the statistics of their curves (n, CURVES, d)."""
+    names, lots = [soaked.unit for soaked, _ in units], [lot for _, lot in units]
+    return names, lots, np.array([statistics.of(soaked, lot) for soaked, lot in units])
 
 
 def _times(name: str, law: FigureLaw, axis: int, off: dict[str, float]) -> list[tuple[str, float]]:

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from driftlab.family.bands import deviation
-from driftlab.family.mixed_model import Family, FamilyUnits
+from driftlab.family.mixed_model import Family
 from driftlab.family.outlier_tests import (
     CURVES,
     FIGURES,
@@ -40,6 +40,7 @@ from driftlab.family.outlier_tests import (
     tests_of,
     unscaled,
 )
+from driftlab.family.partitions import FamilyUnits, in_partitions
 from driftlab.family.record import PER, UnitRecord, figure_name
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import BiasUnit, axis_name, default_unit
@@ -119,7 +120,7 @@ def find_outliers(
     Parameters
     ----------
     family : Family
-    units : Units
+    units : FamilyUnits
         Those to be judged.
     records : iterable of UnitRecord
         Of the same units; one without a record is judged by its curves alone.
@@ -128,17 +129,18 @@ def find_outliers(
     fitted : bool
         Whether the units are those that the family was fitted on; others are judged by the laws that it has.
     """
-    statistics = CurveStatistics(family, fitted=fitted)
+    units, statistics = in_partitions(units), CurveStatistics(family, fitted=fitted)
     tests = tests_of(family, statistics, units, records, None if fitted else family.laws)
     if not tests.names:
         return Outliers({})
     reported = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
     unit = shown or default_unit(family.bias_unit)
     words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
+    places = np.flatnonzero(np.any(reported, axis=1))
     odd = {
         soaked.unit: words.of(k, reported[k], *family.information_of(soaked), lot)
-        for k, (soaked, lot) in enumerate(units) if np.any(reported[k])
-    }  # fmt: skip
+        for k, (soaked, lot) in zip(places.tolist(), units.chosen(places).read(), strict=True)
+    }
     lots = _odd_lots(family, tests, unit) if fitted else ()
     return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted), lots)
 

@@ -34,11 +34,15 @@ far off. q coefficients at the temperatures `peaks`, G lots.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from driftlab.family.partitions import Partitions
 from fusion_core.chunk import Array
 
 TOLERANCE = 2e-3  # of the units' deviations in a step: far below their sampling error
@@ -95,36 +99,53 @@ def root_of(Sigma: Array) -> tuple[Array, Array]:
     return vectors * size, (vectors / size).swapaxes(-1, -2)
 
 
+class OfAxes(NamedTuple):
+    """Information of the units of a partition, J (n, d, q, q) and h (n, d, q), on the knots of their family."""
+
+    J: Array
+    h: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ByLot:
+    """Values (G, ...) of lots, of which a partition of units, of the lots `lot` (n,), is sent its own."""
+
+    values: Array
+    lot: Index
+
+    def __getitem__(self, units: slice) -> dict[int, Array]:
+        """Return the values of the lots of some units, by lot."""
+        return {int(g): self.values[g] for g in np.unique(self.lot[units])}
+
+
 @dataclass(frozen=True, eq=False)
 class EStep:
     """Expectations of the units under a law.
 
     Attributes
     ----------
-    z : (n, q) array
-        Expected deviation of each unit from its lot's mean, in the coordinates of L, had it the weight 1.
+    share : (n,) array
+        Squared distance of each unit from its lot's mean, had it the weight 1, as a share of what is expected.
     spread : (n, 2) array
-        Sum of the variances that z has over units, and of their squares.
+        Sum of the variances that the deviation has over units, in the coordinates of L, and of their squares.
     scatter : (q, q) array
         Weighted sum of the expected outer products of the deviations.
     between : (q, q) array
         Mean over lots of those of their shifts.
     means : Means
-    L : (q, q) array
     """
 
-    z: Array
+    share: Array
     spread: Array
     scatter: Array
     between: Array
     means: Means
-    L: Array
 
     @property
-    def distance(self) -> tuple[Array, Array]:
-        """Squared distance of each unit from its lot's mean (n,), as a share of what is expected, and its dof (n,)."""
+    def dof(self) -> Array:
+        """Degrees of freedom of the distance of each unit (n,)."""
         total = np.maximum(self.spread[:, 0], 1e-12)
-        return np.sum(self.z**2, axis=1) / total, total**2 / np.maximum(self.spread[:, 1], 1e-24)
+        return np.asarray(total**2 / np.maximum(self.spread[:, 1], 1e-24))
 
 
 def inside(J: Array, L: Array) -> Array:
@@ -158,28 +179,62 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
     return Means(mu, P, shifts, cov + taken @ P @ taken.transpose(0, 2, 1), cov + rest @ P @ rest.transpose(0, 2, 1))
 
 
-def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) -> EStep:
-    """Return the expectations of units with J (n, q, q), h (n, q), of the lots `lot` (n,), with the weights w (n,)."""
+def e_step(law: VarianceComponents, units: Partitions[OfAxes], axis: int, lot: Index, w: Array) -> EStep:
+    """Return the expectations of units, of the lots `lot` (n,), with the weights w (n,): two passes over them.
+
+    The first adds what each unit says of its lot's mean, the second the deviations from these means.
+    """
     L, _, lots = law.root()
-    (n, q), G, one, weigh = h.shape, int(lot.max()) + 1, np.eye(len(L)), w[:, None, None]
-    A, a = inside(J, L), h @ L
-    V = np.linalg.inv(A + weigh * one)  # covariance of z
-    K = one - weigh * V  # V A: what a unit follows of an error of its mean
-    own = np.einsum("nij,nj->ni", V, a)
-    of_lot = w * (lot == np.arange(G)[:, None])
-    means = means_of((of_lot @ K.reshape(n, q * q)).reshape(G, q, q), of_lot @ own, lots)
+    q, G = len(L), int(lot.max()) + 1
+    information, weighted = np.zeros((G, q, q)), np.zeros((G, q))
+    for g, (own_information, own_weighted) in units.reduce(partial(_of_lots, axis, L), lot, w).items():
+        information[g], weighted[g] = own_information, own_weighted
+    means = means_of(information, weighted, lots)
     centre = means.mu + means.shifts[lot]
+    scatter, rows = units.reduce(partial(_deviations, axis, L), lot, w, centre, ByLot(means.of_lot, lot))
+    squares, spread = (np.concatenate(part) for part in zip(*rows, strict=True))
+    share = squares / np.maximum(spread[:, 0], 1e-12)
+    between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
+    return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L))
+
+
+def _of_lots(axis: int, L: Array, units: OfAxes, lot: Index, w: Array) -> dict[int, tuple[Array, Array]]:
+    """Return the information of units on the means of their lots, (q, q), and that times their values (q,), by lot."""
+    _, own, K = _expected(L, units.J[:, axis], units.h[:, axis], w)
+    n, q = own.shape
+    present = np.unique(lot)
+    of_lot = w * (lot == present[:, None])
+    information, weighted = (of_lot @ K.reshape(n, q * q)).reshape(-1, q, q), of_lot @ own
+    return {int(g): (information[k], weighted[k]) for k, g in enumerate(present)}
+
+
+def _deviations(
+    axis: int, L: Array, units: OfAxes, lot: Index, w: Array, centre: Array, covariances: Mapping[int, Array]
+) -> tuple[Array, list[tuple[Array, Array]]]:
+    """Return the scatter (q, q) of units about their lots' means `centre` (n, q), of the `covariances` (q, q).
+
+    And the square of each deviation (n,), with the sums of its variances and of their squares (n, 2).
+    """
+    J, h = units.J[:, axis], units.h[:, axis]
+    V, own, K = _expected(L, J, h, w)
     z = own - np.einsum("nij,nj->ni", K, centre)
     scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, V)
-    for g in range(G):
-        half = (K[lot == g] @ means.of_lot[g]) * weigh[lot == g]
+    for g, covariance in covariances.items():
+        half = (K[lot == g] @ covariance) * w[lot == g, None, None]
         scatter += np.tensordot(half, K[lot == g], axes=((0, 2), (0, 2)))
     low = w < 1  # their distance is that of a unit like any other, or none would ever be weighted up again
-    K[low] = one - np.linalg.inv(A[low] + one)
-    z[low] = np.einsum("nij,nj->ni", one - K[low], a[low]) - np.einsum("nij,nj->ni", K[low], centre[low])
+    if np.any(low):
+        _, own, K[low] = _expected(L, J[low], h[low], np.ones(int(np.sum(low))))
+        z[low] = own - np.einsum("nij,nj->ni", K[low], centre[low])
     spread = np.stack([np.trace(K, axis1=1, axis2=2), np.einsum("nij,nij->n", K, K)], axis=1)
-    between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
-    return EStep(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
+    return scatter, [(np.sum(z**2, axis=1), spread)]
+
+
+def _expected(L: Array, J: Array, h: Array, w: Array) -> tuple[Array, Array, Array]:
+    """Return the covariance V of z (n, q, q), V L'h (n, q), and K (n, q, q): what z follows of an error of its mean."""
+    one, weigh = np.eye(len(L)), w[:, None, None]
+    V = np.linalg.inv(inside(J, L) + weigh * one)
+    return np.asarray(V), np.einsum("nij,nj->ni", V, h @ L), np.asarray(one - weigh * V)
 
 
 def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> VarianceComponents:
@@ -214,29 +269,31 @@ class RemlFit:
     moved: float
 
 
-def fit_axis(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | None]) -> RemlFit:
-    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered (n,), at `peaks` (q,) degC.
+def fit_axis(
+    units: Partitions[OfAxes], axis: int, lot: Index, peaks: Array, start: VarianceComponents | None = None
+) -> RemlFit:
+    """Return the law of an axis of units, of the lots numbered (n,), at `peaks` (q,) degC.
 
     EM begins with the law `start`, the last of them, or where that is None with a smooth prior's.
     """
-    J, h, lot, peaks, start = of_axis
-    w, lots = np.ones(len(J)), int(lot.max()) > 0
-    spread = initial_scale(J, h)
+    n, lots = len(lot), int(lot.max()) > 0
+    w = np.ones(n)
+    spread = initial_scale(units, axis)
     prior = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])  # rough: no curve goes on anywhere
     if start is not None:
         law = start
-        w, _ = weights(e_step(law, J, h, lot, w), w, len(w) + WEIGHT)
+        w, _ = weights(e_step(law, units, axis, lot, w), w, n + WEIGHT)
     else:
         Psi = smooth(peaks, prior)[0]
         law = VarianceComponents(Psi, 0.1 * Psi if lots else np.zeros_like(Psi))
         for _ in range(SMOOTH):
-            w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
-            expected = e_step(law, J, h, lot, w)
+            w = _nearest(e_step(law, units, axis, lot, np.ones(n)))
+            expected = e_step(law, units, axis, lot, w)
             prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
             law = VarianceComponents(smooth(peaks, prior)[0], expected.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MAX_STEPS + 1):
-        expected, older_w = e_step(law, J, h, lot, w), w
+        expected, older_w = e_step(law, units, axis, lot, w), w
         if not settled and steps % HYPER == 1:
             older, prior = prior, likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
             settled = steps > 1 and bool(np.max(np.abs(older - prior)) < 0.1)
@@ -246,12 +303,12 @@ def fit_axis(of_axis: tuple[Array, Array, Index, Array, VarianceComponents | Non
             w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
         if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
             break
-    return RemlFit(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
+    return RemlFit(law, e_step(law, units, axis, lot, w), w, limit, steps, moved)
 
 
 def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:
     """Return weights (n,) and their limit, by distances in the law without the unit itself, of `total` weight."""
-    share, dof = expected.distance
+    share, dof = expected.share, expected.dof
     own = np.minimum(w * share * expected.spread[:, 0] / total, 0.9)
     share = share * (1 - w / total) / (1 - own)
     roots = np.cbrt(share)
@@ -266,13 +323,9 @@ def outlier_weights(share: Array, limit: float | Array) -> Array:
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 
-def initial_scale(J: Array, h: Array) -> float:
+def initial_scale(units: Partitions[OfAxes], axis: int) -> float:
     """Return the scale of the units' spread: median over coefficients of the units' median deviation."""
-    q = J.shape[1]
-    bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
-    size = np.trace(J, axis1=1, axis2=2)[:, None, None] / q
-    own = np.linalg.solve(J + 1e-6 * size * (bend.T @ bend + 1e-4 * np.eye(q)), h[..., None])[..., 0]
-    seen = np.diagonal(J, axis1=1, axis2=2)
+    own, seen = (np.concatenate(part) for part in zip(*units.map(partial(_alone, axis)), strict=True))
     own = np.where(seen > 0.01 * np.median(seen), own, np.nan)
     enough = np.sum(np.isfinite(own), axis=0) >= 2
     middle = np.nanmedian(own[:, enough], axis=0)
@@ -280,9 +333,19 @@ def initial_scale(J: Array, h: Array) -> float:
     return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
 
 
+def _alone(axis: int, units: OfAxes) -> tuple[Array, Array]:
+    """Return the coefficients of units by their own soaks alone, and the information on each (n, q)."""
+    J, h = units.J[:, axis], units.h[:, axis]
+    q = J.shape[1]
+    bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
+    size = np.trace(J, axis1=1, axis2=2)[:, None, None] / q
+    own = np.linalg.solve(J + 1e-6 * size * (bend.T @ bend + 1e-4 * np.eye(q)), h[..., None])[..., 0]
+    return own, np.diagonal(J, axis1=1, axis2=2)
+
+
 def _nearest(expected: EStep) -> Array:
     """Return 1 for the units nearest to their lot's mean, MIN_WEIGHT for the others; small families keep all."""
-    share = expected.distance[0]
+    share = expected.share
     return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 

@@ -5,7 +5,7 @@ n units, d axes, q coefficients an axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -21,9 +21,10 @@ from pydantic import (
     TypeAdapter,
     model_serializer,
 )
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, columns_of, seen_temperatures
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import Partitions, UnitOfLot
 from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
@@ -197,13 +198,11 @@ class _UnitContrast(NamedTuple):
 
 
 def sizes(
-    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[Offer], each: ParallelMap = serial
+    units: Partitions[Sequence[UnitOfLot]], taken: Sequence[Offer]
 ) -> tuple[list[LotEffects], dict[str, tuple[OfUnit, ...]], dict[str, UnitDensities]]:
     """Return the laws of effects over all units, the effects in each unit, and its noise beside them."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
-    with threadpool_limits(1):
-        names, lots, densities, rows = zip(*each(partial(_effects_of_unit, taken), units), strict=True)
+    found = [one for own in units.map(partial(_effects_of_units, taken)) for one in own]
+    names, lots, densities, rows = zip(*found, strict=True)
     laws, of_units = [], []
     for offer, column in zip(taken, zip(*rows, strict=True), strict=True):
         contrasts = together([one.contrasts for one in column])
@@ -217,14 +216,17 @@ def sizes(
     return laws, dict(zip(names, zip(*of_units, strict=True), strict=True)), dict(zip(names, densities, strict=True))
 
 
-def _effects_of_unit(
-    taken: Sequence[Offer], unit: tuple[UnitInformation, str]
-) -> tuple[str, str, UnitDensities, list[_UnitContrast]]:
-    """Return the name of a unit, its lot, its noise beside the effects, and its contrast of each."""
-    soaked, lot = unit
-    quiet = _with_noise_beside(soaked, [offer.effect for offer in taken])
-    contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]
-    return soaked.unit, lot, UnitDensities(quiet.white, quiet.walk), contrasts
+def _effects_of_units(
+    taken: Sequence[Offer], units: Sequence[UnitOfLot]
+) -> list[tuple[str, str, UnitDensities, list[_UnitContrast]]]:
+    """Return of each unit its name, its lot, its noise beside the effects, and its contrast of each."""
+    found = []
+    with threadpool_limits(1):
+        for soaked, lot in units:
+            quiet = _with_noise_beside(soaked, [offer.effect for offer in taken])
+            contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]
+            found.append((soaked.unit, lot, UnitDensities(quiet.white, quiet.walk), contrasts))
+    return found
 
 
 def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> UnitInformation:

@@ -23,7 +23,7 @@ n units, d axes, K coefficients (columns), J placebos. Sources: R. C. Paule and 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -31,9 +31,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import Partitions, UnitOfLot
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
 from driftlab.identification.records import with_residuals
@@ -140,20 +141,18 @@ def _with_residual(soaked: UnitInformation) -> list[Chunk]:
 
 
 def contrasts_of(
-    sample: Iterable[UnitInformation], offers: Sequence[Offer], beside: Sequence[Effect], each: ParallelMap = serial
+    sample: Partitions[Sequence[UnitOfLot]], offers: Sequence[Offer], beside: Sequence[Effect]
 ) -> EffectContrasts:
     """Return the contrasts of the units for all offers beside the effects in the model: arrays over (n, d, K)."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
-    with threadpool_limits(1):
-        return together(list(each(partial(_contrasts, effects, sizes, beside), sample)))
+    return together([one for own in sample.map(partial(_contrasts, effects, sizes, beside)) for one in own])
 
 
 def _contrasts(
-    effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], soaked: UnitInformation
-) -> EffectContrasts:
-    return UnitRows(soaked, beside).contrasts(effects, sizes)
+    effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], units: Sequence[UnitOfLot]
+) -> list[EffectContrasts]:
+    with threadpool_limits(1):
+        return [UnitRows(soaked, beside).contrasts(effects, sizes) for soaked, _ in units]
 
 
 def together(units: Sequence[EffectContrasts]) -> EffectContrasts:
@@ -233,11 +232,10 @@ def between_lots(offer: Offer, contrasts: EffectContrasts, lots: Sequence[str]) 
 
 
 def refine(
-    sample: Sequence[UnitInformation], taken: Candidate, grid: Collection[Offer], beside: Sequence[Effect],
-    each: ParallelMap = serial,
-) -> Effect:  # fmt: skip
+    sample: Partitions[Sequence[UnitOfLot]], taken: Candidate, grid: Collection[Offer], beside: Sequence[Effect]
+) -> Effect:
     """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
-    effect = _of_right_size(sample, taken, beside, each)
+    effect = _of_right_size(sample, taken, beside)
     for name, value in effect.hyper_parameters.items():
         known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.group == taken.offer.group})
         if len(known) < 2:
@@ -247,9 +245,9 @@ def refine(
             replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
         ]
         if effect.acts_on_input:  # exactly, where the first look had the map's slope
-            total = np.array([-_squares(sample, [*beside, one.effect], each) / 2 for one in tries])
+            total = np.array([-sample.reduce(partial(_squares, [*beside, one.effect])) / 2 for one in tries])
         else:
-            total = _left_out(tries, contrasts_of(sample, tries, beside, each), np.arange(len(sample))).sum(axis=0)
+            total = _left_out(tries, contrasts_of(sample, tries, beside), np.arange(len(sample))).sum(axis=0)
         k = int(np.clip(np.argmax(total), 1, len(x) - 2))
         a, b, c = total[k - 1 : k + 2]
         bend = a - 2 * b + c
@@ -258,25 +256,17 @@ def refine(
     return effect
 
 
-def _squares(sample: Sequence[UnitInformation], effects: Sequence[Effect], each: ParallelMap) -> float:
-    """Return the sum of squares that curves and effects leave in the units, in their noise."""
-    from threadpoolctl import threadpool_limits
-
+def _squares(effects: Sequence[Effect], units: Sequence[UnitOfLot]) -> float:
+    """Return the sum of squares that curves and effects leave in units, in their noise."""
     with threadpool_limits(1):
-        return sum(each(partial(_square, effects), sample))
+        return sum(float(r @ r) for soaked, _ in units for r in UnitRows(soaked, effects).r)
 
 
-def _square(effects: Sequence[Effect], soaked: UnitInformation) -> float:
-    return sum(float(r @ r) for r in UnitRows(soaked, effects).r)
-
-
-def _of_right_size(
-    sample: Sequence[UnitInformation], taken: Candidate, beside: Sequence[Effect], each: ParallelMap
-) -> Effect:
+def _of_right_size(sample: Partitions[Sequence[UnitOfLot]], taken: Candidate, beside: Sequence[Effect]) -> Effect:
     """Return the effect; a lag as long as its size says."""
     if not taken.effect.acts_on_input:
         return taken.effect
-    contrasts = contrasts_of(sample, [taken.offer], beside, each)
+    contrasts = contrasts_of(sample, [taken.offer], beside)
     size = float(_scale(contrasts.c, variances(*contrasts.flat()[1:]).reshape(contrasts.c.shape))[0])
     longer = {name: value * size for name, value in taken.effect.hyper_parameters.items() if size > 0}
     return taken.effect.model_copy(update=longer)

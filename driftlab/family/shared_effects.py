@@ -8,7 +8,7 @@ n units, d axes, q coefficients an axis of an effect.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
 from driftlab.family.contrasts import EffectContrasts
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes, without_effects
 from driftlab.family.shared_effect_search import (
     CHANCE,
@@ -78,29 +78,23 @@ class SharedEffects(BaseModel):
         return self.model_copy(update={"of_units": {}, "noise": {}, **own})
 
 
-def find_common(
-    units: Iterable[tuple[UnitInformation, str]],
-    *,
-    bias_unit: str = "rad/s",
-    sample: int = SAMPLE,
-    each: ParallelMap = serial,
-) -> SharedEffects:
+def find_common(units: FamilyUnits, *, bias_unit: str = "rad/s", sample: int = SAMPLE) -> SharedEffects:
     """Return the effects that units share; `sample` of them at most are searched.
 
     Parameters
     ----------
-    units : iterable of (UnitInformation, str)
-        Units and their lots; gone through more than once, each time in the same order.
+    units : FamilyUnits
+        Units and their lots, with their rows.
     bias_unit : str
         SI unit of the bias.
-    each : ParallelMap, optional
-        Goes through the units.
     """
-    drawn, count = _drawn(units, sample)
+    units = in_partitions(units)
+    count = len(units)
+    drawn = units.chosen(_drawn(count, sample), A_FEW)
     if len(drawn) < MIN_UNITS:
         why = f"{len(drawn)} units; {MIN_UNITS} are needed to tell what they have in common"
         return SharedEffects(rejected=(RejectedEffect(effect="all", reason=why),), units=count, searched=len(drawn))
-    search = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], each)
+    search = _Search(drawn)
     search.run()
     effects = search.measured(units, bias_unit)
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
@@ -110,29 +104,26 @@ def find_common(
     )  # fmt: skip
 
 
-def _drawn(units: Iterable[tuple[UnitInformation, str]], most: int) -> tuple[list[tuple[UnitInformation, str]], int]:
-    """Return at most some units at random, in their order, and how many there are; that many are ever held."""
+def _drawn(count: int, most: int) -> list[int]:
+    """Return the places of at most some units at random, of so many (reservoir sampling)."""
     rng = np.random.default_rng(0)
-    reservoir: dict[int, tuple[UnitInformation, str]] = {}
-    count = 0
-    for number, unit in enumerate(units):  # reservoir sampling
-        count += 1
-        if len(reservoir) < most:
-            reservoir[number] = unit
-        elif (place := int(rng.integers(count))) < most:
+    reservoir = dict.fromkeys(range(min(count, most)))
+    for number in range(most, count):
+        if (place := int(rng.integers(number + 1))) < most:
             del reservoir[list(reservoir)[place]]
-            reservoir[number] = unit
-    return [reservoir[number] for number in sorted(reservoir)], count
+            reservoir[number] = None
+    return sorted(reservoir)
 
 
 class _Search:
     """Effects added one by one to the model of the sampled units: of each the candidate, refined, and its rivals."""
 
-    def __init__(self, sample: list[UnitInformation], lots: list[str], each: ParallelMap) -> None:
-        self.sample, self.lots, self.each = sample, lots, each
+    def __init__(self, sample: Partitions[Sequence[UnitOfLot]]) -> None:
+        self.sample, self.lots = sample, [lot for own in sample.map(_lots) for lot in own]
         self.taken: list[tuple[Candidate, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
-        self.offers, self.refused = offers_for(sample[:: max(1, len(sample) // PROPOSING)])
+        some = sample.chosen(range(0, len(sample), max(1, len(sample) // PROPOSING)))
+        self.offers, self.refused = offers_for([soaked for soaked, _ in some.read()])
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
         self.noise: dict[str, UnitDensities] = {}
 
@@ -169,8 +160,8 @@ class _Search:
         where = np.flatnonzero([taken.lot in ("", lot) for lot in self.lots])
         if nested(offers, contrasts, taken, where) <= 0:
             return False
-        tuned = [self.sample[k] for k in where[:: max(1, len(where) // TUNING)]]
-        refined = replace(taken.offer, effect=refine(tuned, taken, offers, effects, self.each))
+        tuned = self.sample.chosen(where[:: max(1, len(where) // TUNING)], A_FEW)
+        refined = replace(taken.offer, effect=refine(tuned, taken, offers, effects))
         self.taken.append((replace(taken, offer=refined), tuple(described(rival.effect) for rival in rivals)))
         return True
 
@@ -179,7 +170,7 @@ class _Search:
         return [taken.effect for place, (taken, _) in enumerate(self.taken) if place != k]
 
     def _contrasts(self, offers: list[Offer], beside: list[Effect]) -> EffectContrasts:
-        return contrasts_of(self.sample, offers, beside, self.each)
+        return contrasts_of(self.sample, offers, beside)
 
     def rejected(self) -> tuple[RejectedEffect, ...]:
         """Return the best of every kind that was not added in the last round, and why; and what was refused."""
@@ -197,12 +188,12 @@ class _Search:
             reasons.append((described(one.effect), why))
         return tuple(RejectedEffect(effect=name, reason=why) for name, why in (*reasons, *self.refused.items()))
 
-    def measured(self, units: Iterable[tuple[UnitInformation, str]], bias_unit: str) -> tuple[SharedEffect, ...]:
+    def measured(self, units: Partitions[Sequence[UnitOfLot]], bias_unit: str) -> tuple[SharedEffect, ...]:
         """Return the effects with their sizes in all units."""
         if not self.taken:
             return ()
         effects = []
-        laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken], self.each)
+        laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken])
         for k, ((taken, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
             contrasts = self._contrasts([taken.offer], self._others(k))
             where = np.flatnonzero([law.has(lot) for lot in self.lots])
@@ -217,6 +208,10 @@ class _Search:
                 )
             )  # fmt: skip
         return tuple(effects)
+
+
+def _lots(units: Sequence[UnitOfLot]) -> list[str]:
+    return [lot for _, lot in units]
 
 
 def _margin(one: Candidate) -> float:

@@ -132,6 +132,11 @@ class Scheduler(Workers):
         except Exception as error:
             return WorkerLost(failure(error))
 
+    def all_say(self, question: Callable[[], bool]) -> bool:
+        """Return True if every worker that is there answers a question with True."""
+        self._threads()
+        return all(answer is True for answer in self._client.run(question, on_error="return").values())
+
     def _threads(self) -> int:
         """Return the number of threads of the workers, as soon as there is one; each new worker says its versions."""
         end = time.monotonic() + self.patience

@@ -13,7 +13,7 @@ Rows of a fleet replace those that it had, and no other's, in one transaction. A
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import chain, islice
@@ -177,15 +177,17 @@ def _cell(value: Any) -> Any:
 
 
 def tables_of(
-    name: str, summary: Mapping[str, Any], records: Sequence[UnitRecord], table: Path
+    name: str, summary: Mapping[str, Any], own: Iterable[str], records: Iterable[UnitRecord], table: Path
 ) -> dict[str, tuple[Columns, Iterable[Row]]]:
-    """Return the tables of a fleet, of its `fleet.json`, the records of its units and its `units.parquet`."""
+    """Return the tables of a fleet, of its `fleet.json`, the records of its units and its `units.parquet`.
+
+    `own` are the manifest's own columns; records are read as they are written.
+    """
     counts = {key: summary["counts"][key] for key in ("units", "done", "failed")}
     texts = {key: summary.get(key) for key in ("units_from", "config", "key")}
     written = datetime.now(UTC).isoformat(timespec="seconds")
     fleet = {"name": name, "written": written, "driftlab": __version__, **texts, **counts}
-    more = dict.fromkeys(column for record in records for column in record.more)
-    units = {key: column.type for key, column in all_columns(more).items()}
+    units = {key: column.type for key, column in all_columns(own).items()}
     return {
         "driftlab_fleets": (FLEETS, [fleet]),
         "driftlab_units": (units, _rows(table)),

@@ -1,18 +1,14 @@
 """The analysis of a fleet's units: their shared effects, their family, the outliers among them, and the line.
 
-The units' soaks with the shared effects in the model are computed once, and gone through often.
+The units' soaks with the shared effects in the model are computed once, where the units are, and gone through often.
 """
 
 from __future__ import annotations
 
-import pickle
-import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Self, cast
 
 import numpy as np
 from pydantic import ValidationError
@@ -22,14 +18,12 @@ from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.bands import deviation
 from driftlab.family.baseline import Baseline
 from driftlab.family.file import load_family
-from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
+from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
-from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
-from driftlab.family.unit_information import UnitInformation
-from driftlab.production.store import UnitRef, UnitStore
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
@@ -78,17 +72,16 @@ class FamilyAnalysis:
 
 
 def analyse(
-    store: UnitStore,
+    units: Partitions[Sequence[UnitOfLot]],
     status: FleetStatus,
     config: Config,
     known: Path | None,
     progress: FleetProgress,
-    each: ParallelMap = serial,
     rules: str | None = None,
 ) -> FamilyAnalysis:
-    """Fit the family of the units that are done, or compare them with one that is `known`; `each` maps over them.
+    """Fit the family of the units that are done, or compare them with one that is `known`.
 
-    `rules` are run rules of the line's charts.
+    `units` are those of the status, `rules` run rules of the line's charts.
 
     Raises
     ------
@@ -97,20 +90,19 @@ def analyse(
     """
     unit = tracked_unit(config.filter)
     records = status.done
-    with ExitStack() as until_analysed:
-        if known is None:
-            family, common, units, why = _fitted(store, status, progress, each, until_analysed)
-        else:
-            (family, common), why = _read(known, store, status) if records else (None, NOTHING), ""
-            units = until_analysed.enter_context(UnitSpool(store, common, each)) if records else None
-        progress(Stage("what the line did"))
-        levels = {} if family is None or units is None else _levels(family, units)
-        before = None if known is None or family is None else _baseline(family)
-        line = line_of(records, config.limits, unit=unit, levels=levels or None, baseline=before, rules=rules)
-        if family is None or units is None:
-            return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
-        progress(Stage("units that stand out"))
-        outliers = find_outliers(family, units, records, shown=unit, fitted=known is None)
+    if known is None:
+        family, common, apart, why = _fitted(units, status, progress)
+    else:
+        (family, common), why = _read(known, units, status) if records else (None, NOTHING), ""
+        apart = units.keep("apart", partial(_bare, common.effects), [None] * len(units))
+    progress(Stage("what the line did"))
+    levels = {} if family is None else _levels(family, apart)
+    before = None if known is None or family is None else _baseline(family)
+    line = line_of(records, config.limits, unit=unit, levels=levels or None, baseline=before, rules=rules)
+    if family is None:
+        return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
+    progress(Stage("units that stand out"))
+    outliers = find_outliers(family, apart, records, shown=unit, fitted=known is None)
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
         lots, line = reconcile(outliers.lots, line)
@@ -150,26 +142,28 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
 
 
 def _fitted(
-    store: UnitStore, status: FleetStatus, progress: FleetProgress, each: ParallelMap, until_analysed: ExitStack
-) -> tuple[Family | None, SharedEffects, UnitSpool | None, str]:
+    units: Partitions[Sequence[UnitOfLot]], status: FleetStatus, progress: FleetProgress
+) -> tuple[Family | None, SharedEffects, Partitions[Sequence[UnitOfLot]], str]:
     """Return the family of units, their common effects and the units without them; or why there is none."""
     try:
         progress(Stage("effects that the units share"))
-        common = find_common(store, bias_unit=status.bias_unit, each=each)
-        units = until_analysed.enter_context(UnitSpool(store, common, each, sample_of(len(store))))
+        common = find_common(units, bias_unit=status.bias_unit)
+        noise = [common.noise.get(unit) for unit in status.done.units]
+        apart = units.keep("apart", partial(_bare, common.effects), noise)
         progress(Stage("the family"))
-        family = fit_family(units, channel=status.channel, bias_unit=status.bias_unit, each=each)
+        family = fit_family(apart, channel=status.channel, bias_unit=status.bias_unit)
     except ValueError as error:
-        return None, NOTHING, None, str(error)
+        return None, NOTHING, units, str(error)
     progress(Stage("the family, units left out"))
-    bands = measure_bands(family, units.with_rows(), each)
-    return family.model_copy(update={"bands": bands}), common, units, ""
+    places = sample_of(len(units))
+    sample = units.chosen(places, A_FEW).keep("whole", partial(_apart, common.effects), [noise[k] for k in places])
+    return family.model_copy(update={"bands": measure_bands(family, sample)}), common, apart, ""
 
 
-def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, SharedEffects]:
+def _read(path: Path, units: Partitions[Sequence[UnitOfLot]], status: FleetStatus) -> tuple[Family, SharedEffects]:
     family = load_family(path, channel=status.channel, bias_unit=status.bias_unit)
     try:
-        family.information_of(next(iter(store))[0])
+        family.information_of(next(units.read())[0])
         common = NOTHING if family.common_effects is None else SharedEffects.model_validate(family.common_effects)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
@@ -184,8 +178,12 @@ def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, Sh
 
 def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:
     """Return the mean bias (d,) of each unit over the family's range, which no figure has, and a lot may differ in."""
-    B = _mean_over_range(family)
-    return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
+    means = in_partitions(units).map(partial(_means, family, _mean_over_range(family)))
+    return {name: mean for own in means for name, mean in own}
+
+
+def _means(family: Family, B: Array, units: Sequence[UnitOfLot]) -> list[tuple[str, Array]]:
+    return [(soaked.unit, family.posterior(soaked, lot).c @ B) for soaked, lot in units]
 
 
 def _level_law(family: Family) -> list[InControl]:
@@ -227,56 +225,17 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     )
 
 
-class UnitSpool:
-    """Units with the effects in the model, in their order; a `FamilyUnits`, and a context manager.
-
-    They lie in a file without a name, which ends with this: effects are taken apart once a unit, and memory does not
-    grow with the units. All but `whole` lie there without their rows, which nobody needs who fits a family.
-
-    Parameters
-    ----------
-    store : UnitStore
-    common : SharedEffects
-    each : ParallelMap
-    whole : collection of int
-        Places of the units that keep their rows.
-    """
-
-    def __init__(self, store: UnitStore, common: SharedEffects, each: ParallelMap, whole: Collection[int] = ()) -> None:
-        self._whole, self._starts = sorted(whole), list[int]()
-        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=store.folder))  # noqa: SIM115 - closed at the end of this
-        rows = set(whole)
-        units = ((place, common.noise.get(place.unit), k in rows) for k, place in enumerate(store.places()))
-        for content in each(partial(_apart, common.effects), units):
-            self._starts.append(self._file.tell())
-            self._file.write(content)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *ended: object) -> None:
-        self._file.close()
-
-    def __len__(self) -> int:
-        return len(self._starts)
-
-    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
-        return map(self._read, range(len(self)))
-
-    def with_rows(self) -> list[tuple[UnitInformation, str]]:
-        """Return the units that keep their rows."""
-        return [self._read(k) for k in self._whole]
-
-    def _read(self, k: int) -> tuple[UnitInformation, str]:
-        self._file.seek(self._starts[k])
-        unit: tuple[UnitInformation, str] = pickle.load(self._file)
-        return unit
+def _apart(
+    effects: Sequence[SharedEffect], units: Sequence[UnitOfLot], noise: Sequence[UnitDensities | None]
+) -> list[UnitOfLot]:
+    """Return units with the effects in the model, each drawn from its law, beside their noise."""
+    if not effects:
+        return list(units)
+    return [(without_effects(soaked, lot, effects, own), lot) for (soaked, lot), own in zip(units, noise, strict=True)]
 
 
-def _apart(effects: Sequence[SharedEffect], unit: tuple[UnitRef, UnitDensities | None, bool]) -> bytes:
-    """Return a unit with the effects in the model, and its lot, as they lie in the file."""
-    place, noise, whole = unit
-    soaked, lot = place.read()
-    if effects:
-        soaked = without_effects(soaked, lot, effects, noise)
-    return pickle.dumps((soaked if whole else replace(soaked, recordings=()), lot), pickle.HIGHEST_PROTOCOL)
+def _bare(
+    effects: Sequence[SharedEffect], units: Sequence[UnitOfLot], noise: Sequence[UnitDensities | None]
+) -> list[UnitOfLot]:
+    """Return units with the effects in the model without their rows, which nobody needs who fits a family."""
+    return [(replace(soaked, recordings=()), lot) for soaked, lot in _apart(effects, units, noise)]

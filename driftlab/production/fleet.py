@@ -15,16 +15,15 @@ from uuid import uuid4
 from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
-from driftlab.family.parallel import serial
+from driftlab.family.partitions import serial
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, UnitStore, fleet_folder
+from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, fleet_folder, stored_units
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
-from driftlab.production.workers import Pool
 from driftlab.recordings.identity import sha256
 from driftlab.spc.acknowledgements import (
     Acknowledgement,
@@ -47,7 +46,7 @@ __all__ = ["FleetOptions", "fleet"]
 
 T = TypeVar("T")
 SHOWN = 10  # failures that are named outside of the tables
-ALONE = 100  # units for whose family no further process is begun
+ALONE = 20  # units for whose family no further process is asked
 
 
 def fleet(
@@ -152,7 +151,9 @@ def fleet(
         if database is not None:
             report(Stage("database"))
             records, name = command.status.records, folder.out.name or folder.path.name
-            database.replace(summary["id"], tables_of(name, summary, records, folder.path / TABLE))
+            own = dict.fromkeys(column for record in records for column in record.more)
+            whole = filter(None, map(folder.record, records.units))
+            database.replace(summary["id"], tables_of(name, summary, own, whole, folder.path / TABLE))
         if not command.status.done:
             first = command.status.failed[0]
             raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
@@ -220,13 +221,17 @@ class _Command:
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
+        with self.jobs:
+            return self._stages()
+
+    def _stages(self) -> dict[str, Any]:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
         self.notes = known_notes(folder.mark, f"--out {folder.out}")
         self._timed("units", jobs.do)
         status = self.status = self._timed("reading", jobs.status)
-        self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done))
+        self.failed = self._timed("certificates", partial(jobs.make_certificates, self.config, status.done.units))
         key, before = self._key(), folder.mark
         files = (TABLE, REPORT, *([FAMILY] if before.get("family", {}).get("fitted", True) else ()))
         as_it_was = before.get("key") == key and before.get("complete") and not options.notes
@@ -235,18 +240,23 @@ class _Command:
             self._tell(before["family"].get("odd", {}))
             return self._mark(**{name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark()
-        units = UnitStore(folder.path, [(record.unit, record.lot) for record in status.done])
         # of matrices of forty rows more threads make less
-        with threadpool_limits(1), Pool(options.workers) as pool:
-            each = pool.ordered if len(units) > ALONE else serial
-            learned = partial(analyse, units, status, self.config, options.family, progress, each, options.rules)
+        with threadpool_limits(1), folder.scratch() as scratch:
+            engine = jobs.engine() if len(status.done) > ALONE else serial
+            units, whole = (
+                stored_units(folder.path, of.units, [record.lot for record in of], engine, scratch)
+                for of in (status.done, status.records)
+            )
+            learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
             acknowledged, about = self._acknowledged(analysis)
             pages = self._timed("pages", partial(jobs.make_pages, odd))
             beside = {"yields": self.yields, "gauge": self.gauge, "acknowledged": acknowledged, "notes": self.notes}
-            written = partial(write_fleet, folder, status, self.config, analysis, beside, pages, progress, each)
+            written = partial(
+                write_fleet, folder, status, self.config, analysis, beside, pages, progress, whole, scratch
+            )
             self._timed("tables", written)
         family = self._family(analysis, acknowledged, about)
         return self._mark(complete=True, key=key, family=family, pages=pages)
@@ -278,7 +288,8 @@ class _Command:
             about.setdefault(analysis.line.units[k], []).extend(why)
         about = {unit: why for unit, why in about.items() if why}
         frozen = "" if options.family is None else sha256(options.family)
-        basis = {record.unit: basis_of(record, frozen) for record in self.status.done if record.unit in about}
+        records = {unit: self.jobs.folder.record(unit) for unit in about}
+        basis = {unit: "" if record is None else basis_of(record, frozen) for unit, record in records.items()}
         self.notes += new_notes(options.notes, options.operator or "", about, basis)
         return in_force(self.notes, about, basis), about
 

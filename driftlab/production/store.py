@@ -4,7 +4,8 @@ A fleet takes hours, so what is done is not kept back until all is (docs/adr/005
 writer, by a lock; what driftlab did not write is never removed, not even from a unit's folder; and what cannot be done
 again, since its recordings are not there any more, is replaced only on demand.
 
-Records of units (`unit.json`) are read once a command; their soaks (`unit.npz`) one at a time, as they are needed.
+Records of units (`unit.json`) are read once a command, and kept in brief; their soaks (`unit.npz`) are read one at a
+time, as they are needed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import socket
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,8 +23,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from driftlab.family.partitions import SIZE, Engine, Partitions, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
+from driftlab.production.unit_records import UnitRecords
 from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
@@ -33,6 +37,7 @@ from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
 INSIDE = ("page", "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
 LONGEST = 1 << 20  # bytes of a line
+SCRATCH = ".family.new"  # folder in which workers keep what the family's passes need
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 PAGE = "page"  # folder of a unit's pages
 NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
@@ -64,7 +69,7 @@ class FleetFolder:
             (self.path / UNITS).mkdir(exist_ok=True)
             self._finish()
             self.stamps = dict(_stamps(self.path / STAMPS))
-            self._records: dict[str, UnitRecord | None] = {}
+            self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")
         except BaseException:
             self.lock.release()
@@ -94,21 +99,35 @@ class FleetFolder:
 
     def record(self, name: str) -> UnitRecord | None:
         """Return the record of a unit; None where there is none that can be read."""
-        if name not in self._records:
-            self._records[name] = record_of(self.unit(name))
-        return self._records[name]
+        return record_of(self.unit(name))
 
-    def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
-        """Put a unit in its place, for the one that was there; what others put there is taken along.
+    def brief(self, name: str) -> UnitRecord | None:
+        """Return the record of a unit in brief, of which the file is read once; None where it cannot be read."""
+        if name not in self.records:
+            record = self.record(name)
+            if record is None:
+                return None
+            self.records[name] = record
+        return self.records[name]
 
-        What was made of all units is not of these any more, so the mark says first that it is not complete.
-        """
+    @property
+    def place(self) -> UnitPlace:
+        """The place of the units, for whoever puts some there for this command."""
+        return UnitPlace(self.path, (self.path / LOCK).read_bytes())
+
+    def begin(self) -> None:
+        """Note that what was made of all units will not be of these any more."""
         if self.mark.get("complete"):
             self.write_mark({**self.mark, "complete": False})
-        record = record.model_copy(update={"written": _digests(files)})
-        self._made(f".{record.unit}{NEW}", {**files, RECORD: _content(record)})
-        self._replace(record.unit)
-        self._records[record.unit] = record
+
+    def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
+        """Put a unit in its place, for the one that was there; what others put there is taken along."""
+        self.begin()
+        self.noted(self.place.put(record, files), stamp)
+
+    def noted(self, record: UnitRecord, stamp: str) -> None:
+        """Note a unit that was put in its place."""
+        self.records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
 
     def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
@@ -125,7 +144,8 @@ class FleetFolder:
             self.note(record.model_copy(update={"written": record.written | _digests(pages)}))
             if os.path.lexists(place):  # somebody's
                 os.rename(place, free(place))
-            os.rename(self._made(f".{unit}.{PAGE}{NEW}", {Path(name).name: pages[name] for name in pages}), place)
+            named = {Path(name).name: pages[name] for name in pages}
+            os.rename(_made(self.path / UNITS / f".{unit}.{PAGE}{NEW}", named), place)
 
     def put_certificate(self, unit: str, content: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
         """Put a certificate among the files of a unit, in the place of an earlier one of other results.
@@ -149,19 +169,10 @@ class FleetFolder:
         for name in files:
             self.write(f"{UNITS}/{unit}/{name}", files[name])
 
-    def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
-        """Return a new folder beside those of the units, with files in it."""
-        folder = self.path / UNITS / name
-        remove(folder)
-        for file, content in files.items():
-            (folder / file).parent.mkdir(parents=True, exist_ok=True)
-            (folder / file).write_bytes(content)
-        return folder
-
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already; one that was edited is put aside."""
         self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
-        self._records[record.unit] = record
+        self.records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
         """Note the state of a unit's recordings: as long as it stays, their contents need not be read."""
@@ -187,6 +198,17 @@ class FleetFolder:
         self.mark = {**content, "written": ownership.document(self.path / MARK)["written"]}
         return self.mark
 
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """Give a folder for files that are needed until the end of the command."""
+        path = self.path / SCRATCH
+        remove(path)
+        path.mkdir(mode=0o700)
+        try:
+            yield path
+        finally:
+            remove(path)
+
     def hidden(self, name: str) -> Path:
         """Return the name of a file of all units until it is published."""
         return self.path / f".{name}{NEW}"
@@ -206,16 +228,9 @@ class FleetFolder:
         for name in names:
             os.replace(self.hidden(name), self.path / name)
 
-    def _replace(self, unit: str) -> None:
-        place = self.unit(unit)
-        new, old = (place.with_name(f".{unit}{ending}") for ending in (NEW, OLD))
-        if os.path.lexists(place):
-            os.rename(place, old)
-        os.rename(new, place)
-        _take_along(old, place)
-
     def _finish(self) -> None:
         """Finish what a command that was killed had begun to replace."""
+        remove(self.path / SCRATCH)
         for path in sorted(path for path in (self.path / UNITS).iterdir() if path.name[0] == "."):
             if path.name.endswith(OLD):
                 place = path.with_name(path.name[1:].removesuffix(OLD))
@@ -235,6 +250,48 @@ class FleetFolder:
                 self.write(STAMPS, "".join(lines).encode())
         finally:
             self.lock.release()
+
+
+@dataclass(frozen=True)
+class UnitPlace:
+    """The place of the units of a fleet's folder, as long as a command holds that: `signed` is its lock's content."""
+
+    path: Path
+    signed: bytes
+
+    def reached(self) -> bool:
+        """Return True if this process sees the folder, and the command still holds it."""
+        try:
+            return (self.path / LOCK).read_bytes() == self.signed
+        except OSError:
+            return False
+
+    def put(self, record: UnitRecord, files: Mapping[str, bytes]) -> UnitRecord:
+        """Put a unit in its place, for the one that was there; what others put there is taken along.
+
+        Return its record, which knows the files. Whoever else does the same writes beside it, not over it.
+        """
+        record = record.model_copy(update={"written": _digests(files)})
+        place, hidden = self.path / UNITS / record.unit, f".{record.unit}"
+        old = place.with_name(f"{hidden}{OLD}")
+        new = _made(
+            place.with_name(f"{hidden}.{socket.gethostname()}-{os.getpid()}{NEW}"), {**files, RECORD: _content(record)}
+        )
+        if os.path.lexists(place):
+            _take_along(old, place)  # of one who ended here
+            os.rename(place, old)
+        os.rename(new, place)
+        _take_along(old, place)
+        return record
+
+
+def _made(folder: Path, files: Mapping[str, bytes]) -> Path:
+    """Return a new folder with files in it."""
+    remove(folder)
+    for file, content in files.items():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(content)
+    return folder
 
 
 def _content(record: UnitRecord) -> bytes:
@@ -317,43 +374,39 @@ FAMILY_MAP, COMMAND = "family_map.json", "fleet"  # in the folder of a unit, whi
 
 
 @dataclass(frozen=True)
-class UnitRef:
-    """The place of a unit in a fleet's folder, and its lot."""
+class StoredUnits(Sequence[UnitOfLot]):
+    """A partition of units of a fleet's `folder`, by names and lots; each is read when it is asked for."""
 
     folder: Path
-    unit: str
-    lot: str
+    names: tuple[str, ...]
+    lots: tuple[str, ...]
 
-    def read(self) -> tuple[UnitInformation, str]:
-        """Return the information of its soaks, and its lot; raises UnreadableFile."""
-        path = self.folder / UNITS / self.unit / "unit.npz"
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def read(self) -> StoredUnits:
+        """Return it."""
+        return self
+
+    def __getitem__(self, k: Any) -> Any:
+        """Return the information of a unit's soaks, and its lot; raises UnreadableFile if a file is damaged."""
+        path = self.folder / UNITS / self.names[k] / "unit.npz"
         try:
-            return UnitInformation.from_bytes(read_whole(path, PIECE)), self.lot
+            return UnitInformation.from_bytes(read_whole(path, PIECE)), self.lots[k]
+        except IndexError:
+            raise
         except Exception:  # of a damaged archive nearly any
             raise UnreadableFile(
                 f"{path}: is missing or damaged; remove the folder and give the same command again"
             ) from None
 
 
-class UnitStore:
-    """Units of a fleet's `folder` that were soaked, by names and lots; may be gone through again and again.
-
-    Raises UnreadableFile while one goes through it, if a file is damaged.
-    """
-
-    def __init__(self, folder: Path, units: Sequence[tuple[str, str]]) -> None:
-        self.folder, self.units = folder, units
-
-    def __len__(self) -> int:
-        return len(self.units)
-
-    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
-        """Yield the information of each unit's soaks, and its lot."""
-        return (place.read() for place in self.places())
-
-    def places(self) -> Iterator[UnitRef]:
-        """Yield the place of each unit."""
-        return (UnitRef(self.folder, name, lot) for name, lot in self.units)
+def stored_units(
+    folder: Path, units: Sequence[str], lots: Sequence[str], engine: Engine = serial, scratch: Path | None = None
+) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
+    """Return units of a fleet's folder by names and lots; workers keep files in `scratch`."""
+    cuts = [slice(k, k + SIZE) for k in range(0, len(units), SIZE)]
+    return Partitions([StoredUnits(folder, tuple(units[k]), tuple(lots[k])) for k in cuts], engine, scratch)
 
 
 def record_of(folder: Path) -> UnitRecord | None:

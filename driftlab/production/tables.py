@@ -12,26 +12,35 @@ import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
-from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.posterior_map import informed_where_unknown, posterior_of
+from driftlab.family.partitions import Partitions, UnitOfLot
+from driftlab.family.posterior_map import UnitPosterior, informed_where_unknown, posterior_of
 from driftlab.family.record import UnitRecord
-from driftlab.family.shared_effect import SharedEffect, of_effect
-from driftlab.family.shared_effects import SharedEffects
+from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import COMMAND, FAMILY, FAMILY_MAP, NEW, REPORT, TABLE, UNITS, FleetFolder, UnitRef
+from driftlab.production.store import (
+    COMMAND,
+    FAMILY,
+    FAMILY_MAP,
+    NEW,
+    REPORT,
+    TABLE,
+    UNITS,
+    FleetFolder,
+    StoredUnits,
+    record_of,
+)
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
@@ -40,10 +49,14 @@ from driftlab.spc.yields import reasons
 from driftlab.storage.ownership import free, seal, seal_of, why_not_own
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
+from fusion_core.errors import UnreadableFile
+
+if TYPE_CHECKING:
+    import polars as pl
 
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
-PIECE = 10_000  # rows that are made a frame at once
-AT_ONCE = 25  # units that a process is given at once, with the family
+ROWS = 20_000  # of a group, which is written at once
+MOST_CURVES = 5000  # maps that the report draws
 Row = dict[str, Any]
 
 
@@ -55,11 +68,13 @@ def write_fleet(
     beside: Mapping[str, Any],
     pages: Collection[str],
     progress: FleetProgress,
-    each: ParallelMap = serial,
+    units: Partitions[Sequence[UnitOfLot]],
+    scratch: Path,
 ) -> None:
     """Write family, table and report, each whole or not at all.
 
-    `beside` are fields of the page's overview, `pages` the units that have one.
+    `beside` are fields of the page's overview, `pages` the units that have one, `units` all of the status; a worker
+    writes the rows of its units to `scratch`.
     """
     if analysis.family is not None:
         kind = next((settings.kind for settings in config.tracked_maps()), "")
@@ -68,40 +83,80 @@ def write_fleet(
             folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
             odd_lots=[lot.sentence for lot in analysis.lots],
         )  # fmt: skip
-    curves: list[Array] = []
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
-    rows = _rows(folder.path, status, analysis, curves, progress, each)
-    write_table(folder.hidden(TABLE), rows, more, {"driftlab": __version__, "SI": status.bias_unit})
+    drawn = _drawn(status, analysis)
+    table = _Table(folder.path, analysis.family, analysis.common.effects, tuple(more))
+    stage = Stage("tables and maps", total=len(status.records))
+    progress(stage)
+    names = status.records.units
+    shown = np.isin(np.array(names), np.array(drawn))
+    of_units = (
+        [of.get(name) for name in names] for of in (analysis.reasons, analysis.common.noise, analysis.common.of_units)
+    )
+    paths = [scratch / f"table-{k}" for k, part in enumerate(units.parts) for _ in range(len(part))]
+    curves: list[Array] = []
+    for count, own in units.map(table.write, shown, *of_units, paths):
+        curves += own
+        stage.done += count
+        progress(stage)
+    join_tables(folder.hidden(TABLE), dict.fromkeys(paths), more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
-    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves)
+    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves, drawn)
     write_fleet_report(folder.hidden(REPORT), replace(overview, **beside))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
 
-def _rows(
-    folder: Path,
-    status: FleetStatus,
-    analysis: FamilyAnalysis,
-    curves: list[Array],
-    progress: FleetProgress,
-    each: ParallelMap,
-) -> Iterator[Row]:
-    """Yield the rows of the table, write the units' maps with the family, and add each unit's curve to `curves`."""
-    stage = Stage("tables and maps", total=len(status.records))
-    progress(stage)
-    family, common, reasons = analysis.family, analysis.common, analysis.reasons
-    units = ((UnitRef(folder, one.unit, one.lot), one, common.of_unit(one.unit)) for one in status.done)
-    parts = iter(()) if family is None else each(partial(_of_the_family, family), units, at_once=AT_ONCE)
-    for record in status.records:
-        part = next(parts, None) if record.state == "done" else None
-        if part is None:
-            yield from rows_of(record)
-        else:
-            yield from rows_of(record, part[0], reasons.get(record.unit, ()))
-            curves.append(part[1])
-        stage.done += 1
-        progress(stage)
+def _drawn(status: FleetStatus, analysis: FamilyAnalysis) -> list[str]:
+    """Return the units whose curves the report draws: all, or an even sample and the first of an odd shape."""
+    if analysis.family is None:
+        return []
+    names, done = list(analysis.odd), status.done.units
+    bent = {name for name in names if any(one.T is not None for one in analysis.odd[name])}
+    even = set(done[:: max(1, -(-len(done) // MOST_CURVES))])
+    first = set([name for name in done if name in bent][:MOST_CURVES])
+    return [name for name in done if name in even or name in first]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Writer of a partition's rows, and of its units' maps with the family."""
+
+    folder: Path
+    family: Family | None
+    effects: Sequence[SharedEffect]
+    more: tuple[str, ...]  # names of the manifest's own columns
+
+    def write(
+        self,
+        units: StoredUnits,
+        shown: NDArray[np.bool_],
+        odd: Sequence[Sequence[str] | None],
+        noise: Sequence[UnitDensities | None],
+        sizes: Sequence[Sequence[OfUnit] | None],
+        paths: Sequence[Path],
+    ) -> tuple[int, list[Array]]:
+        """Write rows and maps; return the number of the units, and the curves (d, G) of those that are `shown`."""
+        rows, curves = list[Row](), list[Array]()
+        for k, name in enumerate(units.names):
+            record = record_of(self.folder / UNITS / name)
+            if record is None:
+                raise UnreadableFile(
+                    f"{self.folder / UNITS / name}: has no record any more; give the same command again"
+                )
+            if self.family is None or record.state != "done":
+                rows += rows_of(record)
+                continue
+            soaked, lot = units[k]
+            if self.effects:
+                soaked = without_effects(soaked, lot, self.effects, noise[k])
+            else:
+                soaked = informed_where_unknown(soaked, self.family, record)
+            part, curve = _posterior_rows(self.folder, posterior_of(self.family, soaked, lot), sizes[k])
+            rows += rows_of(record, part, odd[k] or ())
+            curves += [curve] * bool(shown[k])
+        frame_of(rows, self.more).write_parquet(paths[0])
+        return len(units), curves
 
 
 def temperatures(family: Family) -> Array:
@@ -109,21 +164,15 @@ def temperatures(family: Family) -> Array:
     return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
 
 
-def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) -> tuple[list[Row], Array]:
+def _posterior_rows(folder: Path, of_unit: UnitPosterior, size: Sequence[OfUnit] | None) -> tuple[list[Row], Array]:
     """Write the map of a unit with the family; return the family's part of its rows, and that map's curve (d, G).
 
     `shape_distance` is that of its coefficients from the mean of its lot, in deviations: 1 is usual.
     """
-    place, record, common = unit
-    soaked, lot = place.read()
-    soaked = common.apart(soaked, lot)
-    if not common.effects:
-        soaked = informed_where_unknown(soaked, family, record)
-    of_unit = posterior_of(family, soaked, lot)
-    posterior = of_unit.posterior
-    path = place.folder / UNITS / place.unit / FAMILY_MAP
+    family, name, lot, posterior = of_unit.family, of_unit.soaked.unit, of_unit.lot, of_unit.posterior
+    path = folder / UNITS / name / FAMILY_MAP
     new = path.with_name(f".{FAMILY_MAP}{NEW}")
-    of_unit.map({"written": seal_of(COMMAND), "unit": place.unit, "lot": lot}).save(new)
+    of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot}).save(new)
     seal(new)
     if why_not_own(path, COMMAND):
         os.rename(path, free(path))
@@ -136,7 +185,7 @@ def _of_the_family(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffect
         "family_sigma": np.sqrt(np.mean(of_unit.sigma_at(T) ** 2, axis=0)),
         "shape_distance": np.sqrt(np.array(off) / family.knots.q),
     }
-    for first in common.of_units.get(place.unit, ())[:1]:
+    for first in (size or ())[:1]:
         columns |= {"common_effect": first.c[:, 0], "common_effect_sigma": first.sigma[:, 0]}
     knots = family.knots.peaks.tolist()
     rows = [{"knots": knots, **{name: values[k].tolist() for name, values in columns.items()}} for k in range(len(off))]
@@ -187,26 +236,30 @@ def _loop(record: UnitRecord) -> Row:
     return {"loop": record.loop.get("verdict") or record.loop.get("why_not"), "effects": added}
 
 
-def write_table(path: Path, rows: Iterable[Row], more: Iterable[str], metadata: Mapping[str, str]) -> None:
-    """Write rows as a Parquet file, with units and meanings of its columns in its metadata beside `metadata`.
-
-    `more` are the names of the manifest's own columns.
-    """
+def frame_of(rows: Iterable[Row], more: Iterable[str]) -> pl.DataFrame:
+    """Return rows as a frame; `more` are the names of the manifest's own columns."""
     import polars as pl
     from polars import selectors
 
-    columns, left = all_columns(more), iter(rows)
     types = {
         "text": pl.String(), "texts": pl.List(pl.String()), "number": pl.Float64(), "numbers": pl.List(pl.Float64()),
         "count": pl.Int64(), "flag": pl.Boolean(),
     }  # fmt: skip
-    schema = {name: types[column.type] for name, column in columns.items()}
-    pieces = [pl.DataFrame(schema=schema)]
-    while piece := list(islice(left, PIECE)):
-        pieces.append(pl.DataFrame(piece, schema=schema))
-    described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in columns.items()}
-    table = pl.concat(pieces).with_columns(selectors.float().fill_nan(None))
-    table.write_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
+    schema = {name: types[column.type] for name, column in all_columns(more).items()}
+    return pl.DataFrame(list(rows), schema=schema).with_columns(selectors.float().fill_nan(None))
+
+
+def join_tables(path: Path, parts: Iterable[Path], more: Iterable[str], metadata: Mapping[str, str]) -> None:
+    """Write tables one behind the other as a Parquet file, in so many rows at a time.
+
+    Units and meanings of its columns are in its metadata, beside `metadata`.
+    """
+    import polars as pl
+
+    described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in all_columns(more).items()}
+    pl.scan_parquet(list(parts)).sink_parquet(
+        path, metadata={**metadata, "columns": json.dumps(described)}, row_group_size=ROWS
+    )
 
 
 Type = Literal["text", "texts", "number", "numbers", "count", "flag"]
@@ -295,6 +348,7 @@ def _overview(
     analysis: FamilyAnalysis,
     pages: Collection[str],
     curves: Sequence[Array],
+    drawn: Sequence[str],
 ) -> FleetOverview:
     family, axes = analysis.family, analysis.line.axes
     T = np.zeros(0) if family is None else temperatures(family)
@@ -305,7 +359,7 @@ def _overview(
         line=analysis.line,
         T=T,
         curves=np.stack(curves) if curves else np.zeros((0, len(axes), len(T)), dtype=np.float32),
-        drawn=[record.unit for record in status.done] if curves else [],
+        drawn=drawn,
         mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
         odd=analysis.odd,
         effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],

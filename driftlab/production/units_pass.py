@@ -11,24 +11,26 @@ import json
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import filter as matching
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
 from driftlab.evaluation.limits import verdict_of_units, worst
+from driftlab.family.partitions import Engine
 from driftlab.family.record import UnitRecord
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
-from driftlab.production.store import PAGE, FleetFolder
+from driftlab.production.store import PAGE, FleetFolder, UnitPlace
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
-from driftlab.production.unit import Task, certificate_of, key_of, work
+from driftlab.production.unit import Task, UnitResult, certificate_of, key_of, work
+from driftlab.production.unit_records import RecordsOfUnits, UnitRecords
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
 from driftlab.spc.yields import COLUMNS
@@ -98,6 +100,24 @@ class UnitJobs:
     again: list[str] = field(default_factory=list)  # units of these that were replaced
     without_recordings: list[str] = field(default_factory=list)  # units that were left as they are
 
+    def __enter__(self) -> Self:
+        self._held = ExitStack()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.close()
+
+    @cached_property
+    def workers(self) -> Workers:
+        """The workers of the whole command, from when they are asked for the first time; raises WorkersError."""
+        return self._held.enter_context(self.options.crew())
+
+    def engine(self) -> Engine:
+        """Return those who go through the units in the folder: the workers, if they reach it, or some of our own."""
+        if self.workers.all_say(self.folder.place.reached):
+            return self.workers.ordered
+        return self._held.enter_context(Pool(self.options.workers)).ordered
+
     def do(self) -> None:
         """Do every unit that is not done, and put it into the folder."""
         stamps = dict(self._to_do())
@@ -107,16 +127,21 @@ class UnitJobs:
         first = next(tasks, None)
         if first is None:
             return
-        with self.options.crew() as workers:
-            for task, result in workers.map(work, chain([first], tasks)):
-                record, files = (
-                    (_failed(task, result), {}) if isinstance(result, WorkerLost) else (result.record, result.files)
-                )
-                self.folder.put(record, files, stamps[task.unit] if record.key else "")  # without: to be done again
-                self.done += 1
-                stage.done += 1
-                stage.failed += record.state == "failed"
-                self.progress(stage)
+        self.folder.begin()
+        done = partial(work_in_place, self.folder.place)
+        for task, result in self.workers.map(done, chain([first], tasks)):
+            if isinstance(result, WorkerLost):
+                result = UnitResult(_failed(task, result), {})
+            record = result.record if isinstance(result, UnitResult) else result
+            stamp = stamps[task.unit] if record.key else ""  # without: to be done again
+            if isinstance(result, UnitResult):
+                self.folder.put(record, result.files, stamp)
+            else:
+                self.folder.noted(record, stamp)
+            self.done += 1
+            stage.done += 1
+            stage.failed += record.state == "failed"
+            self.progress(stage)
 
     def _to_do(self) -> Iterator[tuple[str, str]]:
         """Yield the units whose stamp is another than when they were done, with the stamp.
@@ -126,7 +151,7 @@ class UnitJobs:
         folder, units, lost, first = self.folder, self.manifest.units, 0, ""
         for entry in units:
             task = self._task(entry)
-            stamp, record = stamp_of(task, self.versions), folder.record(entry.unit)
+            stamp, record = stamp_of(task, self.versions), folder.brief(entry.unit)
             if not stamp and record is None and missing(task):
                 lost, first = lost + 1, first or entry.unit
             if lost > MISSING + len(units) - lost:
@@ -142,7 +167,7 @@ class UnitJobs:
         """Yield the tasks, as they are needed; units of another stamp whose contents are the same are left out."""
         for entry in (entry for entry in self.manifest.units if entry.unit in stamps):
             task = self._task(entry, page=self._wants_page(entry.unit))
-            record = None if self.options.force else self.folder.record(entry.unit)
+            record = None if self.options.force else self.folder.brief(entry.unit)
             if record is not None and self._stays(record, task):
                 self.folder.stamp(entry.unit, record.key, stamps[entry.unit])
                 stage.total -= 1
@@ -166,18 +191,18 @@ class UnitJobs:
 
     def status(self) -> FleetStatus:
         """Return the status of all units; lot, date and the rest are noted as the manifest has them now."""
-        records, key = [], hashlib.sha256()
+        key = hashlib.sha256()
         for entry in self.manifest.units:
-            record = self.folder.record(entry.unit)
+            record = self.folder.brief(entry.unit)
             if record is None:  # it cannot be: it was written by this command, or read by it
                 raise RuntimeError(f"unit {entry.unit} has no record")
             given = {"lot": entry.lot, "date": entry.date, "more": dict(entry.more)}
             if given != {name: getattr(record, name) for name in given}:
-                record = record.model_copy(update=given)
-                self.folder.note(record)
+                whole = self.folder.record(entry.unit)
+                assert whole is not None
+                self.folder.note(whole.model_copy(update=given))
             key.update(repr((entry.unit, record.key, record.state, given)).encode())
-            records.append(record)
-        return FleetStatus(records, key.hexdigest())
+        return FleetStatus(self.folder.records.of([entry.unit for entry in self.manifest.units]), key.hexdigest())
 
     def _wants_page(self, unit: str) -> bool:
         return any(pattern == "all" or fnmatchcase(unit, pattern) for pattern in self.options.pages)
@@ -200,26 +225,26 @@ class UnitJobs:
         missing = [entry for entry in wanted if not self._has_page(entry.unit)]
         stage = Stage("pages", total=len(missing))
         self.progress(stage)
-        records = ((entry, self.folder.record(entry.unit)) for entry in missing)
+        records = ((entry, self.folder.brief(entry.unit)) for entry in missing)
         todo = [self._task(entry, page=True) for entry, record in records if record and record.state == "done"]
-        if todo:
-            with self.options.crew() as workers:
-                for task, result in workers.map(work, todo):
-                    if not isinstance(result, WorkerLost):
-                        self.folder.put_page(task.unit, result.files)
-                    stage.done += 1
-                    self.progress(stage)
+        for task, result in self.workers.map(work, todo) if todo else ():
+            if not isinstance(result, WorkerLost):
+                self.folder.put_page(task.unit, result.files)
+            stage.done += 1
+            self.progress(stage)
         return [entry.unit for entry in wanted if self._has_page(entry.unit)]
 
-    def make_certificates(self, config: Config, records: Sequence[UnitRecord]) -> list[str]:
+    def make_certificates(self, config: Config, units: Sequence[str]) -> list[str]:
         """Make the certificates of units that are done, where they are wanted; return why there is none of a unit."""
         if not self.options.certificate:
             return []
         sheet = sheet_of(config.model_copy(update={"source": None, "filter": None}), [])  # units say the rest
         sheet, failed = replace(sheet, config_sha256=hashlib.sha256(self.config.encode()).hexdigest()), []
-        stage = Stage("certificates", total=len(records))
-        for record in records:
+        stage = Stage("certificates", total=len(units))
+        for unit in units:
             self.progress(stage)
+            record = self.folder.record(unit)
+            assert record is not None
             try:
                 if record.unit in self.without_recordings:
                     raise ConfigError("its recordings are not there, and it may be of another config")
@@ -232,6 +257,12 @@ class UnitJobs:
             stage.done += 1
         self.progress(stage)
         return failed
+
+
+def work_in_place(place: UnitPlace, task: Task) -> UnitRecord | UnitResult:
+    """Do a unit and put it into the folder, where that is reached from here; return its record, else all of it."""
+    result = work(task)
+    return place.put(result.record, result.files) if place.reached() else result
 
 
 def _failed(task: Task, lost: WorkerLost) -> UnitRecord:
@@ -292,18 +323,18 @@ def _looks(folder: str, name: str) -> Iterator[tuple[int | str, ...] | None]:
 class FleetStatus:
     """The units of a manifest as they are in the folder."""
 
-    records: Sequence[UnitRecord] = ()  # in the order of the manifest
+    records: RecordsOfUnits = field(default_factory=lambda: UnitRecords().of(()))  # in the order of the manifest
     key: str = ""  # hash of all that the family stands on: the keys of the units, their lots and dates
 
     @cached_property
-    def done(self) -> list[UnitRecord]:
+    def done(self) -> RecordsOfUnits:
         """The records of the units that were done."""
-        return [record for record in self.records if record.state == "done"]
+        return self.records.in_state("done")
 
     @cached_property
-    def failed(self) -> list[UnitRecord]:
+    def failed(self) -> RecordsOfUnits:
         """Those of the units that failed."""
-        return [record for record in self.records if record.state == "failed"]
+        return self.records.in_state("failed")
 
     @property
     def channel(self) -> str:

@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -27,8 +27,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from driftlab.errors import WorkersError
-from driftlab.family.parallel import BATCH
-from driftlab.production.store import UnitRef, UnitStore
 from driftlab.storage.system import has_posix_locks
 from fusion_core.errors import DataError, FusionError, describe_error
 
@@ -250,65 +248,52 @@ class Workers(ABC):
             If no worker can be had.
         """
 
-    def ordered(self, function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
-        """Yield the function's result of each item, in their order: a `driftlab.family.parallel.ParallelMap`.
-
-        Units of a `UnitStore` are read where they are worked on.
+    def ordered(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield the function's result of each item, in their order: a `driftlab.family.partitions.Engine`.
 
         Raises
         ------
         FusionError, ValueError
             Of the function.
         DataError
-            If workers die of a batch of items, twice.
+            If workers die of an item, twice.
         """
-        call: Callable[[Any], R] = function
-        given: Any = items
-        if isinstance(given, UnitStore):
-            call, given = partial(_read_and, function), given.places()
-        waiting: dict[int, list[R]] = {}
+        waiting: dict[int, R] = {}
         upcoming = 0
-        todo: Iterable[_Batch] = _batches(call, given, at_once)
-        # a worker that was killed for the memory of others need not be killed again: a lost batch is tried once more
+        todo: Iterable[_Job] = ((number, function, item) for number, item in enumerate(items))
+        # a worker that was killed for the memory of others need not be killed again: a lost item is tried once more
         for last in (False, True):
             lost = []
-            for batch, results in self.map(_run_batch, todo):
-                if isinstance(results, Exception):
-                    raise results
-                if isinstance(results, WorkerLost):
-                    lost.append(batch)
+            for job, result in self.map(_outcome, todo):
+                if isinstance(result, Exception):
+                    raise result
+                if isinstance(result, WorkerLost):
+                    lost.append(job)
                     if last:
                         again = "give the same command again, what is done is not done again"
-                        raise DataError(f"what the units have in common: {results.why}; {again}")
+                        raise DataError(f"what the units have in common: {result.why}; {again}")
                     continue
-                waiting[batch[0]] = results
+                waiting[job[0]] = result
                 while upcoming in waiting:
-                    yield from waiting.pop(upcoming)
+                    yield waiting.pop(upcoming)
                     upcoming += 1
             todo = lost
 
-
-_Batch = tuple[int, Callable[[Any], Any], list[Any]]  # number, function and items
-
-
-def _batches(function: Callable[[Any], Any], items: Iterable[Any], at_once: int) -> Iterator[_Batch]:
-    left, number = iter(items), 0
-    while batch := list(islice(left, at_once)):
-        yield number, function, batch
-        number += 1
+    def all_say(self, question: Callable[[], bool]) -> bool:
+        """Return True if every worker that is there answers a question with True."""
+        return question()
 
 
-def _run_batch(batch: _Batch) -> list[Any] | Exception:
-    """Return the function's results of a batch, or its error if that is one of the data."""
-    _, function, items = batch
+_Job = tuple[int, Callable[[Any], Any], Any]  # number, function and item
+
+
+def _outcome(job: _Job) -> Any:
+    """Return the function's result of an item, or its error if that is one of the data."""
+    _, function, item = job
     try:
-        return [function(item) for item in items]
+        return function(item)
     except (FusionError, ValueError) as error:
         return error
-
-
-def _read_and(function: Callable[[Any], R], place: UnitRef) -> R:
-    return function(place.read())
 
 
 class Pool(Workers):
@@ -359,7 +344,9 @@ class Pool(Workers):
     def _begin(self, function: Callable[..., Any], item: Any) -> Worker:
         """Return a worker that has the item in work."""
         while True:
-            worker = self._idle.pop() if self._idle else Worker(function.__module__)
+            worker = (
+                self._idle.pop() if self._idle else Worker(getattr(function, "func", function).__module__)
+            )  # of a partial
             try:
                 worker.take(function, item)
             except OSError:  # it died while it had nothing to do

@@ -9,7 +9,7 @@ U units with a map, d axes, G temperatures; values in SI.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,25 +33,24 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
     line, effects, records = overview.line, overview.effects, overview.records
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
-    failed, done = ([record for record in records if record.state == state] for state in ("failed", "done"))
-    limits, odd, table = [record.limits for record in done], len(reasons), _table(overview, reasons)
+    failed = [(record.unit, "", record.error) for record in records if record.state == "failed"]
+    done, odd, table = len(records) - len(failed), len(reasons), _table(overview, reasons)
+    domains = [record.domain for record in records if record.domain and record.state == "done"]
     lists = _lists(overview, reasons)
     write_page(
         path,
         "fleet",
         title=overview.title,
         lead=_lead(len(records), len(failed), odd, len(effects)),
-        limits=verdict_of_units(limits).capitalize(),
-        outcome=worst([row for of_unit in limits for row in of_unit]),
-        verdict=_headline(line, odd, len(done), odd - len(lists["odd"])),
+        limits=verdict_of_units(record.limits for record in records if record.state == "done").capitalize(),
+        outcome=_outcome(record for record in records if record.state == "done"),
+        verdict=_headline(line, odd, done, odd - len(lists["odd"])),
         use=_use(line, len(lists["odd"]), len(lists["alarms"])),
         yields=overview.yields,
         called=figure_name,
         remarks=[*(one for one in line.sentences[1:] if one not in in_tables(line)), *overview.remarks],
         numbers=_numbers(records),
-        maps=map_charts(
-            overview, np.array([one.domain for one in done if one.domain], dtype=np.float64).reshape(-1, 2)
-        ),
+        maps=map_charts(overview, np.array(domains, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
         lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
         charts=[*joint_charts(line), *control_charts(line)],
@@ -63,7 +62,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         changes=changes(line),
         effects=effects,
         first=FIRST, listed=LISTED,
-        failed=[(record.unit, "", record.error) for record in failed[:LISTED]],
+        failed=failed[:LISTED],
         failed_count=len(failed),
         left_out=len(records) - len(table["unit"]),
         names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
@@ -87,6 +86,11 @@ def _lists(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, lis
     both = {unit: "; ".join(said[unit] for said in (reasons, out) if unit in said) for unit in known}
     listed = [(unit, overview.links.get(unit, ""), f"{note.text()}: {both[unit]}") for unit, note in known.items()]
     return {"odd": rows(reasons), "alarms": rows(out), "acknowledged": listed}
+
+
+def _outcome(records: Iterable[UnitRecord]) -> str | None:
+    """Return the worst verdict of units; None where there is none."""
+    return worst([{"verdict": word} for word in {worst(record.limits) for record in records}])
 
 
 def _lead(units: int, failed: int, odd: int, effects: int) -> str:
@@ -139,11 +143,11 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
 
     It has at most ROWS: the odd, the failed, and every one, second, fourth, ... of the others, as many as fit.
     """
-    special = [k for k, r in enumerate(overview.records) if r.state == "failed" or reasons.get(r.unit)]
-    others, step = sorted(set(range(len(overview.records))) - set(special)), 1
+    special = np.array([r.state == "failed" or bool(reasons.get(r.unit)) for r in overview.records], dtype=bool)
+    others, step = np.flatnonzero(~special), 1
     while len(others[::step]) > ROWS:
         step *= 2
-    records = [overview.records[k] for k in sorted([*special, *others[::step]])]
+    records = [overview.records[k] for k in sorted([*np.flatnonzero(special).tolist(), *others[::step].tolist()])]
     places = {lot: k for k, lot in enumerate(sorted({record.lot for record in records}))}
     axes = next((record.axes for record in overview.records if record.axes), ())
     unit, figures = overview.unit, []

@@ -125,9 +125,11 @@ def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:
     curves, T, U = overview.curves, overview.T, len(overview.drawn)
     if not U:
         return []
+    all_of = len(overview.line.units)
+    sample = f" (an even sample of {all_of:,}, and those of an odd shape)" * (all_of > U)
     caption = (
-        f"Of {U:,} unit{'s' * (U != 1)}: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its "
-        "own. Lines with a unit's name: of an odd shape on this axis."
+        f"Of {U:,} unit{'s' * (U != 1)}{sample}: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on "
+        "its own. Lines with a unit's name: of an odd shape on this axis."
     )
     low, high = ranges.T
     near = 0.5 * float(np.diff(T).max())  # a soak reaches the temperature of the grid that it comes nearest to

@@ -11,6 +11,7 @@ Changes of the line that an odd lot explains, and odd lots that a change of the 
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -312,17 +313,17 @@ def _ordered(
     """
     axes: tuple[str, ...] = ()
     si = ""
-    names, rows, domains = [], [], []
+    names, domains, rows = [], [], array("d")
     for record in records:
         if record.state == "done":
             axes, si = axes or record.axes, si or record.bias_unit
             names.append((record.unit, record.lot, record.date))
             domains.append(record.domain)
-            rows.append(record.table(FIGURES, len(axes)))
+            rows.frombytes(record.table(FIGURES, len(axes)).tobytes())
     place, order = _places([date for _, _, date in names])
-    n, d = len(rows), len(axes)
+    n, d = len(names), len(axes)
     units, lots, dates = (tuple(names[j][k] for j in place) for k in range(3))
-    figures = np.array([rows[j] for j in place], dtype=np.float64).reshape(n, 2, len(FIGURES), d)
+    figures = np.frombuffer(rows).reshape(n, 2, len(FIGURES), d)[place]
     level = np.full((2, n, d), np.nan)
     for k, name in enumerate(units):
         level[0, k] = levels.get(name, np.nan)

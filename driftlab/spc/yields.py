@@ -136,17 +136,19 @@ def _per_cent(group: YieldGroup) -> str:
 
 def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iterable[str] = ()) -> Yield:
     """Return the yield of units, of which `odd` stand out, and by the columns `by`: COLUMNS, or the manifest's own."""
-    why = [reasons(record) for record in records]
-    stands_out = {record.unit for record in records}.intersection(odd)
-    whole = _group("", [*zip(records, why, strict=True)], stands_out)
+    known: dict[tuple[str, ...], list[str]] = {}  # of a line of many units few differ
+    why = [known.setdefault(tuple(own), own) for own in map(reasons, records)]
+    units = [record.unit for record in records]
+    stands_out = set(units).intersection(odd)
+    whole = _group("", [*zip(units, why, strict=True)], stands_out)
     place = {reason: k for k, reason in enumerate(whole.reasons)}
     first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
     covered = tuple(accumulate(first[k] for k in place.values()))
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
-        parts: dict[str, list[tuple[UnitRecord, list[str]]]] = {}
-        for name, record, of_unit in zip(_names(records, column), records, why, strict=True):
-            parts.setdefault(name, []).append((record, of_unit))
+        parts: dict[str, list[tuple[str, list[str]]]] = {}
+        for name, unit, of_unit in zip(_names(records, column), units, why, strict=True):
+            parts.setdefault(name, []).append((unit, of_unit))
         groups[column] = tuple(_group(name, part, stands_out) for name, part in parts.items())
     p = {
         column: chance([one.units for one in parts], [one.accepted for one in parts])
@@ -170,9 +172,9 @@ def reasons(record: UnitRecord) -> list[str]:
     return [f"{name} {SAID[verdict]}" for name, verdict in rows if verdict in SAID]
 
 
-def _group(name: str, part: Sequence[tuple[UnitRecord, list[str]]], odd: Collection[str]) -> YieldGroup:
+def _group(name: str, part: Sequence[tuple[str, list[str]]], odd: Collection[str]) -> YieldGroup:
     counts = Counter(reason for _, why in part for reason in why)
-    accepted, stands_out = sum(not why for _, why in part), sum(record.unit in odd for record, _ in part)
+    accepted, stands_out = sum(not why for _, why in part), sum(unit in odd for unit, _ in part)
     return YieldGroup(name, len(part), accepted, stands_out, dict(counts.most_common()))
 
 

@@ -7,26 +7,27 @@ from pathlib import Path
 
 import family
 
-from driftlab.production.workers import WorkerLost
+from driftlab.production.unit import Task
+from driftlab.production.workers import WorkerLost, Workers
 
 EXAMPLE = Path(family.__file__).parent / "family.yaml"
 HOURS = 1 / 3  # of a soak: in less the chamber is too fast for a map
 
 
-class Here:
+class Here(Workers):
     """Workers that are this process; notes which units and pages they were asked for; loses those in `lost`."""
 
     def __init__(self, lost=()):
         self.asked, self.pages, self.lost = [], [], dict(lost)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
+    def close(self):
         return None
 
     def map(self, function, items):
         for item in items:
+            if not isinstance(item, Task):
+                yield item, function(item)
+                continue
             (self.pages if item.page else self.asked).append(item.unit)
             yield item, WorkerLost(self.lost[item.unit]) if item.unit in self.lost else function(item)
 

@@ -92,7 +92,11 @@ def gone(_):
     os._exit(7)
 
 
-def information(unit):
-    """Return what the soaks of a unit say of its first axis, and the last letter of its lot."""
-    soaked, lot = unit
-    return [*soaked.h[0], float(lot[-1])]
+def information(part):
+    """Return what the soaks of units say of their first axis, and the last letter of their lots."""
+    return [[*soaked.h[0], float(lot[-1])] for soaked, lot in part.read()]
+
+
+def count(units):
+    """Return the number of units, each of them read."""
+    return sum(1 for _ in units)

@@ -13,6 +13,7 @@ from statsmodels.stats.meta_analysis import combine_effects
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.contrasts import UnitRows, without_noise
+from driftlab.family.partitions import in_partitions
 from driftlab.family.shared_effect_search import Offer, between, contrasts_of, gains, mean_of, of_size
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.unit_information import UnitInformation
@@ -46,7 +47,7 @@ def test_a_hysteresis_of_a_third_of_what_one_unit_shows_is_named(
     assert effect.effect.kind == "hysteresis"
     assert 4.5 < effect.effect.hyper_parameters["width"] < 8.0
     np.testing.assert_array_less(np.abs(effect.mean.ravel() / DEG_H - THIRD), 4 * effect.sigma.ravel() / DEG_H)
-    alone = contrasts_of([soaked for soaked, _ in units], [Offer(PLAY, 1)], ())
+    alone = contrasts_of(in_partitions(units), [Offer(PLAY, 1)], ())
     assert np.median(np.sqrt(alone.information)) * THIRD * DEG_H < 1.2  # what one unit has, in its own deviation
     (said,) = sentences(found, UNIT, AXES)
     assert said.startswith("hysteresis of temperature, width")
@@ -139,7 +140,7 @@ def test_coefficients_are_those_of_dense_generalised_least_squares() -> None:
     (rows,) = unit.recordings
     half = SoakRows(rows.t[::2], rows.T[::2], rows.bias[::2], rows.span[::2], {})  # as many as are not averaged
     unit = UnitInformation.of("a", AXES, [half], unit.white, unit.walk, 2.5)
-    shown = contrasts_of([unit], [Offer(PLAY, 1)], ())
+    shown = contrasts_of(in_partitions([(unit, "")]), [Offer(PLAY, 1)], ())
     T = without_noise(half.T)
     y, low = T[0], np.empty(len(T))
     for k, value in enumerate(T):  # the play, by its definition

@@ -7,7 +7,9 @@ import polars as pl
 import pytest
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.production.tables import COLUMNS, all_columns, rows_of, write_table
+from driftlab.production.store import StoredUnits
+from driftlab.production.tables import COLUMNS, _Table, all_columns, frame_of, join_tables, rows_of
+from fusion_core.errors import UnreadableFile
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "output_files.md").read_text()
 
@@ -20,7 +22,10 @@ def record(unit, **more):
 def written(tmp_path):
     def write(*records, more=()):
         path = tmp_path / "units.parquet"
-        write_table(path, (row for one in records for row in rows_of(one)), more, {"SI": "rad/s"})
+        parts = [tmp_path / f"part-{k}" for k in range(len(records))]
+        for one, part in zip(records, parts, strict=True):
+            frame_of(rows_of(one), more).write_parquet(part)
+        join_tables(path, parts, more, {"SI": "rad/s"})
         return path
 
     return write
@@ -84,3 +89,9 @@ def test_the_schema_is_the_same_whatever_is_in_it(written):
     failed = UnitRecord(key="", unit="1", state="failed", error="no file")
     assert pl.read_parquet_schema(written(failed)) == done
     assert len(done) == len(all_columns(()))
+
+
+def test_a_unit_whose_record_is_gone_is_named(tmp_path):
+    units = StoredUnits(tmp_path, ("0007",), ("",))
+    with pytest.raises(UnreadableFile, match=r"units/0007: has no record any more; give the same command again"):
+        _Table(tmp_path, None, (), ()).write(units, [False], [None], [None], [None], [tmp_path / "part"])

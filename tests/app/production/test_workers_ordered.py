@@ -1,5 +1,6 @@
-"""Several processes that go through the units of a fleet, and the file in which they find them without effects."""
+"""Several processes that go through the units of a fleet, and the files in which they find them without effects."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,15 +9,14 @@ import unit_work
 from families_at_rest import effect_of
 
 from driftlab.family.basis import STEP
-from driftlab.family.parallel import serial
 from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import UnitInformation
-from driftlab.production.family import UnitSpool
-from driftlab.production.store import UNITS, UnitStore
+from driftlab.production.family import _bare
+from driftlab.production.store import UNITS, stored_units
 from driftlab.production.workers import Pool
 from driftlab.soak.blocks import SoakRows
-from fusion_core.errors import DataError
+from fusion_core.errors import DataError, UnreadableFile
 
 COUNT = 12
 
@@ -33,7 +33,7 @@ def kept(tmp_path_factory):
         soaked = UnitInformation.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
         (folder / UNITS / soaked.unit).mkdir(parents=True)
         (folder / UNITS / soaked.unit / "unit.npz").write_bytes(soaked.to_bytes())
-    return UnitStore(folder, [(f"{k:02d}", f"L{k % 2}") for k in range(COUNT)])
+    return stored_units(folder, [f"{k:02d}" for k in range(COUNT)], [f"L{k % 2}" for k in range(COUNT)])
 
 
 @pytest.fixture(scope="module")
@@ -44,17 +44,17 @@ def hands():
 
 def test_what_comes_back_is_in_order_and_the_same_as_of_one_process(hands, kept):
     times = [0.05, 0.0, 0.0, 0.02, 0.0, 0.01, 0.0]  # the first is done last
-    found = list(hands(unit_work.burn, times, at_once=1))
+    found = list(hands(unit_work.burn, times))
     assert len(found) == len(times)
     assert len(set(found)) == 2
-    assert list(hands(partial(pow, 2), range(25), at_once=4)) == [2**k for k in range(25)]
-    of_units = [list(each(unit_work.information, kept)) for each in (hands, serial)]
+    assert list(hands(partial(pow, 2), range(25))) == [2**k for k in range(25)]
+    of_units = [list(each(unit_work.information, parts)) for parts in [kept.parts] for each in (hands, map)]
     assert np.array_equal(*of_units)
 
 
 def test_what_an_item_raises_is_raised_here(hands):
     with pytest.raises(ValueError, match=r"invalid literal .*none"):
-        list(hands(int, ["1", "2", "none"], at_once=1))
+        list(hands(int, ["1", "2", "none"]))
     assert list(hands(int, ["1"])) == [1]
 
 
@@ -68,10 +68,10 @@ def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
     paths = [str(tmp_path / name) for name in "abc"]
     for path in paths[1:]:
         (tmp_path / path).touch()  # these have been met already
-    assert list(hands(unit_work.once_then_killed, paths, at_once=1)) == ["came back"] * 3
+    assert list(hands(unit_work.once_then_killed, paths)) == ["came back"] * 3
 
 
-def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
+def test_units_that_are_kept_are_those_without_the_effects_and_come_again(kept, hands, tmp_path):
     effect = effect_of("hysteresis", width=1.0)
     shared = SharedEffect(
         mean=np.full((3, 1), 2.0), sigma=np.full((3, 1), 0.01), spread=np.full((3, 1), 0.1), effect=effect,
@@ -79,17 +79,27 @@ def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kep
         in_other_lots=None, indistinguishable_from=(),
     )  # fmt: skip
     common = SharedEffects(verdict="explained", effects=(shared,), tried=1, units=COUNT, searched=COUNT)
-    expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept]
-    with UnitSpool(kept, common, serial, whole=(2, 5)) as units:
+    expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept.read()]
+    for engine, folder in ((map, None), (hands, tmp_path)):
+        units = replace(kept, engine=engine, folder=folder).keep("apart", partial(_bare, [shared]), [None] * COUNT)
         assert len(units) == COUNT
         for _ in range(2):
-            found = list(units)
+            found = list(units.read())
             for (one, its), (other, lot) in zip(found, expected, strict=True):
-                assert (one.unit, its) == (other.unit, lot)
+                assert (one.unit, its, one.recordings) == (other.unit, lot, ())
                 assert np.array_equal(one.J, other.J)
                 assert np.array_equal(one.h, other.h)
-        assert [soaked.unit for soaked, _ in found if soaked.recordings] == ["02", "05"]
-        whole = units.with_rows()
-        assert [soaked.unit for soaked, _ in whole] == ["02", "05"]
-        assert np.array_equal(whole[0][0].recordings[0].bias, expected[2][0].recordings[0].bias)
-    assert not [path.name for path in kept.folder.iterdir() if path.name != UNITS]
+        some = units.chosen([2, 5, 11], 2)
+        assert [[soaked.unit for soaked, _ in part.read()] for part in some.parts] == [["02", "05"], ["11"]]
+
+
+def test_a_file_that_is_damaged_is_named_wherever_it_is_read(kept, hands):
+    path = kept.parts[0].folder / UNITS / "07" / "unit.npz"
+    content = path.read_bytes()
+    path.write_bytes(content[:1000])
+    try:
+        for engine in (map, hands):
+            with pytest.raises(UnreadableFile, match=r"07/unit\.npz: is missing or damaged; remove the folder"):
+                list(replace(kept, engine=engine).map(unit_work.count))
+    finally:
+        path.write_bytes(content)

@@ -1,0 +1,230 @@
+"""Units of a family in partitions that stay where they are, and passes over them.
+
+A pass calls a function on each partition where that lies, and adds the results. Partitions are of so many units each,
+and sums are those of a binary tree over the partitions in their order, whoever works on them: one process, a pool or a
+cluster come to the same, to the last bit. Results are sums (arrays), samples or columns (lists), and these by name.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate, chain, islice
+from pathlib import Path
+from secrets import token_hex
+from typing import Any, Generic, Protocol, TypeVar
+
+from driftlab.family.unit_information import UnitInformation
+
+SIZE = 50  # units of a partition
+A_FEW = 8  # of a partition of a sample, of which each takes its time
+BLOCKS = 64  # of partitions, that a pass has at most: what a worker is given at once
+
+R = TypeVar("R")
+C = TypeVar("C", covariant=True)
+UnitOfLot = tuple[UnitInformation, str]
+
+
+class Engine(Protocol):
+    """The results of a function of each item, in the items' order, as `map` has them; whoever computes them.
+
+    The function is importable by its name, or a `functools.partial` of one, so that another process may call it.
+    """
+
+    def __call__(self, function: Callable[[Any], R], items: Iterable[Any]) -> Iterator[R]:
+        """Yield the result of each item."""
+        ...
+
+
+serial: Engine = map  # type: ignore[assignment]  # in this process
+
+
+class Partition(Protocol[C]):
+    """The place of a partition, which may be sent to where it is read."""
+
+    def __len__(self) -> int: ...
+
+    def read(self) -> C:
+        """Return its content: a sequence of units, or what is kept of them."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory(Generic[C]):
+    """A partition in memory."""
+
+    content: C
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def read(self) -> C:
+        """Return its content."""
+        return self.content
+
+
+@dataclass(frozen=True)
+class InFile:
+    """A partition in a file that a worker wrote."""
+
+    path: Path
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def read(self) -> Any:
+        """Return its content."""
+        return pickle.loads(self.path.read_bytes())
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenUnits:
+    """Some of the units of partitions, by their places in each."""
+
+    sources: tuple[tuple[Partition[Sequence[UnitOfLot]], tuple[int, ...]], ...]
+
+    def __len__(self) -> int:
+        return sum(len(places) for _, places in self.sources)
+
+    def read(self) -> list[UnitOfLot]:
+        """Return the units."""
+        return [content[k] for part, places in self.sources for content in [part.read()] for k in places]
+
+
+@dataclass(frozen=True, eq=False)
+class Partitions(Generic[C]):
+    """Partitions of units in their order, and who works on them.
+
+    Attributes
+    ----------
+    parts : sequence of Partition
+    engine : Engine
+    folder : Path or None
+        Where workers keep what is to stay; None: in memory.
+    """
+
+    parts: Sequence[Partition[C]]
+    engine: Engine = serial
+    folder: Path | None = None
+
+    def __len__(self) -> int:
+        return sum(map(len, self.parts))
+
+    def map(self, function: Callable[..., R], *of_units: Any) -> Iterator[R]:
+        """Yield the function's result of each partition, in their order.
+
+        Parameters
+        ----------
+        function : callable
+            Of the content of a partition, and of its units' part of each of `of_units`.
+        of_units : sequences
+            Of as many items as there are units.
+        """
+        return chain.from_iterable(self.engine(partial(_each, function), self._blocks(of_units)))
+
+    def reduce(self, function: Callable[..., R], *of_units: Any, add: Callable[[R, R], R] | None = None) -> R:
+        """Return the sum of the function's results of all partitions, of which there is at least one; see `map`."""
+        add = add or added
+        return tree(self.engine(partial(_sum, function, add), self._blocks(of_units)), add)
+
+    def keep(self, name: str, function: Callable[..., R], *of_units: Any) -> Partitions[R]:
+        """Return the function's results as partitions, which stay where they were made; see `map`."""
+        if self.folder is None:
+            results = self.map(function, *of_units)
+            held = [InMemory(result, len(part)) for part, result in zip(self.parts, results, strict=True)]
+            return Partitions(held, self.engine)
+        own = f"{name}-{token_hex(6)}"  # no worker of another pass, or of a command that has ended, writes these
+        files: list[Partition[R]] = [InFile(self.folder / f"{own}-{k}", len(part)) for k, part in enumerate(self.parts)]
+        paths = [[file.path] * len(file) for file in files if isinstance(file, InFile)]
+        for _ in self.map(partial(_write, function), [*chain.from_iterable(paths)], *of_units):
+            pass
+        return Partitions(files, self.engine, self.folder)
+
+    def chosen(self: Partitions[Sequence[UnitOfLot]], places: Iterable[int], size: int = SIZE) -> (
+        Partitions[Sequence[UnitOfLot]]
+    ):  # fmt: skip
+        """Return the units at some places, in their order, in partitions of `size`."""
+        left, parts = iter(sorted(places)), []
+        starts = [*accumulate(map(len, self.parts), initial=0)]
+        at = 0
+        while some := list(islice(left, size)):
+            sources: dict[int, list[int]] = {}
+            for place in some:
+                while place >= starts[at + 1]:
+                    at += 1
+                sources.setdefault(at, []).append(place - starts[at])
+            parts.append(ChosenUnits(tuple((self.parts[k], tuple(own)) for k, own in sources.items())))
+        return Partitions(parts, self.engine, self.folder)
+
+    def read(self: Partitions[Sequence[UnitOfLot]]) -> Iterator[UnitOfLot]:
+        """Yield the units, read here one after the other."""
+        for part in self.parts:
+            yield from part.read()
+
+    def _blocks(self, of_units: Sequence[Any]) -> Iterator[list[tuple[Any, ...]]]:
+        """Yield the partitions with their units' part of `of_units`, in blocks that are whole branches of the tree."""
+        size = 1
+        while size * BLOCKS < len(self.parts):
+            size *= 2
+        starts = [*accumulate(map(len, self.parts), initial=0)]
+        for first in range(0, len(self.parts), size):
+            yield [
+                (part, *(own[starts[first + k] : starts[first + k + 1]] for own in of_units))
+                for k, part in enumerate(self.parts[first : first + size])
+            ]
+
+
+FamilyUnits = Partitions[Sequence[UnitOfLot]] | Sequence[UnitOfLot]
+"""The units of a family with their lots, in partitions or in memory."""
+
+
+def in_partitions(units: FamilyUnits, size: int = SIZE) -> Partitions[Sequence[UnitOfLot]]:
+    """Return units in memory in partitions of `size`; those that are in some already as they are."""
+    if isinstance(units, Partitions):
+        return units
+    cuts = range(0, len(units), size)
+    return Partitions([InMemory(units[k : k + size], len(units[k : k + size])) for k in cuts])
+
+
+def added(one: Any, other: Any) -> Any:
+    """Return the sum of two results: arrays are added, lists one after the other, tuples and names each by itself."""
+    if isinstance(one, tuple):
+        return tuple(map(added, one, other))
+    if isinstance(one, dict):
+        both = {name: added(value, other[name]) if name in other else value for name, value in one.items()}
+        return {**other, **both}
+    return one + other
+
+
+def tree(leaves: Iterable[R], add: Callable[[R, R], R]) -> R:
+    """Return the sum of at least one leaf, as a binary tree over them in their order."""
+    held: list[tuple[int, R]] = []  # levels fall
+    for leaf in leaves:
+        level, value = 0, leaf
+        while held and held[-1][0] == level:
+            level, value = level + 1, add(held.pop()[1], value)
+        held.append((level, value))
+    _, value = held.pop()
+    while held:
+        value = add(held.pop()[1], value)
+    return value
+
+
+def _each(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> list[R]:
+    return [function(part.read(), *of_units) for part, *of_units in block]
+
+
+def _sum(function: Callable[..., R], add: Callable[[R, R], R], block: Sequence[tuple[Any, ...]]) -> R:
+    return tree((function(part.read(), *of_units) for part, *of_units in block), add)
+
+
+def _write(function: Callable[..., Any], content: Any, paths: Sequence[Path], *of_units: Any) -> None:
+    """Write the function's result of a partition, whole or not at all: a worker may end, or two may do the same."""
+    new = paths[0].with_name(f"{paths[0].name}.{os.getpid()}")
+    new.write_bytes(pickle.dumps(function(content, *of_units), pickle.HIGHEST_PROTOCOL))
+    os.replace(new, paths[0])

@@ -1,0 +1,113 @@
+"""Passes over partitions: whoever works on them, the sums are the same to the last bit."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import other_families as made
+import pytest
+from numpy.testing import assert_allclose
+from threadpoolctl import threadpool_limits
+
+from driftlab.family import mixed_model, outlier_tests, partitions
+from driftlab.family.band_calibration import measure_bands
+from driftlab.family.mixed_model import Family, fit_family
+from driftlab.family.partitions import InMemory, Partitions, added, in_partitions, tree
+from driftlab.family.reml import VarianceComponents, e_step
+from driftlab.production.workers import Pool
+
+SIZE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def units() -> list[partitions.UnitOfLot]:
+    dealt = made.deal("polynomial", 60, 31, d=2, lots=3, size=SIZE)
+    return [(unit.soaked(31, ("x", "y")), unit.lot) for unit in dealt]
+
+
+def test_a_tree_adds_in_an_order_that_whole_branches_do_not_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    for count in (1, 2, 3, 7, 22, 64, 91):
+        leaves = (rng.normal(size=count) * 10.0 ** rng.integers(-8, 8, count)).tolist()
+        parts = Partitions([InMemory(leaf, 1) for leaf in leaves])
+        sums = set()
+        for blocks in (1, 2, 5, 16, 1000):
+            monkeypatch.setattr(partitions, "BLOCKS", blocks)
+            sums.add(parts.reduce(float))
+        assert sums == {tree(leaves, operator.add)}
+        assert_allclose(sums.pop(), float(np.sum(np.array(leaves, dtype=np.longdouble))), rtol=1e-12)
+
+
+def test_results_are_added_by_what_they_are() -> None:
+    one = (np.array([1.0, 2.0]), ["a"], {"L0": (1, [3])})
+    other = (np.array([10.0, 20.0]), ["b", "c"], {"L1": (5, [6]), "L0": (2, [4])})
+    total = added(one, other)
+    assert total[0].tolist() == [11.0, 22.0]
+    assert total[1:] == (["a", "b", "c"], {"L0": (3, [3, 4]), "L1": (5, [6])})
+
+
+def test_partitions_of_units_have_their_part_of_what_is_sent(units: list[partitions.UnitOfLot]) -> None:
+    parts = in_partitions(units, 7)
+    names = [soaked.unit for soaked, _ in units]
+    found = [pair for own in parts.map(_with_names, names, np.arange(60)) for pair in own]
+    assert found == [(name, name, k) for k, name in enumerate(names)]
+    some = parts.chosen([59, 3, 8, 9, 22], 2)
+    assert [[soaked.unit for soaked, _ in part.read()] for part in some.parts] == [
+        [names[3], names[8]], [names[9], names[22]], [names[59]],
+    ]  # fmt: skip
+    assert [soaked.unit for soaked, _ in some.read()] == [names[k] for k in (3, 8, 9, 22, 59)]
+
+
+def _with_names(own: list[partitions.UnitOfLot], names: list[str], places: np.ndarray) -> list[tuple[str, str, int]]:
+    return [(soaked.unit, name, int(k)) for (soaked, _), name, k in zip(own, names, places, strict=True)]
+
+
+def _found(units: Partitions[list[partitions.UnitOfLot]]) -> tuple[Family, np.ndarray]:
+    family = fit_family(units)
+    family = family.model_copy(update={"bands": measure_bands(family, units)})
+    statistics = outlier_tests.CurveStatistics(family, fitted=True)
+    return family, outlier_tests.tests_of(family, statistics, units, [], None).values
+
+
+@pytest.mark.parametrize("sample", [1500, 40])  # all units, and some of them
+def test_processes_change_nothing(
+    sample: int, units: list[partitions.UnitOfLot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mixed_model, "SAMPLE", sample)
+    with threadpool_limits(1):
+        family, values = _found(in_partitions(units, 7))
+        with Pool(2) as pool:
+            by_two, theirs = _found(replace(in_partitions(units, 7), engine=pool.ordered, folder=tmp_path))
+    assert by_two.model_dump_json() == family.model_dump_json()
+    assert np.array_equal(theirs, values, equal_nan=True)
+
+
+def test_sums_of_partitions_of_any_size_agree(units: list[partitions.UnitOfLot]) -> None:
+    knots = units[0][0].knots
+    lot = np.array([int(name[-1]) for _, name in units])
+    lot -= lot.min()
+    w = np.random.default_rng(2).choice([1.0, 0.3], 60)
+    law = VarianceComponents(*(SIZE**2 * scale * np.eye(knots.q) for scale in (1.0, 0.1)))
+    found = []
+    for size in (1, 7, 60):
+        sums = in_partitions(units, size).keep("sums", partial(mixed_model._stacked, knots))
+        found.append(e_step(law, sums, 1, lot, w))
+    for other in found[1:]:
+        for name in ("share", "spread", "scatter", "between"):
+            one = getattr(found[0], name)
+            assert_allclose(getattr(other, name), one, rtol=1e-9, atol=1e-9 * np.max(np.abs(one)))
+        assert_allclose(other.means.mu, found[0].means.mu, rtol=1e-9)
+
+
+def test_families_of_partitions_of_any_size_agree(units: list[partitions.UnitOfLot]) -> None:
+    """Sigma by as much as its prior is found: to a tolerance of the likelihood, beyond which additions decide."""
+    one, other = (fit_family(in_partitions(units, size)) for size in (7, 50))
+    assert_allclose(other.mu, one.mu, rtol=1e-9, atol=1e-9 * np.max(np.abs(one.mu)))
+    for name in ("mu_covariance", "Sigma", "Lambda"):
+        its = getattr(one, name)
+        assert_allclose(getattr(other, name), its, atol=1e-5 * np.max(np.abs(its)))
+    assert (other.steps, other.units) == (one.steps, one.units)
