@@ -87,6 +87,7 @@ def import_map(
     T = np.linspace(*calibration.domain, PLACES)
     bias = calibration.bias(T)
     provenance = {
+        **calibration.about,
         "imported_from": path.name,
         "format": exporter.kind,
         "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),

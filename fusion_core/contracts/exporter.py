@@ -47,6 +47,8 @@ class ReadBack:
         The degree of polynomial that holds it.
     notes : tuple of str
         What one should know of it.
+    about : mapping of str to str
+        Facts on the device, as a source's `about`.
     """
 
     channel: str
@@ -56,6 +58,7 @@ class ReadBack:
     bias: Callable[[Array], Array]
     order: int = 3
     notes: tuple[str, ...] = ()
+    about: Mapping[str, str] = field(default_factory=dict)
 
 
 class Exporter(Plugin):

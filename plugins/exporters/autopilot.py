@@ -12,7 +12,7 @@ error of what was cut. N samples, n = order + 1 coefficients, d axes.
 
 Parameter files hold numbers by name, one a line. All lines that ground stations write are read:
 `1<TAB>1<TAB>NAME<TAB>VALUE<TAB>TYPE` (QGroundControl), `NAME,VALUE` (Mission Planner, `ulog_params`), `NAME VALUE`
-(MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment.
+(MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment. A log has its vehicle's parameters too.
 """
 
 from __future__ import annotations
@@ -31,11 +31,16 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_core import contracts
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss
+from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss, head
 from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.escaping import comment
 from fusion_core.units import Unit, same_dimension
+from fusion_plugins.sources.dataflash import DataFlash
+from fusion_plugins.sources.dataflash import last_parameters as of_dataflash
+from fusion_plugins.sources.ulog import Ulog
+from fusion_plugins.sources.ulog import first_parameters as of_ulog
+from fusion_plugins.sources.unpacked import plain_file
 
 Single = NDArray[np.float32]
 TRIAD = ("x", "y", "z")
@@ -44,13 +49,17 @@ OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 ti
 
 @dataclass(frozen=True)
 class FirmwareSensor:
-    """A kind of sensor that a firmware corrects for temperature; `short` stands in the parameters' names."""
+    """A kind of sensor that a firmware corrects for temperature.
+
+    `short` stands in the parameters' names; the firmware's unit is `size` of the SI unit.
+    """
 
     short: str
     channel: str
     unit: str
     order: int = 3
     axes: tuple[str, ...] = TRIAD
+    size: float = 1.0
 
 
 class Firmware:
@@ -62,10 +71,6 @@ class Firmware:
     def bias(self, temperature: ArrayLike) -> Single:
         """Return the correction (N, d) at temperatures (N,) in degC."""
         raise NotImplementedError
-
-    def in_use(self, t: Array, temperature: Array) -> ArrayLike:
-        """Return the temperatures (N,) whose correction is in use at times t (N,) in s: by default each its own."""
-        return temperature
 
 
 Held = TypeVar("Held", bound=Firmware)
@@ -154,6 +159,7 @@ class Autopilot(contracts.Exporter):
         T_ref: float,
         hold: Callable[[Array], Held],
         limits: tuple[np.float32, np.float32] | None = None,
+        in_use: Callable[[Chunk], Array] | None = None,
     ) -> tuple[Held, SensorLoss, tuple[str, ...]]:
         """Fit the polynomial; return the firmware's parameters, the loss, and texts about everything that is left out.
 
@@ -163,23 +169,25 @@ class Autopilot(contracts.Exporter):
             Its order and axes.
         T_ref : float
             Reference of the powers, degC.
-        hold : function of coefficients (n, d) of all axes of the firmware
+        hold : function of coefficients (n, d) of all axes of the firmware, in its unit
             Makes the parameters.
         limits : pair of float32, optional
             The firmware's limits of temperature, degC, where they are within the map's domain.
+        in_use : function of a recording -> (N,), optional
+            The temperatures whose correction is in use; each its own by default.
         """
         at = [0] if len(kind.axes) == 1 else places(self.kind, sensor)
         flown = self.flown(sensor.fitted.domain)
         c = polynomial(sensor.fitted, kind.order, T_ref, flown)
         of_all = np.zeros((len(c), len(kind.axes)))
-        of_all[:, at] = c
+        of_all[:, at] = c / kind.size
         held = hold(of_all)
 
         def target(T: ArrayLike) -> Array:
-            return held.bias(T)[:, at].astype(np.float64)
+            return held.bias(T)[:, at].astype(np.float64) * kind.size
 
         def renewed(recording: Chunk) -> Array:
-            return target(held.in_use(recording.t, recording["temperature"]))
+            return target(recording["temperature"] if in_use is None else in_use(recording))
 
         modelled, left_out = contracts.beyond_a_map(sensor)
         recording = contracts.warm_up(sensor.fitted.domain)
@@ -220,18 +228,24 @@ def kind_of(kinds: Sequence[Kind], sensor: Calibrated, exporter: str, corrected:
 
 
 def read_back(
-    kind: FirmwareSensor, held: Firmware, whose: str, notes: Sequence[str], besides: Array | None = None
+    kind: FirmwareSensor,
+    held: Firmware,
+    whose: str,
+    notes: Sequence[str],
+    about: Mapping[str, str],
+    besides: Array | None = None,
 ) -> ReadBack:
     """Return the calibration that a firmware holds; `besides` (d,) is what it takes off at all temperatures."""
     low, high = held.T_min, held.T_max
 
     def bias(T: Array) -> Array:
         taken_off = held.bias(T).astype(np.float64)
-        return taken_off if besides is None else taken_off + besides
+        return (taken_off if besides is None else taken_off + besides) * kind.size
 
     first = f"{kind.channel}: {whose}, clamped below {low:g} and above {high:g} °C"
     axes = kind.axes if len(kind.axes) > 1 else ("x",)
-    return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, (first, *notes))
+    domain = float(low), float(high)
+    return ReadBack(kind.channel, kind.unit, axes, domain, bias, kind.order, (first, *notes), about)
 
 
 def places(kind: str, sensor: Calibrated) -> list[int]:
@@ -281,22 +295,28 @@ def powers(T: Array, T_ref: float, c: Array) -> Array:
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
-LOGS = {  # how a log begins, what it is, and what writes its parameters
-    b"ULog": ("a PX4 log", "`ulog_params -i LOG FILE` of pyulog"),
-    b"\xa3\x95": ("a DataFlash log", "`mavparms.py LOG > FILE` of pymavlink"),
-}
 
 
 def read_parameters(path: Path) -> dict[str, float]:
-    """Return a file's parameters by name.
+    """Return a file's parameters by name; those of a log, packed or not, too.
 
     Raises
     ------
     UnreadableFile
-        If it is not there, is a log, holds a line that is no parameter, or says two things of one.
+        If it is not there, holds a line that is no parameter, or says two things of one.
     """
+    with plain_file(path) as plain:
+        begins = head(plain) if plain.is_file() else b""
+        if any(begins.startswith(signature) for signature in Ulog.signatures):
+            return of_ulog(plain)
+        if any(begins.startswith(signature) for signature in DataFlash.signatures):
+            return of_dataflash(plain)
+        return _of_text(_text(plain), path)
+
+
+def _of_text(text: str, path: Path) -> dict[str, float]:
     parameters: dict[str, float] = {}
-    for number, line in enumerate(_text(path).splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         fields = FIELDS.split(line.split("#")[0].strip())
         if fields == [""]:
             continue
@@ -338,12 +358,6 @@ def _text(path: Path) -> str:
             data = file.read(LARGEST + 1)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name a parameter file") from None
-    for begins, (what, tool) in LOGS.items():
-        if data.startswith(begins):
-            raise UnreadableFile(
-                f"{path}: is {what}, expected a parameter file; save the vehicle's parameters with the ground station, "
-                f"or take those of the log: {tool}"
-            )
     try:
         if len(data) > LARGEST:
             raise ValueError

@@ -140,6 +140,13 @@ class Ulog(FileSource):
                 )
 
 
+def first_parameters(path: Path) -> dict[str, float]:
+    """Return the parameters with which a log begins; raises UnreadableFile."""
+    from fusion_plugins.sources.ulog.file import LogFile
+
+    return LogFile(path, "ulog").parameters
+
+
 @hookimpl
 def sources() -> list[type[Source]]:
     """Register the plugin."""
