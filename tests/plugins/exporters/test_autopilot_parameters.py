@@ -1,7 +1,11 @@
 """Parameter files: every way in which ground stations write them reads the same."""
 
+import gzip
+
+import dataflash_writer
 import numpy as np
 import pytest
+import ulog_writer
 
 from fusion_core.errors import UnreadableFile
 from fusion_plugins.exporters.autopilot import read_parameters, single
@@ -52,3 +56,16 @@ def test_texts_of_single_precision_are_the_shortest_that_hit_it():
     assert np.array_equal(np.array(texts, dtype=np.float32), values)
     assert max(map(len, texts)) <= 15
     assert single(0.1) == "0.1"
+
+
+def test_those_of_a_log_are_read_from_the_log(tmp_path):
+    t, still = np.arange(20.0) + 5, np.zeros((20, 3))
+    values = {"TC_G_ENABLE": 1, "TC_G0_X1_0": -2.5e-5}
+    log = ulog_writer.write_ulog(tmp_path / "a.ulg", [ulog_writer.sensor("sensor_gyro", 0, t, still, 20.0, 7)], values)
+    packed = tmp_path / "a.ulg.gz"
+    packed.write_bytes(gzip.compress(log.read_bytes()))
+    for path in (log, packed):
+        assert read_parameters(path) == {"TC_G_ENABLE": 1.0, "TC_G0_X1_0": np.float32(-2.5e-5)}
+    path = tmp_path / "b.bin"
+    dataflash_writer.write_log(path, t, [(still, still, t)], {"INS_TCAL1_ENABLE": 0}, [(9.0, "INS_TCAL1_ENABLE", 1)])
+    assert read_parameters(path) == {"INS_TCAL1_ENABLE": 1.0}
