@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
@@ -15,7 +14,7 @@ from fusion_core.units import Unit
 from fusion_plugins.effects.common import auxiliary
 
 _EXACT = 1e-3  # of the input: what is left of two that are one, by means over some seconds
-_KNOWN = 0.01  # of what is left of the reading: an input that is smaller shows nothing
+_KNOWN = 1.0  # of what is left of the reading: an input that is smaller shows nothing
 _TURNED = 0.1  # of the input: it differs by more from one recording to another, or in one
 Form = Literal["constant", "of temperature", "both"]
 
@@ -59,8 +58,8 @@ class ScaleFactor(Effect):
             return
         heat = all("temperature" in chunk.channels for chunk in recordings)
         T = float(np.mean(np.concatenate([chunk["temperature"] for chunk in recordings]))) if heat else 25.0
-        forms: list[Form] = (["constant"] if within else []) + (["both" if within else "of temperature"] if heat else [])
-        for form in forms:
+        forms: dict[Form, bool] = {"constant": within, "both": within and heat, "of temperature": heat and not within}
+        for form in (form for form, shown in forms.items() if shown):
             yield self.model_copy(update={"channel": name, "form": form, "zero": T})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
