@@ -69,6 +69,14 @@ class ScaleFactor(Effect):
         factors += [] if self.form == "constant" else [chunk["temperature"] - float(self.zero)]
         return on_each_axis(np.stack(factors, axis=1), len(self.axes)) * u[:, :, None], None
 
+    def ends(self, channel: str) -> Array:
+        """Return the ends of the domain of a channel; those of the input reach as far to either side."""
+        ends = super().ends(channel)
+        if channel != self.channel:
+            return ends
+        largest = np.max(np.abs(ends), axis=1)
+        return np.stack([-largest, largest], axis=1)
+
     @property
     def terms(self) -> tuple[str, ...]:
         """The scale factor error and its change with temperature, as far as they count."""

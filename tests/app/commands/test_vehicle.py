@@ -165,7 +165,11 @@ def air_and_field(path, drift=0.0, once=False):
     T = 15 + 15 * swing
     x, stamp, same = T - 30, np.round(t * 1e6).astype(np.uint64), np.ones(len(t))
     about = {"timestamp": stamp, "timestamp_sample": stamp, "temperature": T, "error_count": 0 * same}
-    topics = [sensor("sensor_gyro", 0, t, NOISE * rng.normal(size=(len(t), 3)), T, GYROS[0])]
+    still = np.array([0, 0, -G]) + 2e-3 * rng.normal(size=(len(t), 3)) - 1e-3 * x[:, None]
+    topics = [
+        sensor("sensor_gyro", 0, t, NOISE * rng.normal(size=(len(t), 3)), T, GYROS[0]),
+        sensor("sensor_accel", 0, t, still, T, ACCELS[0]),
+    ]
     for k in range(2):
         pressure = 100_900 + 300 * k + PRESSURE[0] * x + PRESSURE[1] * x**2 + k * drift * (t / t[-1]) ** 2
         values = {"device_id": (6620172 + k) * same, "pressure": pressure + 2 * rng.normal(size=len(t))}
@@ -179,14 +183,14 @@ def air_and_field(path, drift=0.0, once=False):
 
 def test_barometers_and_a_magnetometer_are_corrected_about_the_middle(tmp_path):
     result = driftlab.vehicle(air_and_field(tmp_path / "a.ulg"), out=tmp_path / "out", kind="polynomial")
-    assert [one.name for one in result.sensors] == ["gyro 0", "mag 0", "baro 0", "baro 1"]
-    assert [bool(one.left_out) for one in result.sensors] == [False] * 4
+    assert [one.name for one in result.sensors] == ["gyro 0", "accel 0", "mag 0", "baro 0", "baro 1"]
+    assert [bool(one.left_out) for one in result.sensors] == [False] * 5
     x = np.linspace(-14, 14, 50)
     for k in range(2):
         back = Px4(kind="px4", baro_device_id=6620172 + k).read(tmp_path / "out" / "vehicle.params")[-1]
         expected = PRESSURE[0] * x + PRESSURE[1] * x**2  # the pressure of the air is not in it
         np.testing.assert_allclose(back.bias(30 + x)[:, 0], expected, atol=0.5)
-    back = Px4(kind="px4", mag_device_id=197388).read(tmp_path / "out" / "vehicle.params")[1]
+    back = Px4(kind="px4", mag_device_id=197388).read(tmp_path / "out" / "vehicle.params")[-1]
     expected = 1e-4 * (FIELD[0] * x[:, None] + FIELD[1] * x[:, None] ** 2)
     np.testing.assert_allclose(back.bias(30 + x), expected, atol=5e-8)
 
@@ -198,7 +202,7 @@ def test_what_may_be_the_weather_is_not_among_the_parameters(drift, once, tmp_pa
     second = result.sensors[-1]
     assert "air pressure and field drift by themselves" in second.left_out
     assert "6620173" not in (tmp_path / "out" / "vehicle.params").read_text()
-    assert bool(result.sensors[2].left_out) is once
+    assert bool(result.sensors[3].left_out) is once
     assert result.status == 0  # gyros and accelerometers are there
     page = (tmp_path / "out" / "report.html").read_text()
     assert all(one.title in page for one in result.sensors)
@@ -208,9 +212,9 @@ def test_what_may_be_the_weather_is_not_among_the_parameters(drift, once, tmp_pa
 def test_levels_of_two_days_do_not_bend_the_curve(tmp_path):
     one = air_and_field(tmp_path / "a.ulg")
     result = driftlab.vehicle([f"{one}::0:3600", f"{one}::3600:"], kind="polynomial")
-    assert len(result.sensors[2].recordings) == 2
+    assert len(result.sensors[3].recordings) == 2
     x = np.linspace(-14, 14, 50)
-    bias = result.sensors[2].result.map.bias(30 + x)[:, 0]
+    bias = result.sensors[3].result.map.bias(30 + x)[:, 0]
     np.testing.assert_allclose(bias - bias.mean(), (e := PRESSURE[0] * x + PRESSURE[1] * x**2) - e.mean(), atol=0.5)
 
 

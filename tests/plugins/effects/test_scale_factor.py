@@ -67,3 +67,12 @@ def test_it_is_not_proposed_where_nothing_shows_it():
     assert all(one.channel != "accel" for one in ScaleFactor().proposals(gyro))
     unknown = [Chunk(c.t, {k: v for k, v in c.channels.items() if k != "excess"}) for c in still]
     assert list(ScaleFactor().proposals(unknown)) == []
+
+
+def test_what_was_fitted_one_way_up_holds_the_other_way_up():
+    domain = {"accel": ((-G, 0.0), (0.0, G), (-1.0, 2.0)), "temperature": (10.0, 40.0)}
+    effect = ScaleFactor(zero=25.0, form="of temperature", domain=domain)
+    up, down = (placed([0, sign, 0]) for sign in (1, -1))
+    one, other = (effect.held(chunk.having(accel=chunk["accel"] - chunk["excess"]), None)[0] for chunk in (up, down))
+    np.testing.assert_allclose(one, -other, atol=1e-12)
+    assert np.max(np.abs(one)) == pytest.approx(15 * G)
