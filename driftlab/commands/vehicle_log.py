@@ -6,7 +6,7 @@ import hashlib
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,6 +93,8 @@ class LogSensor:
         Of its fields.
     recordings : tuple of str
         The logs that have it.
+    places : tuple of int
+        Its number in each of them, from 0.
     """
 
     channel: str
@@ -100,6 +102,12 @@ class LogSensor:
     about: Mapping[str, str]
     unit: str
     recordings: tuple[str, ...]
+    places: tuple[int, ...]
+
+    @property
+    def logged(self) -> list[tuple[str, int]]:
+        """Its logs, each with its number there."""
+        return list(zip(self.recordings, self.places, strict=True))
 
     @property
     def device(self) -> str:
@@ -110,6 +118,11 @@ class LogSensor:
     def name(self) -> str:
         """Channel and number, e.g. `gyro 0`."""
         return f"{self.channel} {self.number}"
+
+    def beside(self, other: LogSensor) -> LogSensor:
+        """Return the sensor with what another log has of it."""
+        recordings, places = self.recordings + other.recordings, self.places + other.places
+        return replace(self, recordings=recordings, places=places)
 
     @property
     def held(self) -> bool:
@@ -139,25 +152,50 @@ def config_and_data(
     product: str, sensor: LogSensor, sensors: Sequence[LogSensor], site: Mapping[str, str]
 ) -> tuple[Config, list[str]]:
     """Return the config by which a sensor's map is fitted, and its recordings."""
-    platform = PLATFORMS[product]
-    topic, at = platform.topics[sensor.channel], sensor.number - platform.first
-    temperature = f"{topic.name}[{at}].{topic.temperature}"
     if sensor.held:
-        paths: dict[str, Any] = {"time": f"{topic.name}[{at}].{platform.clock}", "temperature": temperature}
-        fields = [f"{topic.name}[{at}].{axis}" for axis in topic.axes]
-        model = {"kind": "held", "channel": sensor.channel, "update_interval": "1 s", **HELD[sensor.channel]}
-        channels = {name: {"path": path} for name, path in paths.items()}
-        channels[sensor.channel] = {"path": fields if len(fields) > 1 else fields[0], "unit": sensor.unit}
-        config = config_of({"source": {"kind": _kind(product), "channels": channels}, "filter": model})
-        return config, _levelled(config, sensor)
-    gyros = [one.number for one in sensors if one.channel == "gyro" and {*sensor.recordings} <= {*one.recordings}]
-    gyro = (sensor.number if sensor.number in gyros else next(iter(gyros), sensor.number)) - platform.first
-    places = {"gyro": gyro, "accel": gyro, sensor.channel: at}
-    axes = {name: [f"{platform.topics[name].name}[{k}].{axis}" for axis in platform.topics[name].axes]
-            for name, k in places.items()}  # fmt: skip
-    rows = platform.topics["gyro"].name
-    time = f"{rows}[{gyro if product == 'px4_log' else at}].{platform.clock}"
-    return _config(product, site, {"time": time, **axes, "temperature": temperature}), list(sensor.recordings)
+        configs = [_held(product, sensor, place) for place in sensor.places]
+        return configs[0], _levelled(configs, sensor)
+    configs = []
+    for name, place in zip(sensor.recordings, sensor.places, strict=True):
+        gyros = [at for one in sensors if one.channel == "gyro" for log, at in one.logged if log == name]
+        gyro = place if place in gyros else min(gyros, default=place)
+        configs.append(_config(product, site, _paths(product, sensor.channel, place, gyro)))
+    names = zip(sensor.recordings, sensor.places, configs, strict=True)
+    data = [name if at == sensor.places[0] else _read_by(config, name) for name, at, config in names]
+    return configs[0], data
+
+
+def _read_by(config: Config, recording: str) -> InMemoryName:
+    """Return a recording that is read by another config than the first."""
+    source = with_recording(config, recording).source
+    assert source is not None
+    return InMemoryName(source)
+
+
+def _held(product: str, sensor: LogSensor, place: int) -> Config:
+    """Return the config of a sensor whose input is constant, as the log has it at `place`."""
+    platform, topic = PLATFORMS[product], PLATFORMS[product].topics[sensor.channel]
+    row = f"{topic.name}[{place}]"
+    fields = [f"{row}.{axis}" for axis in topic.axes]
+    channels = {
+        "time": {"path": f"{row}.{platform.clock}"},
+        "temperature": {"path": f"{row}.{topic.temperature}"},
+        sensor.channel: {"path": fields if len(fields) > 1 else fields[0], "unit": sensor.unit},
+    }
+    model = {"kind": "held", "channel": sensor.channel, "update_interval": "1 s", **HELD[sensor.channel]}
+    return config_of({"source": {"kind": _kind(product), "channels": channels}, "filter": model})
+
+
+def _paths(product: str, channel: str, place: int, gyro: int) -> dict[str, Any]:
+    """Return the paths of channels that read the sensor at a place in the log; `gyro` is that of the rows."""
+    platform = PLATFORMS[product]
+    paths: dict[str, Any] = {}
+    for name in ("gyro", "accel"):
+        topic, at = platform.topics[name], place if name == channel else gyro
+        paths[name] = [f"{topic.name}[{at}].{axis}" for axis in topic.axes]
+    own, rows = platform.topics[channel], platform.topics["gyro"].name
+    time = f"{rows}[{gyro if product == 'px4_log' else place}].{platform.clock}"
+    return {"time": time, **paths, "temperature": f"{own.name}[{place}].{own.temperature}"}
 
 
 def _kind(product: str) -> str:
@@ -171,7 +209,7 @@ def _config(product: str, site: Mapping[str, str], paths: Mapping[str, Any]) -> 
     return config_of({"extends": product, **site, "source": {"channels": channels}})
 
 
-def _levelled(config: Config, sensor: LogSensor) -> list[str]:
+def _levelled(configs: Sequence[Config], sensor: LogSensor) -> list[str]:
     """Return the recordings of a sensor, each less its level at the middle of all temperatures.
 
     The level is the field or the air pressure of a day and place. It is told together with a curve that all logs
@@ -179,8 +217,10 @@ def _levelled(config: Config, sensor: LogSensor) -> list[str]:
 
         y_k = level_j + c_1 (T_k - T_mid) + ... + c_5 (T_k - T_mid)^5,    k in log j
     """
-    assert config.filter is not None
-    chunks = [concatenate(read(with_recording(config, name), Faults())) for name in sensor.recordings]
+    model = configs[0].filter
+    assert model is not None
+    logs = [with_recording(config, name) for config, name in zip(configs, sensor.recordings, strict=True)]
+    chunks = [concatenate(read(config, Faults())) for config in logs]
     T, y = (np.concatenate([chunk[name] for chunk in chunks]) for name in ("temperature", sensor.channel))
     log = np.repeat(range(len(chunks)), list(map(len, chunks)))
     some = np.unique(np.linspace(0, len(T) - 1, ROWS).astype(int))
@@ -190,13 +230,13 @@ def _levelled(config: Config, sensor: LogSensor) -> list[str]:
     names = []
     for chunk, name, level in zip(chunks, sensor.recordings, levels, strict=True):
         held = {sensor.channel: chunk[sensor.channel] - level, "temperature": chunk["temperature"]}
-        units = {sensor.channel: config.filter.tracked.unit}
+        units = {sensor.channel: model.tracked.unit}
         names.append(InMemoryName(in_memory_name(Chunk(chunk.t, held), units, name)))
     return list(names)
 
 
 def sensors_of(product: str, recordings: Sequence[str], site: Mapping[str, str]) -> list[LogSensor]:
-    """Return the sensors of all logs, none of which is there twice.
+    """Return the sensors of all logs, none of which is there twice, by their devices; the first log numbers them.
 
     Raises
     ------
@@ -207,33 +247,35 @@ def sensors_of(product: str, recordings: Sequence[str], site: Mapping[str, str])
     more = {name: f"{topic.name}.{topic.axes[0]}" for name, topic in rest.items()}  # or their rows are not read
     source = _config(product, site, more).source
     assert isinstance(source, FileSource)
-    found = dict[tuple[str, int], tuple[Mapping[str, str], str, list[str]]]()
+    found = dict[tuple[str, str | int], LogSensor]()
     for name in recordings:
-        for key, about, unit in _in_log(product, source, part_of(name)[0]):
-            before, _, having = found.setdefault(key, (about, unit, []))
-            device, other = (facts.get("device_id", "") for facts in (about, before))
-            if other != device:
-                raise ConfigError(
-                    f"{name}: has the device id {device or 'unknown'} as {key[0]} {key[1]}, {having[0]} has "
-                    f"{other or 'none'}; give the logs of one vehicle whose sensors kept their places"
-                )
-            having.append(name)
+        for one in _in_log(product, source, name):
+            key = one.channel, one.device or one.number
+            before = found.get(key)
+            found[key] = one if before is None else before.beside(one)
     _check_twice(recordings)
-    order = list(PLATFORMS[product].topics)
-    sensors = [LogSensor(*key, about, unit, tuple(having)) for key, (about, unit, having) in found.items()]
-    return sorted(sensors, key=lambda one: (order.index(one.channel), one.number))
+    order, first = list(PLATFORMS[product].topics), dict[str, LogSensor]()
+    for one in found.values():
+        if (other := first.setdefault(one.name, one)) is not one:
+            raise ConfigError(
+                f"{one.recordings[0]}: has the device id {one.device or 'unknown'} as {one.name}, "
+                f"{other.recordings[0]} has {other.device or 'none'}; give the logs of one vehicle, first one that has "
+                "all its sensors"
+            )
+    return sorted(found.values(), key=lambda one: (order.index(one.channel), one.number))
 
 
-def _in_log(product: str, source: FileSource, path: Path) -> Iterator[tuple[tuple[str, int], Mapping[str, str], str]]:
-    """Yield channel and number of each sensor of a log, with the facts on its device and its unit."""
-    platform = PLATFORMS[product]
+def _in_log(product: str, source: FileSource, recording: str) -> Iterator[LogSensor]:
+    """Yield the sensors of one log."""
+    platform, path = PLATFORMS[product], part_of(recording)[0]
     with source.model_copy(update={"path": path}).open(path, Faults()) as table:
         for channel, topic in platform.topics.items():
-            for number in topic.numbers:
-                place = f"{topic.name}[{number}].{topic.axes[0]}"
+            for at in topic.numbers:
+                place = f"{topic.name}[{at}].{topic.axes[0]}"
                 with suppress(MissingChannel):
                     if table.has(place):
-                        yield (channel, number + platform.first), table.about(place), table.unit(place) or ""
+                        about, unit = table.about(place), table.unit(place) or ""
+                        yield LogSensor(channel, at + platform.first, about, unit, (recording,), (at,))
 
 
 def _check_twice(recordings: Sequence[str]) -> None:

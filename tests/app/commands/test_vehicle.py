@@ -37,13 +37,15 @@ def soak(seed=6, start=30.0):
     return t, units
 
 
-def px4(path, gyros=GYROS, **of_soak):
+def px4(path, order=(0, 1), gyros=GYROS, **of_soak):
+    """Write a log with the units in an order, as their drivers happened to start."""
     t, units = soak(**of_soak)
     topics = []
-    for k, (gyro, accel, T) in enumerate(units):
+    for place, k in enumerate(order):
+        gyro, accel, T = units[k]
         topics += [
-            sensor("sensor_gyro", k, t, gyro, T, gyros[k]),
-            sensor("sensor_accel", k, t + 3e-4, accel, T, ACCELS[k]),
+            sensor("sensor_gyro", place, t, gyro, T, gyros[k]),
+            sensor("sensor_accel", place, t + 3e-4, accel, T, ACCELS[k]),
         ]
     return write_ulog(path, topics, {"TC_G_ENABLE": 0})
 
@@ -135,11 +137,21 @@ def test_two_logs_of_a_vehicle_count_together_and_those_of_two_vehicles_are_refu
     samples = [result.sensors[1].result.map.record.samples for result in (alone, both)]
     assert samples[1] > 1.8 * samples[0]
     check(both.sensors, 0)
-    px4(tmp_path / "other.ulg", gyros=GYROS[::-1])
-    with pytest.raises(ConfigError, match=f"has the device id {GYROS[1]} as gyro 0.*logs of one vehicle"):
+    px4(tmp_path / "other.ulg", gyros=(77, 78))
+    with pytest.raises(
+        ConfigError, match=f"has the device id 77 as gyro 0, .* has {GYROS[0]}; give the logs of one veh"
+    ):
         driftlab.vehicle([folder / "soak.ulg", tmp_path / "other.ulg"])
     with pytest.raises(ConfigError, match="are of PX4 and of ArduPilot"):
         driftlab.vehicle([folder / "soak.ulg", folder / "soak.bin"])
+
+
+def test_a_sensor_is_the_same_by_its_device_in_whatever_order_a_log_has_it(folder, tmp_path):
+    turned = px4(tmp_path / "turned.ulg", order=(1, 0), seed=8)
+    both = driftlab.vehicle([folder / "soak.ulg", turned], kind="polynomial")
+    assert [int(one.device) for one in both.sensors] == [*GYROS, *ACCELS]
+    assert [one.places for one in both.sensors] == [(0, 1), (1, 0)] * 2
+    check(both.sensors, 0)
 
 
 def test_what_it_cannot_use_is_said(folder, tmp_path):
@@ -181,16 +193,21 @@ def air_and_field(path, drift=0.0, once=False):
     return write_ulog(path, topics)
 
 
+def read_back(path, channel, **settings):
+    (found,) = (one for one in Px4(kind="px4", **settings).read(path) if one.channel == channel)
+    return found
+
+
 def test_barometers_and_a_magnetometer_are_corrected_about_the_middle(tmp_path):
     result = driftlab.vehicle(air_and_field(tmp_path / "a.ulg"), out=tmp_path / "out", kind="polynomial")
     assert [one.name for one in result.sensors] == ["gyro 0", "accel 0", "mag 0", "baro 0", "baro 1"]
     assert [bool(one.left_out) for one in result.sensors] == [False] * 5
     x = np.linspace(-14, 14, 50)
     for k in range(2):
-        back = Px4(kind="px4", baro_device_id=6620172 + k).read(tmp_path / "out" / "vehicle.params")[-1]
+        back = read_back(tmp_path / "out" / "vehicle.params", "baro", baro_device_id=6620172 + k)
         expected = PRESSURE[0] * x + PRESSURE[1] * x**2  # the pressure of the air is not in it
         np.testing.assert_allclose(back.bias(30 + x)[:, 0], expected, atol=0.5)
-    back = Px4(kind="px4", mag_device_id=197388).read(tmp_path / "out" / "vehicle.params")[-1]
+    back = read_back(tmp_path / "out" / "vehicle.params", "mag", mag_device_id=197388)
     expected = 1e-4 * (FIELD[0] * x[:, None] + FIELD[1] * x[:, None] ** 2)
     np.testing.assert_allclose(back.bias(30 + x), expected, atol=5e-8)
 
