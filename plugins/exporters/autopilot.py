@@ -12,7 +12,7 @@ error of what was cut. N samples, n = order + 1 coefficients, d axes.
 
 Parameter files hold numbers by name, one a line. All lines that ground stations write are read:
 `1<TAB>1<TAB>NAME<TAB>VALUE<TAB>TYPE` (QGroundControl), `NAME,VALUE` (Mission Planner, `ulog_params`), `NAME VALUE`
-(MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment. A log has its vehicle's parameters too.
+(MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment.
 """
 
 from __future__ import annotations
@@ -31,16 +31,11 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_core import contracts
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss, head
+from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss
 from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.escaping import comment
 from fusion_core.units import Unit, same_dimension
-from fusion_plugins.sources.dataflash import DataFlash
-from fusion_plugins.sources.dataflash import last_parameters as of_dataflash
-from fusion_plugins.sources.ulog import Ulog
-from fusion_plugins.sources.ulog import first_parameters as of_ulog
-from fusion_plugins.sources.unpacked import plain_file
 
 Single = NDArray[np.float32]
 TRIAD = ("x", "y", "z")
@@ -298,25 +293,15 @@ LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
 
 
 def read_parameters(path: Path) -> dict[str, float]:
-    """Return a file's parameters by name; those of a log, packed or not, too.
+    """Return a file's parameters by name.
 
     Raises
     ------
     UnreadableFile
         If it is not there, holds a line that is no parameter, or says two things of one.
     """
-    with plain_file(path) as plain:
-        begins = head(plain) if plain.is_file() else b""
-        if any(begins.startswith(signature) for signature in Ulog.signatures):
-            return of_ulog(plain)
-        if any(begins.startswith(signature) for signature in DataFlash.signatures):
-            return of_dataflash(plain)
-        return _of_text(_text(plain), path)
-
-
-def _of_text(text: str, path: Path) -> dict[str, float]:
     parameters: dict[str, float] = {}
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_text(path).splitlines(), 1):
         fields = FIELDS.split(line.split("#")[0].strip())
         if fields == [""]:
             continue

@@ -11,7 +11,7 @@ gyros and accelerometers are in the frame of the board, without the autopilot's 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -23,7 +23,7 @@ from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.joining import mapped
-from fusion_plugins.sources.unpacked import unpacking
+from fusion_plugins.sources.unpacked import plain_file, unpacking
 
 SIGNATURE = b"\xa3\x95\x80"
 TEXT = b"FMT, "  # of a log as text
@@ -69,6 +69,15 @@ class DataFlash(FileSource):
 
         return DataFlashWriter(path, note)
 
+    @classmethod
+    def parameters(cls, path: Path) -> Mapping[str, float]:
+        """Return the parameters that a log ends with."""
+        from fusion_plugins.sources.dataflash.log import DataFlashMessages
+
+        faults = Faults()
+        with plain_file(path) as plain, _binary(plain, faults) as place:
+            return DataFlashMessages(path, mapped(place), (), faults).parameters.last
+
 
 @contextmanager
 def _binary(path: Path, faults: Faults) -> Iterator[Path]:
@@ -80,15 +89,6 @@ def _binary(path: Path, faults: Faults) -> Iterator[Path]:
 
     with binary(path, faults) as place:
         yield place
-
-
-def last_parameters(path: Path) -> dict[str, float]:
-    """Return the parameters that a log ends with; raises UnreadableFile."""
-    from fusion_plugins.sources.dataflash.log import DataFlashMessages
-
-    faults = Faults()
-    with _binary(path, faults) as place:
-        return DataFlashMessages(path, mapped(place), (), faults).parameters.last
 
 
 @hookimpl

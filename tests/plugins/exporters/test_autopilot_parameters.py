@@ -1,11 +1,7 @@
 """Parameter files: every way in which ground stations write them reads the same."""
 
-import gzip
-
-import dataflash_writer
 import numpy as np
 import pytest
-import ulog_writer
 
 from fusion_core.errors import UnreadableFile
 from fusion_plugins.exporters.autopilot import read_parameters, single
@@ -33,8 +29,6 @@ def test_all_ways_of_writing_read_the_same(by, tmp_path):
         (b"A 1\nB nan\n", "line 2: 'B nan' is no parameter"),
         (b"A 1 2\n", "line 1: 'A 1 2' is no parameter"),
         (b"A 1\nB 2\nA 3\n", "line 3: A is 3, and 1 further up; keep one"),
-        (b"ULog\x01\x125 and so on", "ends before its first row"),
-        (b"\xa3\x95\x80", r"describes no message \(FMT\)"),
         (b"\xff\xfe\x00A", "is no text, expected a parameter file"),
     ],
 )
@@ -56,16 +50,3 @@ def test_texts_of_single_precision_are_the_shortest_that_hit_it():
     assert np.array_equal(np.array(texts, dtype=np.float32), values)
     assert max(map(len, texts)) <= 15
     assert single(0.1) == "0.1"
-
-
-def test_those_of_a_log_are_read_from_the_log(tmp_path):
-    t, still = np.arange(20.0) + 5, np.zeros((20, 3))
-    values = {"TC_G_ENABLE": 1, "TC_G0_X1_0": -2.5e-5}
-    log = ulog_writer.write_ulog(tmp_path / "a.ulg", [ulog_writer.sensor("sensor_gyro", 0, t, still, 20.0, 7)], values)
-    packed = tmp_path / "a.ulg.gz"
-    packed.write_bytes(gzip.compress(log.read_bytes()))
-    for path in (log, packed):
-        assert read_parameters(path) == {"TC_G_ENABLE": 1.0, "TC_G0_X1_0": np.float32(-2.5e-5)}
-    path = tmp_path / "b.bin"
-    dataflash_writer.write_log(path, t, [(still, still, t)], {"INS_TCAL1_ENABLE": 0}, [(9.0, "INS_TCAL1_ENABLE", 1)])
-    assert read_parameters(path) == {"INS_TCAL1_ENABLE": 1.0}
