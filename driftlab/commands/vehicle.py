@@ -287,7 +287,7 @@ def _page(result: VehicleResult, recordings: Sequence[str], folder: Path) -> str
     sections = []
     for one in result.sensors:
         known = (None, None) if one.result is None else (one.result.verdict, one.result.unit)
-        sections.append(report.Section(one.title, one.sentences, *known, lost.get(one.name)))
+        sections.append(report.SensorReport(one.title, one.sentences, *known, lost.get(one.name)))
     if not mapped:
         return report.page_of(result.product, recordings, sections, None, result.loss, result.problem)
     sheet = sheet_of(mapped[0][1].config, recordings)

@@ -21,7 +21,7 @@ from fusion_core.contracts import Loss, SensorLoss
 STAIRS = "its renewal in stairs"  # of the causes of a loss
 
 
-class Section(NamedTuple):
+class SensorReport(NamedTuple):
     """A sensor on the page: its verdict and what the firmware loses, None where there is none."""
 
     title: str
@@ -31,14 +31,14 @@ class Section(NamedTuple):
     loss: SensorLoss | None
 
 
-def table(sections: Sequence[Section]) -> TextTable:
+def table(sections: Sequence[SensorReport]) -> TextTable:
     """Return the table of all sensors, each by its worst axis."""
     heads = ("sensor", "unit", "range\n[°C]", "good to\n(1 sigma)", "lost over\nthe range", "lost in\na warm-up",
              "of that\nthe stairs")  # fmt: skip
     return TextTable(heads, [_row(section) for section in sections], framed=False)
 
 
-def _row(section: Section) -> list[str]:
+def _row(section: SensorReport) -> list[str]:
     verdict, unit, loss = section.verdict, section.unit, section.loss
     if verdict is None or unit is None:
         return [section.title, "", "no map", *["-"] * 4]
@@ -51,7 +51,7 @@ def _row(section: Section) -> list[str]:
     return [*cells, *("-" if part is None else text(float(np.max(part.rms)) * unit.factor) for part in parts)]
 
 
-def charts(sections: Sequence[Section]) -> list[tuple[Section, Chart | None]]:
+def charts(sections: Sequence[SensorReport]) -> list[tuple[SensorReport, Chart | None]]:
     """Return each sensor with the chart of its map."""
     drawn = (None if one.verdict is None or one.unit is None else chart(one.verdict, one.unit) for one in sections)
     return [(one, found and replace(found, title=one.title)) for one, found in zip(sections, drawn, strict=True)]
@@ -60,7 +60,7 @@ def charts(sections: Sequence[Section]) -> list[tuple[Section, Chart | None]]:
 def page_of(
     product: str,
     recordings: Sequence[str],
-    sections: Sequence[Section],
+    sections: Sequence[SensorReport],
     sheet: Sheet | None,
     loss: Loss | None,
     problem: str,

@@ -40,7 +40,7 @@ class BarometerExponent(autopilot.Firmware):
     T_max: np.float32
 
     def bias(self, temperature: ArrayLike) -> Single:
-        """Return what is taken off (N, 1) at temperatures (N,) in degC, Pa."""
+        """Return the bias (N, 1) at temperatures (N,) in degC, Pa."""
         above = np.maximum(np.asarray(temperature, dtype=np.float32) - T_ZERO, np.float32(0))
         return -np.power(above, self.exponent)[:, None]
 
