@@ -286,8 +286,8 @@ def _page(result: VehicleResult, recordings: Sequence[str], folder: Path) -> str
     lost = {} if result.loss is None else {loss.sensor.channel: loss for loss in result.loss.sensors}
     sections = []
     for one in result.sensors:
-        known = (None, None) if one.result is None else (one.result.verdict, one.result.unit)
-        sections.append(report.SensorReport(one.title, one.sentences, *known, lost.get(one.name)))
+        verdict, unit = (None, None) if one.result is None else (one.result.verdict, one.result.unit)
+        sections.append(report.SensorReport(one.title, one.sentences, verdict, unit, lost.get(one.name)))
     if not mapped:
         return report.page_of(result.product, recordings, sections, None, result.loss, result.problem)
     sheet = sheet_of(mapped[0][1].config, recordings)

@@ -42,7 +42,7 @@ class BarometerExponent(autopilot.Firmware):
     def bias(self, temperature: ArrayLike) -> Single:
         """Return the bias (N, 1) at temperatures (N,) in degC, Pa."""
         above = np.maximum(np.asarray(temperature, dtype=np.float32) - T_ZERO, np.float32(0))
-        return -np.power(above, self.exponent)[:, None]
+        return np.asarray(-np.power(above, self.exponent)[:, None], dtype=np.float32)
 
 
 def corrections(sensor: Calibrated) -> Corrections:
