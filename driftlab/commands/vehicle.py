@@ -167,11 +167,12 @@ def vehicle(
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> VehicleResult:
-    """Calibrate all gyros, accelerometers, barometers and magnetometers of a vehicle.
+    """Calibrate all sensors of a vehicle.
 
-    Finds them in its logs, fits a thermal map of each, and writes a page and one file of parameters with all, as
-    `export` does; what the firmware loses of each is said. LOG is of PX4 (.ulg) or ArduPilot (.bin, or .log as text),
-    of a vehicle at rest; packed with gzip too. Several logs of one vehicle count together.
+    Finds gyros, accelerometers, barometers and magnetometers in its logs, fits a thermal map of each, and writes a page
+    and one file of parameters with all, as `export` does; what the firmware loses of each is said. LOG is of PX4 (.ulg)
+    or ArduPilot (.bin, or .log as text), of a vehicle at rest; packed with gzip too. Several logs of one vehicle count
+    together.
 
     Parameters
     ----------
