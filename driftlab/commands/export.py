@@ -50,7 +50,7 @@ from fusion_core.thermal.record_texts import parse_json
 from fusion_core.units import along_axes
 
 CONFIGS = (".yaml", ".yml")
-SHOWN = {"rad/s": "deg/h", "m/s^2": "mg"}  # units in which people read those of a map's file
+SHOWN = {"rad/s": "deg/h", "m/s^2": "mg", "T": "uT"}  # units in which people read those of a map's file
 GRAVITY = 9.80665  # m/s^2, in a g
 LOSS = "loss.json"
 SCHEMA = 2  # of its layout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -16,8 +17,9 @@ from driftlab.commands.console import say_lines
 from driftlab.commands.export import SHOWN, exporter_of, installed
 from driftlab.commands.inputs import Place
 from driftlab.maps.fit import axes_of, term_lines
+from driftlab.starter import reading
 from driftlab.storage.map_file import check_place, save
-from fusion_core.contracts import Calibrated, FittedMap, ReadBack, ThermalMap
+from fusion_core.contracts import Calibrated, Exporter, FittedMap, ReadBack, ThermalMap
 from fusion_core.errors import ConfigError, quote
 from fusion_core.escaping import json_of
 
@@ -81,13 +83,14 @@ def import_map(
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
     exporter = exporter_of(kind, {name: str(value) for name, value in (settings or {}).items()})
     path, place = Path(file), Path(out)
-    calibration = _of_channel(exporter.read(path), channel, path)
+    calibration = _of_channel(_read(exporter, path), channel, path)
     model = installed(ThermalMap, map_kind, "--kind")
     order = {"order": calibration.order} if map_kind == ORDERED else {}
     check_place(place, [path], "import")
     T = np.linspace(*calibration.domain, PLACES)
     bias = calibration.bias(T)
     provenance = {
+        **calibration.about,
         "imported_from": path.name,
         "format": exporter.kind,
         "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -107,6 +110,22 @@ def import_map(
     save(fitted, place, "import")
     apart = np.max(np.abs(fitted.bias(T) - bias), axis=0)
     return Imported(calibration, fitted, tuple(apart.tolist()))
+
+
+def _read(exporter: Exporter, path: Path) -> list[ReadBack]:
+    """Return the calibrations of a file of parameters, or of a log that has its vehicle's."""
+    kinds = reading.file_sources(path, reading.beginning(path, reading.HEAD)) if path.is_file() else []
+    parameters = next((values for cls in kinds if (values := cls.parameters(path))), None)
+    if parameters is None:
+        return exporter.read(path)
+    lines = [f"{name} {value!r}" for name, value in parameters.items() if name.isidentifier() and np.isfinite(value)]
+    with tempfile.TemporaryDirectory(prefix="driftlab-") as temporary:
+        place = Path(temporary) / f"{path.name}.parameters"
+        place.write_text("\n".join(lines), encoding="utf-8")
+        try:
+            return exporter.read(place)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(str(place), str(path))) from None
 
 
 def _of_channel(calibration: Sequence[ReadBack], channel: str | None, path: Path) -> ReadBack:

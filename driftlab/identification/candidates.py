@@ -184,7 +184,7 @@ def with_residual(search: Search) -> list[Chunk]:
     residuals = []
     for record, predicted in zip(evidence.records, evidence.split(evidence.rate - left), strict=True):
         of_model = np.stack([np.interp(record.chunk.t, record.t, column) for column in predicted.T], axis=1)
-        residuals.append(record.chunk[evidence.channel] - of_model)
+        residuals.append(evidence.excess(record.chunk) - of_model)
     return with_residuals(evidence.chunks, residuals)
 
 

@@ -46,7 +46,9 @@ class Record:
     name: str  # of the recording
     calibration: bool  # whether it has this role
     train: bool  # whether it has this one; it may have both
-    chunk: Chunk  # N means in SI; the sensor's channel (N, d) less the reference, `temperature` without steps
+    # N means in SI; `temperature` without steps, `excess` (N, d): the sensor's reading less its known input, or its
+    # channel where there is none
+    chunk: Chunk
     starts: NDArray[np.int64]  # (n,) the first mean of each row
     # (columns, 2) smallest and largest value of each channel, update by update
     ranges: Mapping[str, Array] = field(default_factory=dict)
@@ -86,7 +88,11 @@ class Evidence:
     @cached_property
     def rate(self) -> Array:
         """Reading less reference (n, d), SI."""
-        return self.rows([record.chunk[self.channel] for record in self.records])
+        return self.rows([self.excess(record.chunk) for record in self.records])
+
+    def excess(self, chunk: Chunk) -> Array:
+        """Return the sensor's reading less its known input (N, d)."""
+        return chunk["excess" if "excess" in chunk.channels else self.channel]
 
     @property
     def chunks(self) -> list[Chunk]:
@@ -196,7 +202,7 @@ def _at_rest(segments: Iterable[RunSegment], channel: str, ends: dict[str, Array
             own = _ends(values)
             ends[name] = _ends(np.hstack([ends.get(name, own), own]).T)
         channels = {k: v for k, v in channels.items() if k not in ("dt", "tau", "temperature_raw")}
-        channels[channel] = segment.rate
+        channels["excess"] = segment.rate
         still = Chunk(rows.t, channels, previous, rows.sensors).where(segment.still)
         if len(still):
             yield still

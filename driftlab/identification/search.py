@@ -224,10 +224,16 @@ def inputs(effect: Effect) -> tuple[str, ...]:
 
 
 def _ends(state: Search, name: str) -> Iterator[Rows]:
-    """Yield the rows (n,) in the highest and in the lowest part of each column of a channel, where there are enough."""
+    """Yield the rows (n,) in the highest and in the lowest part of each column of a channel, where there are enough.
+
+    Not of one that stands still in each recording, as an axis in a placement: its parts are whole recordings, which are
+    left out one by one before.
+    """
     values = state.evidence.rows([chunk[name].reshape(len(chunk), -1) for chunk in state.evidence.chunks])
     for u in values.T:
         low, high = float(u.min()), float(u.max())
+        if max(float(np.ptp(part)) for part in state.evidence.split(u)) < END * (high - low):
+            continue
         for rows in (u > high - END * (high - low), u < low + END * (high - low)):
             if MIN_ROWS <= np.sum(rows) <= len(u) - MIN_ROWS:
                 yield rows

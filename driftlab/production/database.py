@@ -153,7 +153,7 @@ def _replace(connection: Connection, name: str, fleet: str, columns: Columns, ro
     quoted = connection.dialect.identifier_preparer.format_table(table)
     for own in (own for own in fields if own.name.casefold() not in there):
         kind = CreateColumn(own).compile(dialect=connection.dialect)
-        connection.execute(sql.DDL(f"ALTER TABLE {quoted} ADD COLUMN {str(kind).replace('%', '%%')}"))
+        connection.execute(sql.text(f"ALTER TABLE {quoted} ADD COLUMN {kind!s}".replace(":", "\\:")))
     connection.execute(table.delete().where(table.c.fleet == fleet))
     left = iter(rows)
     while some := list(islice(left, AT_ONCE)):

@@ -50,6 +50,8 @@ class ReadBack:
         What one should know of it.
     matrix : TriadMatrix, optional
         Scale factor and misalignment of a triad, where the target holds some.
+    about : mapping of str to str
+        Facts on the device, as a source's `about`.
     """
 
     channel: str
@@ -60,6 +62,7 @@ class ReadBack:
     order: int = 3
     notes: tuple[str, ...] = ()
     matrix: TriadMatrix | None = None
+    about: Mapping[str, str] = field(default_factory=dict)
 
 
 class Exporter(Plugin):

@@ -132,6 +132,11 @@ class FileSource(Source):
         """
 
     @classmethod
+    def parameters(cls, path: Path) -> Mapping[str, float]:
+        """Return the parameters of the device that logged a file, by their names; none by default."""
+        return {}
+
+    @classmethod
     def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
         """Begin a recording as a device of this kind writes it, for rehearsals: of a source that has `written`.
 

@@ -136,7 +136,7 @@ USUAL: Mapping[str, Usual] = {
 }
 """The names that mean the same in every recording; any other name is a channel of the unit that it is given."""
 
-DERIVED = frozenset({"dt", "tau", "residual", *CONDITIONED, *READINGS})
+DERIVED = frozenset({"dt", "tau", "residual", "excess", *CONDITIONED, *READINGS})
 """Channels that the program makes from others: a recording has none of these names."""
 
 Name = Annotated[str, Field(min_length=1)]

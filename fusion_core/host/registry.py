@@ -320,7 +320,7 @@ class Installed:
             return handler(core_schema.any_schema())
         union = reduce(or_, classes.values())
         tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
-        return handler(TypeAdapter(tagged).core_schema)
+        return handler(TypeAdapter[Any](tagged).core_schema)
 
 
 def _choice(contract: type[Plugin], kind: str) -> core_schema.CoreSchema:

@@ -1,4 +1,4 @@
-"""ArduPilot's thermal parameters of an IMU, as the `.parm` file that MAVProxy and Mission Planner load.
+"""ArduPilot's thermal parameters of IMUs and a barometer, as the `.parm` file that MAVProxy and Mission Planner load.
 
 A cubic about 35 degC without a constant, in 1e-6 rad/s (m/s^2) per power of a kelvin. The constant is the IMU's offset,
 `INS_GYROFFS_*`, valid at the temperature `INS_GYR1_CALTEMP`: both are written for the gyro. The accelerometers' offset
@@ -14,7 +14,8 @@ to TMIN). So the parameters hold no constant: it is in the offset, together with
 
 Products and sums are rounded one by one, as C without contraction does; a compiler that fuses them differs in the last
 bit. Source: ArduPilot, AP_InertialSensor_tempcal.cpp, AP_InertialSensor_Backend.cpp. (The simulator takes the middle of
-the range in place of 35 degC, and does not clip: it proves nothing here.) N samples, d axes.
+the range in place of 35 degC, and does not clip: it proves nothing here.) Of a barometer: `ardupilot_barometer`; of
+compasses it has none. N samples, d axes.
 """
 
 from __future__ import annotations
@@ -32,15 +33,17 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Exporter, ReadBack
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
+from fusion_core.units import same_dimension
 from fusion_plugins.ardupilot_names import ParameterNames, of_axes, thermal_group
-from fusion_plugins.exporters import autopilot
+from fusion_plugins.exporters import ardupilot_barometer, autopilot
 from fusion_plugins.exporters.autopilot import Autopilot, Corrections, FirmwareSensor, Parameter, Single
 
 SWING = 10.0  # K that the firmware asks of a calibration
 ROUNDED = 0.1  # K by which limits differ by rounding, and less
 LEARNING = 2  # of INS_TCALn_ENABLE
 SENSORS = (FirmwareSensor("GYR", "gyro", "rad/s"), FirmwareSensor("ACC", "accel", "m/s^2", scaled=True))
-CORRECTED = "ArduPilot corrects gyros (rad/s) and accelerometers (m/s^2)"
+KINDS = (*SENSORS, ardupilot_barometer.KIND)
+CORRECTED = "ArduPilot corrects gyros (rad/s), accelerometers (m/s^2) and its first barometer (Pa)"
 T_REF = np.float32(35.0)  # degC
 SCALE = np.float32(1e-6)  # of a stored coefficient
 UNCALIBRATED = np.float32(-300.0)  # degC: T_cal before the first calibration
@@ -91,6 +94,7 @@ class Ardupilot(Autopilot):
     def shared(self, sensors: tuple[Calibrated, ...]) -> tuple[list[Parameter], list[str]]:
         """Return the switch and the limits of temperature of each IMU, which its sensors share."""
         parameters, notes = list[Parameter](), list[str]()
+        sensors = tuple(one for one in sensors if not same_dimension(one.unit, ardupilot_barometer.KIND.unit))
         for imu in dict.fromkeys(map(self._imu, sensors)):
             low, high = _limits(self._of(imu, sensors))
             begin = thermal_group(imu)
@@ -101,9 +105,11 @@ class Ardupilot(Autopilot):
 
     def corrections(self, sensor: Calibrated, sensors: tuple[Calibrated, ...]) -> Corrections:
         """Return the coefficients of a sensor, and its offset with its temperature where they are to be written."""
+        kind = autopilot.kind_of(KINDS, sensor, self.kind, CORRECTED)
+        if kind is ardupilot_barometer.KIND:
+            return ardupilot_barometer.corrections(sensor)
         imu = self._imu(sensor)
         low, high = _limits(self._of(imu, sensors))
-        kind = autopilot.kind_of(SENSORS, sensor, self.kind, CORRECTED)
         names = ParameterNames(kind.short, imu)
         T_cal = np.clip(T_REF, low, high)  # where it can be 35 degC, nothing is added back
         reference, scale = float(T_REF), float(SCALE)
@@ -129,7 +135,7 @@ class Ardupilot(Autopilot):
         return f"{parameter.name} {autopilot.single(parameter.value)}"
 
     def read(self, path: Path) -> list[ReadBack]:
-        """Return the sensors of `imu` that a file's parameters correct.
+        """Return the sensors of `imu`, and the barometer, that a file's parameters correct.
 
         Raises
         ------
@@ -142,6 +148,7 @@ class Ardupilot(Autopilot):
         begin = thermal_group(imu)
         enabled = autopilot.integer(values, f"{begin}_ENABLE")
         read = [_calibration(values, kind, imu) for kind in SENSORS] if enabled == 1 else []
+        read.append(ardupilot_barometer.calibration(values))
         calibrations = [calibration for calibration in read if calibration is not None]
         if calibrations:
             return calibrations
@@ -166,7 +173,8 @@ class Ardupilot(Autopilot):
 
     def _of(self, imu: int, sensors: tuple[Calibrated, ...]) -> tuple[Calibrated, ...]:
         """Return the sensors of an IMU."""
-        return tuple(sensor for sensor in sensors if self._imu(sensor) == imu)
+        ours = (sensor for sensor in sensors if not same_dimension(sensor.unit, ardupilot_barometer.KIND.unit))
+        return tuple(sensor for sensor in ours if self._imu(sensor) == imu)
 
     def _notes(self, sensor: Calibrated, names: ParameterNames, low: np.float32, high: np.float32) -> list[str]:
         first, last = sensor.fitted.domain
@@ -229,7 +237,7 @@ def _calibration(values: Mapping[str, float], kind: FirmwareSensor, imu: int) ->
     if T_cal <= UNCALIBRATED:
         notes.append(f"{kind.channel}: {names.caltemp} is not set, the firmware takes TMIN in its place")
     scale = np.array([values.get(name, 1.0) for name in of_axes(names.scale)]) if kind.scaled else None
-    return autopilot.read_back(kind, held, f"IMU {imu}", notes, scale=scale)
+    return autopilot.read_back(kind, held, f"IMU {imu}", notes, {"imu": str(imu)}, scale=scale)
 
 
 @hookimpl

@@ -46,9 +46,10 @@ OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 ti
 
 @dataclass(frozen=True)
 class FirmwareSensor:
-    """A kind of sensor that a firmware corrects for temperature; `short` stands in the parameters' names.
+    """A kind of sensor that a firmware corrects for temperature.
 
-    `scaled`: readings less their bias are multiplied by a constant scale, axis by axis.
+    `short` stands in the parameters' names; the firmware's unit is `size` of the SI unit. `scaled`: readings less their
+    bias are multiplied by a constant scale, axis by axis.
     """
 
     short: str
@@ -57,6 +58,7 @@ class FirmwareSensor:
     order: int = 3
     axes: tuple[str, ...] = TRIAD
     scaled: bool = False
+    size: float = 1.0
 
 
 class Firmware:
@@ -68,10 +70,6 @@ class Firmware:
     def bias(self, temperature: ArrayLike) -> Single:
         """Return the correction (N, d) at temperatures (N,) in degC."""
         raise NotImplementedError
-
-    def in_use(self, t: Array, temperature: Array) -> ArrayLike:
-        """Return the temperatures (N,) whose correction is in use at times t (N,) in s: by default each its own."""
-        return temperature
 
 
 Held = TypeVar("Held", bound=Firmware)
@@ -174,6 +172,7 @@ class Autopilot(contracts.Exporter):
         T_ref: float,
         hold: Callable[[Array], Held],
         limits: tuple[np.float32, np.float32] | None = None,
+        in_use: Callable[[Chunk], Array] | None = None,
     ) -> tuple[Held, SensorLoss, tuple[str, ...]]:
         """Fit the polynomial; return the firmware's parameters, the loss, and texts about everything that is left out.
 
@@ -183,23 +182,25 @@ class Autopilot(contracts.Exporter):
             Its order and axes.
         T_ref : float
             Reference of the powers, degC.
-        hold : function of coefficients (n, d) of all axes of the firmware
+        hold : function of coefficients (n, d) of all axes of the firmware, in its unit
             Makes the parameters.
         limits : pair of float32, optional
             The firmware's limits of temperature, degC, where they are within the map's domain.
+        in_use : function of a recording -> (N,), optional
+            The temperatures whose correction is in use; each its own by default.
         """
         at = [0] if len(kind.axes) == 1 else places(self.kind, sensor)
         flown = self.flown(sensor.fitted.domain)
         c = polynomial(sensor.fitted, kind.order, T_ref, flown)
         of_all = np.zeros((len(c), len(kind.axes)))
-        of_all[:, at] = c
+        of_all[:, at] = c / kind.size
         held = hold(of_all)
 
         def target(T: ArrayLike) -> Array:
-            return held.bias(T)[:, at].astype(np.float64)
+            return held.bias(T)[:, at].astype(np.float64) * kind.size
 
         def renewed(recording: Chunk) -> Array:
-            return target(held.in_use(recording.t, recording["temperature"]))
+            return target(recording["temperature"] if in_use is None else in_use(recording))
 
         modelled, left_out = contracts.beyond_a_map(sensor)
         recording = contracts.warm_up(sensor.fitted.domain)
@@ -260,6 +261,7 @@ def read_back(
     held: Firmware,
     whose: str,
     notes: Sequence[str],
+    about: Mapping[str, str],
     besides: Array | None = None,
     scale: Array | None = None,
 ) -> ReadBack:
@@ -271,7 +273,7 @@ def read_back(
 
     def bias(T: Array) -> Array:
         taken_off = held.bias(T).astype(np.float64)
-        return taken_off if besides is None else taken_off + besides
+        return (taken_off if besides is None else taken_off + besides) * kind.size
 
     domain = float(low), float(high)
     scaled = scale is not None and np.any(scale) and np.any(scale != 1)  # all are zero where none was determined
@@ -283,7 +285,7 @@ def read_back(
     first = f"{kind.channel}: {whose}, clamped below {low:g} and above {high:g} °C"
     axes = kind.axes if len(kind.axes) > 1 else ("x",)
     matrix = None if scale is None or not scaled else _matrix(scale, domain)
-    return ReadBack(kind.channel, kind.unit, axes, domain, bias, kind.order, (first, *notes), matrix)
+    return ReadBack(kind.channel, kind.unit, axes, domain, bias, kind.order, (first, *notes), matrix, about)
 
 
 def places(kind: str, sensor: Calibrated) -> list[int]:
@@ -333,10 +335,6 @@ def powers(T: Array, T_ref: float, c: Array) -> Array:
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
-LOGS = {  # how a log begins, what it is, and what writes its parameters
-    b"ULog": ("a PX4 log", "`ulog_params -i LOG FILE` of pyulog"),
-    b"\xa3\x95": ("a DataFlash log", "`mavparms.py LOG > FILE` of pymavlink"),
-}
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -345,7 +343,7 @@ def read_parameters(path: Path) -> dict[str, float]:
     Raises
     ------
     UnreadableFile
-        If it is not there, is a log, holds a line that is no parameter, or says two things of one.
+        If it is not there, holds a line that is no parameter, or says two things of one.
     """
     parameters: dict[str, float] = {}
     for number, line in enumerate(_text(path).splitlines(), 1):
@@ -390,12 +388,6 @@ def _text(path: Path) -> str:
             data = file.read(LARGEST + 1)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name a parameter file") from None
-    for begins, (what, tool) in LOGS.items():
-        if data.startswith(begins):
-            raise UnreadableFile(
-                f"{path}: is {what}, expected a parameter file; save the vehicle's parameters with the ground station, "
-                f"or take those of the log: {tool}"
-            )
     try:
         if len(data) > LARGEST:
             raise ValueError

@@ -1,18 +1,18 @@
 """PX4's thermal parameters, as the `.params` file that QGroundControl loads.
 
-`TC_G<n>_*` of a gyro (rad/s), `TC_A<n>_*` of an accelerometer (m/s^2), both cubics on three axes, and `TC_B<n>_*` of a
-barometer (Pa), of fifth order. A sensor is corrected only where `TC_?<n>_ID` is its device id: nothing says so in
-flight where it is not. X0 is subtracted *besides* the offset in `CAL_GYRO<n>_?OFF`, which is therefore set to zero.
-Readings of an accelerometer less all this are multiplied by `CAL_ACC<n>_?SCALE`, those of a gyro are not. The firmware
-computes in single precision, in this order of operations::
+`TC_G<n>_*` of a gyro (rad/s), `TC_A<n>_*` of an accelerometer (m/s^2), `TC_M<n>_*` of a magnetometer (gauss), all
+cubics on three axes, and `TC_B<n>_*` of a barometer (Pa), of fifth order. A sensor is corrected only where `TC_?<n>_ID`
+is its device id: nothing says so in flight where it is not. X0 is subtracted *besides* the offset in
+`CAL_GYRO<n>_?OFF`, which is therefore set to zero. Readings of an accelerometer less all this are multiplied by
+`CAL_ACC<n>_?SCALE`, those of a gyro are not. The firmware computes in single precision, in this order of operations::
 
     d = clip(T, TMIN, TMAX) - TREF
-    gyro, accelerometer:  X0 + X1 d + X2 d2 + X3 d3,    d2 = d d,  d3 = d2 d
-    barometer:            the same to X5, the power multiplied up as it goes
+    three axes:  X0 + X1 d + X2 d2 + X3 d3,    d2 = d d,  d3 = d2 d
+    barometer:   the same to X5, the power multiplied up as it goes
 
 The correction of the sensor is not this, but the one that was last *published*: a module looks once a second, and
-publishes when the temperature has moved by more than 1 K since it last did. So the correction runs in stairs. (When it
-publishes another sensor's, this one's goes with it: with `TC_A_ENABLE` the stairs may be finer than here.)
+publishes the corrections of all sensors when the temperature of one has moved by more than 1 K since that one last made
+it publish. So the correction runs in stairs, which are finer the more sensors of different temperatures there are.
 
 Products and sums are rounded one by one, as C without contraction does; a compiler that fuses them differs in the last
 bit. Sources: PX4-Autopilot, src/modules/temperature_compensation: TemperatureCompensation.cpp,
@@ -22,7 +22,7 @@ ParameterManager (the vehicle's system id must be that of each line). N samples,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Exporter, ReadBack
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Calibrated, Exporter, ReadBack, warm_up
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.exporters import autopilot
@@ -45,6 +45,8 @@ Number = Annotated[int, Field(ge=0, le=3)]  # in the parameters' names
 INSTANCES = range(4)
 PERIOD = 1.0  # s from one look to the next
 STEP = np.float32(1.0)  # K that the temperature must have moved, and more
+GAUSS = 1e-4  # T
+ATMOSPHERE = 1e4  # Pa: a constant that is larger is no offset of a barometer
 NEVER = np.float32(-100.0)  # degC: the temperature of what was published last, where nothing was
 
 
@@ -64,6 +66,7 @@ class Px4Sensor(FirmwareSensor):
 SENSORS = (
     Px4Sensor("G", "gyro", "rad/s", topic="sensor_gyro", calibration="GYRO"),
     Px4Sensor("A", "accel", "m/s^2", scaled=True, topic="sensor_accel", setting="accel_device_id", calibration="ACC"),
+    Px4Sensor("M", "mag", "T", size=GAUSS, topic="sensor_mag", setting="mag_device_id", calibration="MAG"),
     Px4Sensor("B", "baro", "Pa", 5, ("",), topic="sensor_baro", setting="baro_device_id", calibration="BARO"),
 )
 CORRECTED = "PX4 corrects sensors in " + ", ".join(f"{kind.unit} ({kind.channel})" for kind in SENSORS)
@@ -89,10 +92,6 @@ class Px4Parameters(autopilot.Firmware):
             offset = offset + X * power
         return np.asarray(offset, dtype=np.float32)
 
-    def in_use(self, t: Array, temperature: Array) -> ArrayLike:
-        """Return the temperatures (N,) that were last published at times t (N,)."""
-        return published(t, temperature)
-
 
 class Px4(Autopilot):
     """Thermal parameters of PX4, for QGroundControl."""
@@ -106,6 +105,8 @@ class Px4(Autopilot):
     """`device_id` of the gyro, as in `sensor_gyro` of a log. Without it, that of the log of which the map was made."""
     accel_device_id: DeviceId | None = None
     """The same of the accelerometer."""
+    mag_device_id: DeviceId | None = None
+    """The same of the magnetometer."""
     baro_device_id: DeviceId | None = None
     """The same of the barometer."""
     instance: Number | None = None
@@ -132,7 +133,16 @@ class Px4(Autopilot):
         def hold(c: Array) -> Px4Parameters:
             return Px4Parameters(c.astype(np.float32), T_ref, low, high)
 
-        held, loss, left_out = self.fit(sensor, kind, float(T_ref), hold)
+        def in_use(recording: Chunk) -> Array:
+            others = [warm_up(one.fitted.domain)["temperature"] for one in sensors]
+            return published(recording.t, recording["temperature"], others).astype(np.float64)
+
+        held, loss, left_out = self.fit(sensor, kind, float(T_ref), hold, in_use=in_use)
+        if kind.short == "B" and abs(held.X[0, 0]) > ATMOSPHERE:
+            raise ConfigError(
+                f"export px4: the map of the {sensor.channel} is {held.X[0, 0]:.6g} Pa at {T_ref:.4g} °C, the pressure "
+                "of the air and no offset; fit it with `reference`, that of another barometer or a constant"
+            )
         instance = _log_number(sensor, "instance", 0) if self.instance is None else self.instance
         given = self.accel_calibration if kind.short == "A" else self.calibration
         slot = _log_number(sensor, "calibration", instance) if given is None else given
@@ -208,6 +218,7 @@ def _notes(sensor: Calibrated, kind: Px4Sensor, device: int, slot: int) -> list[
         if sensor.matrix is not None
         else "calibrate the accelerometers anew after the reboot, as X0 has the offset, and CAL_ACC would take it off "
         "again",
+        "M": "calibrate the compass anew after the reboot; firmware that has no TC_M_ENABLE ignores these",
         "B": "the CAL_BAROn_OFF of this device is taken off besides; set it to 0",
     }
     used = f"used for the device id {device} alone; reboot after loading"
@@ -245,14 +256,21 @@ def _calibration(values: Mapping[str, float], kind: Px4Sensor, instance: int, wa
         raise _UnusedSensor(f"{begin}{instance}_TMIN {low:g}, _TMAX {high:g}, _TREF {T_ref:g} are no range")
     offset, scale, note = _calibrated(values, kind, ids[instance])
     notes = [*autopilot.missing(values, names), *note]
-    whose = f"device id {ids[instance]}"
-    return autopilot.read_back(kind, Px4Parameters(X, T_ref, low, high), whose, notes, offset, scale)
+    whose, slot = f"device id {ids[instance]}", _slot(values, kind, ids[instance])
+    about = {"device_id": str(ids[instance]), "instance": str(instance)}
+    about |= {} if slot is None else {"calibration": str(slot)}
+    return autopilot.read_back(kind, Px4Parameters(X, T_ref, low, high), whose, notes, about, offset, scale)
+
+
+def _slot(values: Mapping[str, float], kind: Px4Sensor, device: int) -> int | None:
+    """Return the n of the CAL_GYROn_ID that is the device's."""
+    slots = (n for n in INSTANCES if autopilot.integer(values, f"CAL_{kind.calibration}{n}_ID") == device)
+    return next(slots, None)
 
 
 def _calibrated(values: Mapping[str, float], kind: Px4Sensor, device: int) -> tuple[Array, Array | None, list[str]]:
     """Return the constant calibration of the same device: offset (d,), scale (d,) where it has one, and a note."""
-    slots = (n for n in INSTANCES if autopilot.integer(values, f"CAL_{kind.calibration}{n}_ID") == device)
-    begin = f"CAL_{kind.calibration}{next(slots, None)}"
+    begin = f"CAL_{kind.calibration}{_slot(values, kind, device)}"
     names = [f"{begin}_{axis.upper()}OFF" for axis in kind.axes]
     offset = np.array([values.get(name, 0.0) for name in names])
     text = f"{kind.channel}: {', '.join(names)} are not 0, and taken off besides; so they are here"
@@ -260,19 +278,22 @@ def _calibrated(values: Mapping[str, float], kind: Px4Sensor, device: int) -> tu
     return offset, np.array(list(scales)) if kind.scaled else None, [text] if np.any(offset) else []
 
 
-def published(t: ArrayLike, temperature: ArrayLike) -> Single:
+def published(t: ArrayLike, temperature: ArrayLike, others: Sequence[ArrayLike] = ()) -> Single:
     """Return the temperature (N,) whose offset is in use at times t (N,) in s, from a start at the first of them.
 
     Before anything is published nothing is subtracted; that is before the first look only, and left out here.
+    `others` are the temperatures (N,) of all sensors that are corrected, with which this one's is published.
     """
     times, T = np.asarray(t, dtype=np.float64), np.asarray(temperature, dtype=np.float32)
+    of_all = np.stack([T, *(np.asarray(other, dtype=np.float32) for other in others)])
     count = int((times[-1] - times[0]) / PERIOD + 1e-9) + 1
     looks = np.searchsorted(times, times[0] + PERIOD * np.arange(count) + 1e-9, side="right") - 1
-    used, last = np.empty_like(T), NEVER
+    used, own, last = np.empty_like(T), NEVER, np.full(len(of_all), NEVER)
     for look, after in pairwise([*looks.tolist(), len(T)]):
-        if abs(T[look] - last) > STEP:
-            last = T[look]
-        used[look:after] = last
+        moved = np.abs(of_all[:, look] - last) > STEP
+        last[moved] = of_all[moved, look]
+        own = T[look] if np.any(moved) else own
+        used[look:after] = own
     return used
 
 

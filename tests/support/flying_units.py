@@ -59,7 +59,7 @@ def in_c(folder, body, numbers, T):
         "  return 0;\n}\n"
     )
     flags = ["-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Werror"]
-    subprocess.run(["gcc", *flags, "-o", folder / "formula", source], check=True)
+    subprocess.run(["gcc", *flags, "-o", folder / "formula", source, "-lm"], check=True)
     data = np.concatenate([numbers, T]).astype(np.float32).tobytes()
     done = subprocess.run([folder / "formula"], input=data, capture_output=True, check=True)
     return np.frombuffer(done.stdout, dtype=np.float32)

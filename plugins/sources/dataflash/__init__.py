@@ -1,4 +1,4 @@
-"""Logs of ArduPilot vehicles (.bin): rows of an inertial unit, as its sensor measured them.
+"""Logs of ArduPilot vehicles (.bin, or .log as text): rows of an inertial unit, as its sensor measured them.
 
 ::
 
@@ -11,7 +11,7 @@ gyros and accelerometers are in the frame of the board, without the autopilot's 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -20,20 +20,20 @@ from pydantic import Field
 
 from fusion_core.contracts import FileSource, Source, Table, foreign, head
 from fusion_core.contracts.file_source import RecordingWriter
-from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.joining import mapped
-from fusion_plugins.sources.unpacked import unpacking
+from fusion_plugins.sources.unpacked import plain_file, unpacking
 
 SIGNATURE = b"\xa3\x95\x80"
+TEXT = b"FMT, "  # of a log as text
 NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
 
 
 class DataFlash(FileSource):
     """A DataFlash log of an ArduPilot vehicle, from the card or as a ground station downloads it."""
 
-    signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
+    signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE, TEXT)
     suffixes: ClassVar[tuple[str, ...]] = (".bin", ".BIN")
     written: ClassVar[tuple[str, ...]] = (".bin",)
     product: ClassVar[str | None] = "ardupilot_log"
@@ -52,20 +52,15 @@ class DataFlash(FileSource):
         from fusion_plugins.sources.dataflash.log import DataFlashMessages
         from fusion_plugins.sources.dataflash.table import Messages
 
-        first = head(path)
-        data = mapped(path)
-        if first.startswith(b"FMT, "):
-            raise UnreadableFile(
-                f"{path}: is an ArduPilot log as text, a binary one (.bin) was expected; take the .bin from the "
-                "vehicle's card, or write its IMU lines as CSV and use kind: csv"
-            )
-        if not first.startswith(SIGNATURE) and SIGNATURE not in data[:NEAR].tobytes():
-            raise foreign(path, first, self.kind)
         paths = [path for channel in self.channels.values() for path in channel.paths]
         wanted = {path.partition(".")[0].partition("[")[0] for path in paths}
-        log = DataFlashMessages(path, data, wanted | {"IMU"}, faults)
-        of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
-        yield Messages(log, self.imu, self.compensated, faults, of_rows)
+        with _binary(path, faults) as place:
+            first, data = head(place), mapped(place)
+            if not first.startswith(SIGNATURE) and SIGNATURE not in data[:NEAR].tobytes():
+                raise foreign(path, first, self.kind)
+            log = DataFlashMessages(path, data, wanted | {"IMU"}, faults)
+            of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
+            yield Messages(log, self.imu, self.compensated, faults, of_rows)
 
     @classmethod
     def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
@@ -73,6 +68,27 @@ class DataFlash(FileSource):
         from fusion_plugins.sources.dataflash.writer import DataFlashWriter
 
         return DataFlashWriter(path, note)
+
+    @classmethod
+    def parameters(cls, path: Path) -> Mapping[str, float]:
+        """Return the parameters that a log ends with."""
+        from fusion_plugins.sources.dataflash.log import DataFlashMessages
+
+        faults = Faults()
+        with plain_file(path) as plain, _binary(plain, faults) as place:
+            return DataFlashMessages(path, mapped(place), (), faults).parameters.last
+
+
+@contextmanager
+def _binary(path: Path, faults: Faults) -> Iterator[Path]:
+    """Yield the path of a binary log, of one as text that of a temporary file."""
+    if not head(path).startswith(TEXT):
+        yield path
+        return
+    from fusion_plugins.sources.dataflash.text import binary
+
+    with binary(path, faults) as place:
+        yield place
 
 
 @hookimpl

@@ -92,6 +92,11 @@ class Parameters:
         return sorted({at for name in names for at in self._rows.get(name, ([], []))[0][1:]})
 
     @property
+    def last(self) -> dict[str, float]:
+        """The values in force at the end."""
+        return {name: known[-1] for name, (_, known) in self._rows.items() if known}
+
+    @property
     def steps(self) -> int:
         """Number of changes of the inertial units' parameters."""
         return sum(len(places) - 1 for name, (places, _) in self._rows.items() if name.startswith(UNITS) and places)

@@ -13,7 +13,7 @@ columns.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
@@ -25,7 +25,7 @@ from fusion_core.contracts.file_source import problem
 from fusion_core.errors import ConfigError, MissingChannel, quote
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.unpacked import unpacking
+from fusion_plugins.sources.unpacked import plain_file, unpacking
 
 if TYPE_CHECKING:
     from fusion_core.contracts.file_source import RecordingWriter
@@ -104,6 +104,14 @@ class Ulog(FileSource):
         from fusion_plugins.sources.ulog.writer import ULogWriter
 
         return ULogWriter(path, note)
+
+    @classmethod
+    def parameters(cls, path: Path) -> Mapping[str, float]:
+        """Return the parameters with which a log begins."""
+        from fusion_plugins.sources.ulog.file import LogFile
+
+        with plain_file(path) as place:
+            return LogFile(place, "ulog").parameters
 
     def _gyro(self, log: LogFile) -> Instance | None:
         """Return the gyro that the settings name."""

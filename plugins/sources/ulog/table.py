@@ -42,6 +42,7 @@ UNITS = {  # of a field, by itself and by its topic: a ULog names none
 }
 LEAST_PA = 2000.0  # no mbar is more, no Pa under 25 km less
 CALIBRATED = {"sensor_gyro": "GYRO", "sensor_accel": "ACC"}  # and what its parameters are called
+SLOTS = {**CALIBRATED, "sensor_baro": "BARO", "sensor_mag": "MAG"}
 ASTRAY = 1e6  # us: a time stamp that stands out from the four about it by more is damaged; disorder of less is sorted
 
 
@@ -81,7 +82,7 @@ class ULogTopics(Table):
         instance = self.instance(path)
         if instance is None or not instance.device:
             return {}
-        begin = f"CAL_{CALIBRATED.get(instance.topic, '')}"
+        begin = f"CAL_{SLOTS.get(instance.topic, '')}"
         slots = [n for n in range(4) if self.log.parameters.get(f"{begin}{n}_ID") == instance.device]
         device = {"device_id": str(instance.device), "instance": str(instance.number)}
         return device | ({"calibration": str(slots[0])} if slots else {})

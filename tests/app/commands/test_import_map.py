@@ -1,5 +1,6 @@
 """From the log of a vehicle to its parameters and back: what is in the vehicle is what `compare` compares."""
 
+import gzip
 import json
 
 import dataflash_writer
@@ -127,3 +128,30 @@ def test_from_a_log_to_parameters_and_back_to_a_comparison(logs, tmp_path):
     found = json.loads(called("compare", bare, vehicle, "--input", run, "--json"))["configs"]
     before, after = (np.linalg.norm(found[name]["coast_rmse_rad_s"]["to the end"]) for name in ("bare", "vehicle"))
     assert after < 0.3 * before
+
+
+def test_a_log_has_the_parameters_of_its_vehicle(tmp_path):
+    t, still, path = np.arange(20.0) + 5, np.zeros((20, 3)), tmp_path / "a.params"
+    Px4(kind="px4", device_id=DEVICE, instance=1).export(unit(cubic()), path)
+    written = (line.split("\t")[2:] for line in path.read_text().splitlines() if line[0] != "#")
+    values = {name: int(value) if kind == "6" else float(value) for name, value, kind in written}
+    rows = [ulog_writer.sensor("sensor_gyro", 0, t, still, 20.0, 7)]
+    log = ulog_writer.write_ulog(tmp_path / "flight.ulg", rows, values)
+    packed = tmp_path / "flight.ulg.gz"
+    packed.write_bytes(gzip.compress(log.read_bytes()))
+    T = np.linspace(-10, 50, 99)
+    for place in (log, packed):
+        found = import_map("px4", place, tmp_path / "map.json", settings={"device_id": DEVICE})
+        np.testing.assert_allclose(found.map.bias(T), cubic().bias(T), atol=3e-9)
+        about = read_map(tmp_path / "map.json").record.provenance
+        assert (about["device_id"], about["instance"], about["imported_from"]) == (str(DEVICE), "1", place.name)
+    with pytest.raises(ConfigError, match=r"flight.ulg: gyro 9 has no TC_Gn_ID beside TC_G1_ID"):
+        import_map("px4", log, tmp_path / "map.json", settings={"device_id": 9})
+    Ardupilot(kind="ardupilot").export(unit(cubic()), tmp_path / "a.parm")
+    lines = (line.split() for line in (tmp_path / "a.parm").read_text().splitlines() if line[0] != "#")
+    logged = {name: float(value) for name, value in lines}
+    dataflash_writer.write_log(tmp_path / "b.bin", t, [(still, still, t)], logged | {"INS_TCAL1_ENABLE": 0},
+                               [(9.0, "INS_TCAL1_ENABLE", 1)])  # fmt: skip
+    found = import_map("ardupilot", tmp_path / "b.bin", tmp_path / "map.json")
+    np.testing.assert_allclose(found.map.bias(T), cubic().bias(T), atol=3e-9)
+    assert found.map.record.provenance["imu"] == "1"

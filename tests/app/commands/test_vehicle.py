@@ -10,7 +10,7 @@ import pytest
 from autopilots import parameters
 from dataflash_writer import write_log
 from typer.testing import CliRunner
-from ulog_writer import sensor, write_ulog
+from ulog_writer import FORMATS, Topic, sensor, write_ulog
 
 import driftlab
 from driftlab.cli import app
@@ -37,13 +37,15 @@ def soak(seed=6, start=30.0):
     return t, units
 
 
-def px4(path, gyros=GYROS, **of_soak):
+def px4(path, order=(0, 1), gyros=GYROS, **of_soak):
+    """Write a log with the units in an order, as their drivers happened to start."""
     t, units = soak(**of_soak)
     topics = []
-    for k, (gyro, accel, T) in enumerate(units):
+    for place, k in enumerate(order):
+        gyro, accel, T = units[k]
         topics += [
-            sensor("sensor_gyro", k, t, gyro, T, gyros[k]),
-            sensor("sensor_accel", k, t + 3e-4, accel, T, ACCELS[k]),
+            sensor("sensor_gyro", place, t, gyro, T, gyros[k]),
+            sensor("sensor_accel", place, t + 3e-4, accel, T, ACCELS[k]),
         ]
     return write_ulog(path, topics, {"TC_G_ENABLE": 0})
 
@@ -135,11 +137,21 @@ def test_two_logs_of_a_vehicle_count_together_and_those_of_two_vehicles_are_refu
     samples = [result.sensors[1].result.map.record.samples for result in (alone, both)]
     assert samples[1] > 1.8 * samples[0]
     check(both.sensors, 0)
-    px4(tmp_path / "other.ulg", gyros=GYROS[::-1])
-    with pytest.raises(ConfigError, match=f"has the device id {GYROS[1]} as gyro 0.*logs of one vehicle"):
+    px4(tmp_path / "other.ulg", gyros=(77, 78))
+    with pytest.raises(
+        ConfigError, match=f"has the device id 77 as gyro 0, .* has {GYROS[0]}; give the logs of one veh"
+    ):
         driftlab.vehicle([folder / "soak.ulg", tmp_path / "other.ulg"])
     with pytest.raises(ConfigError, match="are of PX4 and of ArduPilot"):
         driftlab.vehicle([folder / "soak.ulg", folder / "soak.bin"])
+
+
+def test_a_sensor_is_the_same_by_its_device_in_whatever_order_a_log_has_it(folder, tmp_path):
+    turned = px4(tmp_path / "turned.ulg", order=(1, 0), seed=8)
+    both = driftlab.vehicle([folder / "soak.ulg", turned], kind="polynomial")
+    assert [int(one.device) for one in both.sensors] == [*GYROS, *ACCELS]
+    assert [one.places for one in both.sensors] == [(0, 1), (1, 0)] * 2
+    check(both.sensors, 0)
 
 
 def test_what_it_cannot_use_is_said(folder, tmp_path):
@@ -152,13 +164,101 @@ def test_what_it_cannot_use_is_said(folder, tmp_path):
         driftlab.vehicle(folder / "soak.ulg", settings={"instance": 1})
 
 
+HOURS, PERIOD = 2, 3600.0
+PRESSURE, FIELD = np.array([3.0, 0.05]), np.array([[2e-4, -1e-4, 3e-4], [1e-6, 0.0, -2e-6]])  # Pa, G by K, K^2
+MAG = [name for name in FORMATS["sensor_gyro"] if "clip" not in name and "samples" not in name]
+
+
+def air_and_field(path, drift=0.0, once=False):
+    """Write a log with two barometers and a magnetometer over sweeps of temperature; of the second, weather too."""
+    rng = np.random.default_rng(5)
+    t = 30 + np.arange(HOURS * 3600.0)
+    swing = np.minimum(t / HOURS / 1800, 2) if once else 2 * np.abs((t / PERIOD) % 1 - 0.5) * 2
+    T = 15 + 15 * swing
+    x, stamp, same = T - 30, np.round(t * 1e6).astype(np.uint64), np.ones(len(t))
+    about = {"timestamp": stamp, "timestamp_sample": stamp, "temperature": T, "error_count": 0 * same}
+    still = np.array([0, 0, -G]) + 2e-3 * rng.normal(size=(len(t), 3)) - 1e-3 * x[:, None]
+    topics = [
+        sensor("sensor_gyro", 0, t, NOISE * rng.normal(size=(len(t), 3)), T, GYROS[0]),
+        sensor("sensor_accel", 0, t, still, T, ACCELS[0]),
+    ]
+    for k in range(2):
+        pressure = 100_900 + 300 * k + PRESSURE[0] * x + PRESSURE[1] * x**2 + k * drift * (t / t[-1]) ** 2
+        values = {"device_id": (6620172 + k) * same, "pressure": pressure + 2 * rng.normal(size=len(t))}
+        topics.append(Topic("sensor_baro", about | values, k))
+    field = [0.2, 0.05, -0.4] + FIELD[0] * x[:, None] + FIELD[1] * x[:, None] ** 2
+    field = field + 2e-3 * rng.normal(size=field.shape)
+    values = {"device_id": 197388 * same, **{axis: field[:, k] for k, axis in enumerate("xyz")}}
+    topics.append(Topic("sensor_mag", about | values, 0, MAG))
+    return write_ulog(path, topics)
+
+
+def read_back(path, channel, **settings):
+    (found,) = (one for one in Px4(kind="px4", **settings).read(path) if one.channel == channel)
+    return found
+
+
+def test_barometers_and_a_magnetometer_are_corrected_about_the_middle(tmp_path):
+    result = driftlab.vehicle(air_and_field(tmp_path / "a.ulg"), out=tmp_path / "out", kind="polynomial")
+    assert [one.name for one in result.sensors] == ["gyro 0", "accel 0", "mag 0", "baro 0", "baro 1"]
+    assert [bool(one.left_out) for one in result.sensors] == [False] * 5
+    x = np.linspace(-14, 14, 50)
+    for k in range(2):
+        back = read_back(tmp_path / "out" / "vehicle.params", "baro", baro_device_id=6620172 + k)
+        expected = PRESSURE[0] * x + PRESSURE[1] * x**2  # the pressure of the air is not in it
+        np.testing.assert_allclose(back.bias(30 + x)[:, 0], expected, atol=0.5)
+    back = read_back(tmp_path / "out" / "vehicle.params", "mag", mag_device_id=197388)
+    expected = 1e-4 * (FIELD[0] * x[:, None] + FIELD[1] * x[:, None] ** 2)
+    np.testing.assert_allclose(back.bias(30 + x), expected, atol=5e-8)
+
+
+@pytest.mark.parametrize(("drift", "once"), [(400.0, False), (0.0, True)], ids=["weather", "one way"])
+def test_what_may_be_the_weather_is_not_among_the_parameters(drift, once, tmp_path):
+    log = air_and_field(tmp_path / "a.ulg", drift, once)
+    result = driftlab.vehicle(log, out=tmp_path / "out", kind="polynomial")
+    second = result.sensors[-1]
+    assert "air pressure and field drift by themselves" in second.left_out
+    assert "6620173" not in (tmp_path / "out" / "vehicle.params").read_text()
+    assert bool(result.sensors[3].left_out) is once
+    assert result.status == 0  # gyros and accelerometers are there
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert all(one.title in page for one in result.sensors)
+    assert f"{len(result.sensors)} of {len(result.sensors)} sensors have a map" in page
+
+
+def test_levels_of_two_days_do_not_bend_the_curve(tmp_path):
+    one = air_and_field(tmp_path / "a.ulg")
+    result = driftlab.vehicle([f"{one}::0:3600", f"{one}::3600:"], kind="polynomial")
+    assert len(result.sensors[3].recordings) == 2
+    x = np.linspace(-14, 14, 50)
+    bias = result.sensors[3].result.map.bias(30 + x)[:, 0]
+    np.testing.assert_allclose(bias - bias.mean(), (e := PRESSURE[0] * x + PRESSURE[1] * x**2) - e.mean(), atol=0.5)
+
+
+def test_maps_keep_their_devices_through_parameters_and_back(folder, tmp_path):
+    driftlab.vehicle(folder / "soak.ulg", out=tmp_path / "out", kind="polynomial")
+    again = []
+    for channel, k in (("gyro", 1), ("accel", 1)):
+        settings = {"instance": k}
+        out = tmp_path / f"{channel}.json"
+        driftlab.import_map("px4", tmp_path / "out" / "vehicle.params", out, channel=channel, settings=settings)
+        driftlab.export("px4", out, tmp_path / f"{channel}.params")
+        again += (tmp_path / f"{channel}.params").read_text().splitlines()
+    lines = {line for line in (tmp_path / "out" / "vehicle.params").read_text().splitlines() if line[:4] == "1\t1\t"}
+    ids = [line for line in again if "_ID\t" in line]
+    assert ids == [f"1\t1\tTC_G1_ID\t{GYROS[1]}\t6", f"1\t1\tTC_A1_ID\t{ACCELS[1]}\t6"]
+    assert set(ids) <= lines
+
+
 @pytest.mark.recordings
 def test_a_measured_log_of_three_units_that_is_too_short_says_so_of_each():
     logs = sorted((Path(os.environ["DRIFTLAB_DATA"]) / "data" / "px4_ulog").glob("*.ulg"))
     assert logs
     for log in logs:
         result = driftlab.vehicle(log)
-        assert [one.name for one in result.sensors] == [f"{name} {k}" for name in ("gyro", "accel") for k in range(3)]
+        inertial, beside = result.sensors[:6], result.sensors[6:]
+        assert [one.name for one in inertial] == [f"{name} {k}" for name in ("gyro", "accel") for k in range(3)]
+        assert [one.name for one in beside] == [f"{name} {k}" for name in ("mag", "baro") for k in range(2)]
         assert len({one.device for one in result.sensors if one.channel == "gyro"}) == 3
         assert all(one.result is None and one.problem for one in result.sensors)
         assert (result.status, result.loss, result.problem) == (1, None, "no sensor has a map")

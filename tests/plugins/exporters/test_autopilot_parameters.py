@@ -29,8 +29,6 @@ def test_all_ways_of_writing_read_the_same(by, tmp_path):
         (b"A 1\nB nan\n", "line 2: 'B nan' is no parameter"),
         (b"A 1 2\n", "line 1: 'A 1 2' is no parameter"),
         (b"A 1\nB 2\nA 3\n", "line 3: A is 3, and 1 further up; keep one"),
-        (b"ULog\x01\x125 and so on", "is a PX4 log, expected a parameter file"),
-        (b"\xa3\x95\x80", "is a DataFlash log, expected a parameter file"),
         (b"\xff\xfe\x00A", "is no text, expected a parameter file"),
     ],
 )

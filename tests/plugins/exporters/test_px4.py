@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fusion_core.contracts import Export
 from fusion_core.errors import ConfigError
 from fusion_plugins.effects.hysteresis import Hysteresis
 from fusion_plugins.exporters.px4 import Px4
+from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 DEVICE = 2490378
 
@@ -119,8 +121,42 @@ def test_accelerometers_and_barometers_have_their_own(path):
 
 
 def test_a_map_of_another_unit_is_refused(path):
-    with pytest.raises(ConfigError, match="the map of the mag is in T, PX4 corrects sensors in rad/s"):
-        px4().export(Export((sensor(fitted(), channel="mag", unit="T", shown="uT"),)), path)
+    with pytest.raises(ConfigError, match="the map of the supply is in V, PX4 corrects sensors in rad/s"):
+        px4().export(Export((sensor(fitted(), channel="supply", unit="V", shown="mV"),)), path)
+
+
+def test_a_magnetometer_is_held_in_gauss_and_comes_back_in_tesla(path):
+    tesla = sensor(fitted("cubic", unit="T", channel="mag"), channel="mag", unit="T", shown="uT")
+    (loss,) = px4(mag_device_id=197388, instance=1).export(Export((tesla,)), path).sensors
+    found, T = rows(path), np.linspace(-10, 50, 99)
+    middle = tesla.fitted.bias(np.array([20.0]))[0]
+    np.testing.assert_allclose([found[f"TC_M1_X0_{k}"][0] for k in range(3)], middle * 1e4, rtol=1e-6)  # 1 T is 1e4 G
+    assert (found["TC_M_ENABLE"], found["TC_M1_ID"]) == ((1, 6), (197388, 6))
+    (back,) = Px4(kind="px4", mag_device_id=197388).read(path)
+    np.testing.assert_allclose(back.bias(T), tesla.fitted.bias(T), atol=1e-9)
+    np.testing.assert_array_equal(
+        np.max(np.abs(back.bias(T) - tesla.fitted.bias(T)), axis=0) <= loss.domain.largest, True
+    )
+    assert dict(back.about) == {"device_id": "197388", "instance": "1"}
+
+
+def test_the_pressure_of_the_air_is_no_offset(path):
+    T = np.linspace(-10, 50, 500)
+    whole = Polynomial(order=3).fit(T, (101325 + 3 * T)[:, None], {})
+    with pytest.raises(ConfigError, match="pressure is 101385 Pa at 20 °C, the pressure of the air and no offset; fit"):
+        px4(baro_device_id=5).export(Export((sensor(whole, ("x",), "pressure", "Pa", "Pa"),)), path)
+
+
+def test_stairs_are_finer_beside_a_sensor_of_other_temperatures(path):
+    other = sensor(fitted(low=0.0, high=30.0), channel="gyro 1")
+    one = sensor(fitted(provenance={"device_id": "7", "instance": "0"}), channel="gyro 0")
+    two = replace(other, map=fitted(low=0.0, high=30.0, provenance={"device_id": "9", "instance": "1"}))
+    exporter = Px4(kind="px4")
+    alone = exporter.export(Export((one,)), path).sensors[0]
+    both = exporter.export(Export((one, two)), path).sensors[0]
+    stairs = [loss.causes["its renewal in stairs"].rms for loss in (alone, both)]
+    assert np.all(stairs[1] < 0.9 * stairs[0])
+    assert rows(path)["TC_G1_ID"] == (9, 6)
 
 
 def test_axes_that_the_map_lacks_stay_uncorrected_and_that_is_said(path):

@@ -1,5 +1,7 @@
 """PX4's arithmetic: bit for bit that of its formula in C, and its module's way of publishing."""
 
+import subprocess
+
 import numpy as np
 import pytest
 from flying_units import in_c
@@ -63,3 +65,41 @@ def test_what_is_used_lags_by_no_more_than_a_kelvin_and_what_a_second_brings():
 def test_a_start_at_the_value_of_nothing_published_takes_nothing_away():
     # -100 degC stands for `never`: within a kelvin of it nothing is ever published; no sensor is that cold
     assert published(np.arange(3.0), [-99.5, -99.6, -40.0]).tolist() == [-100.0, -100.0, -40.0]
+
+
+# the module of the documentation, for COUNT sensors: once a second each offset is worked out; where the temperature of
+# one has moved by more than 1 K since that one was last reported, what is worked out of all is published
+MODULE = """
+#include <math.h>
+#include <stdio.h>
+int main(void) {
+  float T[COUNT], offset[COUNT], out[COUNT] = {0}, last[COUNT];
+  for (int i = 0; i < COUNT; i++) last[i] = -100.0f;
+  while (fread(T, sizeof T, 1, stdin) == 1) {
+    int changed = 0;
+    for (int i = 0; i < COUNT; i++) {
+      offset[i] = 0.25f + 0.5f * T[i];
+      if (fabsf(T[i] - last[i]) > 1.0f) { last[i] = T[i]; changed = 1; }
+    }
+    if (changed) for (int i = 0; i < COUNT; i++) out[i] = offset[i];
+    fwrite(out, sizeof out, 1, stdout);
+  }
+  return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_what_is_published_of_several_sensors_is_what_the_module_publishes_in_c(count, tmp_path):
+    rng = np.random.default_rng(count)
+    walk = np.cumsum(rng.normal(0, 0.2, (2000, count)), axis=0)
+    T = (20 + 3 * np.arange(count) + walk).astype(np.float32)
+    (tmp_path / "module.c").write_text(MODULE)
+    flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-DCOUNT={count}"]
+    subprocess.run(["gcc", *flags, "-o", tmp_path / "module", tmp_path / "module.c", "-lm"], check=True)
+    done = subprocess.run([tmp_path / "module"], input=T.tobytes(), capture_output=True, check=True)
+    expected = np.frombuffer(done.stdout, dtype=np.float32).reshape(-1, count)
+    for k in range(count):
+        used = published(np.arange(2000.0), T[:, k], list(T.T))
+        found = np.float32(0.25) + np.float32(0.5) * used
+        assert np.array_equal(found.view(np.uint32), np.ascontiguousarray(expected[:, k]).view(np.uint32))

@@ -407,13 +407,6 @@ def test_a_description_with_a_wrong_length(tmp_path):
 # ------------------------------------------------------------------ files that are none, or lack something
 
 
-def test_a_text_log_says_what_to_do(tmp_path):
-    path = tmp_path / "1.log"
-    path.write_text("FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n")
-    with pytest.raises(UnreadableFile, match=r"is an ArduPilot log as text, a binary one \(\.bin\) was expected; take"):
-        read(DataFlash(path=path, channels=CHANNELS))
-
-
 def test_files_of_another_kind(tmp_path):
     path = tmp_path / "l.bin"
     path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
