@@ -52,7 +52,7 @@ class TriadMapResult(Result):
         `map.corrected(reading, T)` gives the input (N, 3), `map.bias(T)` the bias; with g-sensitivity
         `map.corrected(reading, T, force=f)`.
     fit : TriadFit
-        Terms with their joint covariance, `fit.verdict()` what the stimulus does not tell.
+        Terms with their joint covariance, which of them the stimulus does not tell is in `lines()`.
     written : tuple of Path
     """
 
@@ -88,7 +88,7 @@ class TriadMapResult(Result):
 
     def lines(self) -> list[str]:
         """Return the frame, what the stimulus does not tell, and the notes on the recordings."""
-        return [words.frame_line(self.fit), *self.fit.verdict(), *self.faults.lines()]
+        return [words.frame_line(self.fit), *words.verdict(self.fit), *self.faults.lines()]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit, self.unit)
@@ -119,7 +119,7 @@ class TriadMapResult(Result):
         measured = {name: one for name, one in self.measured.items() if not self.levelled or name not in none}
         return Certificate(
             "fit-map", self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
-            levelled=self.levelled, remarks=self.fit.verdict(),
+            levelled=self.levelled, remarks=words.verdict(self.fit),
         )  # fmt: skip
 
 
@@ -238,7 +238,7 @@ def _map_of(
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what the stimulus does not tell, and where the map was written."""
     terminal().print(words.table(result.fit, result.unit))
-    say_lines([words.frame_line(result.fit), *result.fit.verdict()])
+    say_lines([words.frame_line(result.fit), *words.verdict(result.fit)])
     print_verdict(result.limits_verdict, "limits: ")
     say_lines((row.line(result.unit) for row in result.limits), "  ")
     say_lines(result.faults.lines(), "note: ")

@@ -212,7 +212,7 @@ def _config(product: str, site: Mapping[str, str], paths: Mapping[str, Any]) -> 
 def _levelled(configs: Sequence[Config], sensor: LogSensor) -> list[str]:
     """Return the recordings of a sensor, each less its level at the middle of all temperatures.
 
-    The level is the field or the air pressure of a day and place. It is told together with a curve that all logs
+    The level is the field or the air pressure of a day and place. It is estimated together with a curve that all logs
     share, so that logs of different temperatures join::
 
         y_k = level_j + c_1 (T_k - T_mid) + ... + c_5 (T_k - T_mid)^5,    k in log j

@@ -149,11 +149,7 @@ def fleet(
         command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
         summary = command.all()
         if database is not None:
-            report(Stage("database"))
-            records, name = command.status.records, folder.out.name or folder.path.name
-            own = dict.fromkeys(column for record in records for column in record.more)
-            whole = filter(None, map(folder.record, records.units))
-            database.replace(summary["id"], tables_of(name, summary, own, whole, folder.path / TABLE))
+            command.to_database(database, summary)
         if not command.status.done:
             first = command.status.failed[0]
             raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
@@ -260,6 +256,15 @@ class _Command:
             self._timed("tables", written)
         family = self._family(analysis, acknowledged, about)
         return self._mark(complete=True, key=key, family=family, pages=pages)
+
+    def to_database(self, database: Database, summary: Mapping[str, Any]) -> None:
+        """Replace the rows of the fleet in a database by those of `fleet.json`, table and records."""
+        self.jobs.progress(Stage("database"))
+        folder, records = self.jobs.folder, self.status.records
+        own = dict.fromkeys(column for record in records for column in record.more)
+        whole = filter(None, map(folder.record, records.units))
+        name = folder.out.name or folder.path.name
+        database.replace(summary["id"], tables_of(name, summary, own, whole, folder.path / TABLE))
 
     def _family(
         self, analysis: FamilyAnalysis, acknowledged: Mapping[str, Acknowledgement], about: Collection[str]

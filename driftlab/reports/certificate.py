@@ -325,7 +325,9 @@ class Certificate:
         ]  # fmt: skip
         table = _table(budget, np.array([unit.factor for unit in units]))
         for row in table["rows"]:
-            row["shown"] = [text if told else "not told" for text, told in zip(row["shown"], matrix.told, strict=True)]
+            row["shown"] = [
+                text if told else "not observable" for text, told in zip(row["shown"], matrix.told, strict=True)
+            ]
         return {"frame": matrix.frame, "terms": terms, **table}
 
     def _figure(self, name: str, measured: Measured) -> dict[str, Any]:

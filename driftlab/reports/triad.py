@@ -24,6 +24,34 @@ MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the er
     "m/s^2": ("a change of velocity by 10 m/s", 1e4, "mm/s", "along it", "across it"),
 }
 HOURLY = {"rad/s": (3600 * 180 / np.pi, "deg an hour"), "m/s^2": (1e3, "mm/s a second")}
+POOR = 0.1  # of a usual size: a term that is known better is well known
+
+
+def verdict(fit: TriadFit) -> list[str]:
+    """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
+    lines = []
+    middle = fit.sigma(np.array([np.mean(fit.domain)]))[0]
+    for j, name in enumerate(fit.names):
+        if not fit.free[j]:
+            continue
+        if not fit.told[j]:
+            lines.append(f"{name}: not observable, and taken as zero, since {fit.stimulus.lacking(j)}")
+        elif middle[j] > POOR * fit.usual[j]:
+            lines.append(f"{name}: poorly observable, {middle[j] / fit.usual[j]:.0%} of a usual size, since "
+                         f"{fit.stimulus.lacking(j)}")  # fmt: skip
+    low, high = fit.domain
+    untold = [fit.names[j] for j in np.flatnonzero(fit.untold_changes)]
+    if high - low < NARROW:
+        lines.append(
+            f"no change over temperature is observable: all of it lies at {np.mean(fit.domain):.1f} °C; repeat it at "
+            "other temperatures, 20 K apart or more"
+        )
+    elif untold:
+        lines.append(
+            f"change from {low:.1f} to {high:.1f} °C: not observable for {', '.join(untold)}, whose part of the "
+            "stimulus lies at too few temperatures; repeat that part near both ends"
+        )
+    return lines
 
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
@@ -53,9 +81,9 @@ def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
         of_range = [f"{change[j] * factor:{spec}}", f"{of_change[j] * factor:.2g}"]
         curve = fit.terms.curves[j].name
         if not fit.told[j]:
-            of_term[0], of_range, curve = "-", ["-", "-"], "not told"
+            of_term[0], of_range, curve = "-", ["-", "-"], "not observable"
         elif high - low < np.ptp(fit.grid) or fit.untold_changes[j]:
-            of_range = ["not told", "-"]
+            of_range = ["not observable", "-"]
         elif curve == "constant":
             of_range = ["none", "-"]
         rows.append([f"{fit.names[j]} [{name}]", *of_term, *of_range, curve])
@@ -101,7 +129,7 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
     text += f" and {number(across)} {shown} {others}" if cross else ""
     text += f" (two sigma); with the bias alone taken off, up to {number(alone)} {shown} of it were wrong."
     if np.any(fit.free & ~fit.told):
-        text += " Terms that are not told count as 1 % or 10 mrad."
+        text += " Terms that are not observable count as 1 % or 10 mrad."
     hour, hourly = HOURLY[unit.si]
     level = 2 * float(np.max(sigma[list(BIAS)])) * hour
     return f"{text} The bias adds up to {number(level)} {hourly} (two sigma), and what it wanders afterwards."
@@ -168,7 +196,7 @@ def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Seque
         sheet=sheet,
         result=result(fit, channel),
         use=use(fit, unit),
-        untold=fit.verdict(),
+        untold=verdict(fit),
         terms=table(fit, unit),
         frame=frame_line(fit),
         charts=charts(fit, unit),
@@ -184,7 +212,7 @@ def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:
     return {
         "frame": "sensor" if fit.stimulus.sensor_frame else "given",
         "temperature": T.tolist(),
-        "verdict": fit.verdict(),
+        "verdict": verdict(fit),
         "terms": {
             name: {
                 "unit": si_unit_of(j, unit), "told": bool(fit.told[j]), "free": bool(fit.free[j]),

@@ -53,9 +53,8 @@ from fusion_core.errors import SingularFit
 
 STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
-UNTOLD = 0.5  # of the usual size: a term that is not known better is not told
+UNTOLD = 0.5  # of the usual size: a term that is not known better is not observable
 USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / 9.80665  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
-POOR = 0.1  # of it: one that is known better is well known
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
@@ -186,32 +185,6 @@ class TriadFit:
         low, high = self.grid[[0, -1]]
         return np.asarray((2 * T - low - high) / (high - low))
 
-    def verdict(self) -> list[str]:
-        """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
-        lines = []
-        middle = self.sigma(np.array([np.mean(self.domain)]))[0]
-        for j, name in enumerate(self.names):
-            if not self.free[j]:
-                continue
-            if not self.told[j]:
-                lines.append(f"{name}: not told, and taken as zero, since {self.stimulus.lacking(j)}")
-            elif middle[j] > POOR * self.usual[j]:
-                lines.append(f"{name}: poorly told, {middle[j] / self.usual[j]:.0%} of a usual size, since "
-                             f"{self.stimulus.lacking(j)}")  # fmt: skip
-        low, high = self.domain
-        untold = [self.names[j] for j in np.flatnonzero(self.untold_changes)]
-        if high - low < NARROW:
-            lines.append(
-                f"no change over temperature is told: all of it lies at {np.mean(self.domain):.1f} °C; repeat it at "
-                "other temperatures, 20 K apart or more"
-            )
-        elif untold:
-            lines.append(
-                f"change from {low:.1f} to {high:.1f} °C: not told for {', '.join(untold)}, whose part of the stimulus "
-                "lies at too few temperatures; repeat that part near both ends"
-            )
-        return lines
-
 
 def fit_triad(
     stimulus: TriadInput,
@@ -252,7 +225,7 @@ def fit_triad(
     search.check()
     if not search.converge():
         search.drop_untold()
-    for _ in range(PASSES):  # noise and walk, curves, and what is not told, each by the others
+    for _ in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
         before = [*search.chosen, *search.told]
         search.choose()
         search.converge()
@@ -356,7 +329,7 @@ class _Search:
         """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
 
         Without `noise` that stays as it is. Where there is no optimum the terms are those of usual units, whose
-        equations show which of them are not told.
+        equations show which of them are not observable.
         """
         fall, size = np.inf, 1 / TINY
         for k in range(STEPS):
@@ -424,7 +397,7 @@ class _Search:
         return np.asarray(B @ np.linalg.inv(N) @ B.T)
 
     def drop_untold(self) -> None:
-        """Set terms that are not told to zero, the least known first, and of those that are alike the bias last."""
+        """Set unobservable terms to zero, the least known first, and of those that are alike the bias last."""
         while True:
             sigma = np.sqrt(np.diag(self._covariance())) / self.usual * self.told
             sigma[list(BIAS)] *= 0.9
@@ -470,7 +443,7 @@ class _Search:
         return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(self.free))))
 
     def result(self, domain: tuple[float, float]) -> TriadFit:
-        """Return the fit; changes that are not told, and terms that are not, count with their usual size."""
+        """Return the fit; changes that are not observable, and terms that are not, count with their usual size."""
         wide = domain[1] - domain[0] >= NARROW
         straight = [wide and curve.q == 1 for curve in self._curves(self.chosen)]
         design = [

@@ -76,7 +76,7 @@ class TriadInput(ABC):
 
     @abstractmethod
     def lacking(self, term: int) -> str:
-        """Return the reason why a term of `TERMS`, then `SENSITIVITIES`, is not told, and after `; ` the remedy."""
+        """Return the reason that a term of `TERMS`, then `SENSITIVITIES`, cannot be seen; after `; ` the remedy."""
 
     @property
     def free(self) -> NDArray[np.bool_]:

@@ -46,7 +46,7 @@ def _pair(term: int) -> str:
 
 
 def _lacking_force(force: Array | None, axis: str, what: str) -> str:
-    """Return the reason why a g-sensitivity to the force (P, 3) along an axis is not told, and the remedy."""
+    """Return the reason why a g-sensitivity to the force (P, 3) along an axis is not observable, and the remedy."""
     if force is None:
         return "no specific force is known; record the accelerometers too, or turn about the vertical at a latitude"
     along = force[:, AXES.index(axis)]

@@ -21,7 +21,7 @@ from importlib.metadata import Distribution, EntryPoint, entry_points
 from operator import or_
 from pathlib import Path
 from threading import RLock
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit, PydanticUseDefault, core_schema
@@ -320,7 +320,7 @@ class Installed:
             return handler(core_schema.any_schema())
         union = reduce(or_, classes.values())
         tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
-        return handler(TypeAdapter[Any](tagged).core_schema)
+        return handler(TypeAdapter(cast(Any, tagged)).core_schema)
 
 
 def _choice(contract: type[Plugin], kind: str) -> core_schema.CoreSchema:

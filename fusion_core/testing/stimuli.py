@@ -54,7 +54,7 @@ def derivatives_are_those_of_differences(stimulus: Stimulus) -> None:
 
 
 def what_is_lacking_has_a_remedy(stimulus: Stimulus) -> None:
-    """The reason why a term is not told is followed by `; ` and what to do, in one line."""
+    """The reason why a term is not observable is followed by `; ` and what to do, in one line."""
     for known, values in _cases(stimulus):
         for term in range(len(values)):
             text = known.lacking(term)

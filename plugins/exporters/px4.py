@@ -143,11 +143,18 @@ class Px4(Autopilot):
                 f"export px4: the map of the {sensor.channel} is {held.X[0, 0]:.6g} Pa at {T_ref:.4g} °C, the pressure "
                 "of the air and no offset; fit it with `reference`, that of another barometer or a constant"
             )
+        parameters, notes = self._parameters(sensor, kind, device, held)
+        return Corrections(parameters, loss, left_out, notes)
+
+    def _parameters(
+        self, sensor: Calibrated, kind: Px4Sensor, device: int, held: Px4Parameters
+    ) -> tuple[list[Parameter], list[str]]:
+        """Return the parameters of a sensor, and notes on them."""
         instance = _log_number(sensor, "instance", 0) if self.instance is None else self.instance
         given = self.accel_calibration if kind.short == "A" else self.calibration
         slot = _log_number(sensor, "calibration", instance) if given is None else given
         begin = f"TC_{kind.short}{instance}"
-        values = {f"{begin}_TMIN": low, f"{begin}_TMAX": high, f"{begin}_TREF": T_ref}
+        values = {f"{begin}_TMIN": held.T_min, f"{begin}_TMAX": held.T_max, f"{begin}_TREF": held.T_ref}
         values |= {kind.coefficient(instance, *at): value for at, value in np.ndenumerate(held.X)}
         if kind.short == "G":
             values |= {f"CAL_GYRO{slot}_{axis.upper()}OFF": np.float32(0.0) for axis in sensor.axes}
@@ -160,7 +167,7 @@ class Px4(Autopilot):
             Parameter(f"{begin}_ID", device, whole=True),
             *(Parameter(name, float(value)) for name, value in values.items()),
         ]
-        return Corrections(parameters, loss, left_out, _notes(sensor, kind, device, slot))
+        return parameters, _notes(sensor, kind, device, slot)
 
     def written(self, parameter: Parameter) -> str:
         """Return the five columns of QGroundControl."""

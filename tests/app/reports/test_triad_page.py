@@ -77,15 +77,18 @@ def test_what_the_stimulus_does_not_tell_stands_on_page_and_certificate(opened, 
     turned(tmp_path, axes=range(2), more={"limits": {"scale": "2 %"}})
     page = opened(tmp_path / "map.report.html")
     assert page.locator("h2").first.inner_text() == "Not told by the stimulus"
-    assert "scale z: not told, and taken as zero, since no segment turns about z; add segments" in page.inner_text("ul")
+    assert (
+        "scale z: not observable, and taken as zero, since no segment turns about z; add segments"
+        in page.inner_text("ul")
+    )
     assert "6 of 9 terms" in page.locator(".verdict").nth(1).inner_text()
     assert "count as 1 % or 10 mrad" in page.inner_text(".use")
     signed = content(tmp_path)
     assert signed["verdict"].startswith("INCOMPLETE")
     assert signed["limits"][0]["note"] == "the stimulus does not tell zz"
     shown = [row["shown"] for row in signed["matrix"]["rows"]]
-    assert {row[8] for row in shown} == {"not told"}
-    assert "not told" not in {row[0] for row in shown}
+    assert {row[8] for row in shown} == {"not observable"}
+    assert "not observable" not in {row[0] for row in shown}
     assert any("terms of xz, of yz, of zz" in text for text in signed["not_covered"])
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strained, tumble, turntable
 
+from driftlab.reports.triad import verdict
 from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import TERMS
 from fusion_core.chunk import Chunk
@@ -84,7 +85,7 @@ def test_g_sensitivity_goes_with_the_bias_where_no_axis_points_both_ways():
     assert np.sum(~fit.told[12:]) == 3
     assert np.all(fit.sigma(AT)[:, :3] > 0.4 * 1.78e-4 * 9.8)
     assert np.all(fit.sigma(AT)[:, 12:] > 0.4 * 1.78e-4)
-    line = next(line for line in fit.verdict() if "not told, and taken as zero" in line)
+    line = next(line for line in verdict(fit) if "not observable, and taken as zero" in line)
     assert "from 0 to 9.8 m/s^2; add segments with" in line
     assert np.max(fit.sigma(AT)[:, 3:12]) < 1e-4  # M is not touched by it
 
@@ -94,7 +95,7 @@ def test_without_a_known_force_no_g_sensitivity_is_told():
     fit = fit_triad(own, POLYNOMIAL, 0.02, ALL, walk=1e-6)
     assert not fit.told[12:].any()
     assert np.all(fit.terms.at(AT)[:, 12:] == 0)
-    assert sum("no specific force is known; record the accelerometers too" in line for line in fit.verdict()) == 9
+    assert sum("no specific force is known; record the accelerometers too" in line for line in verdict(fit)) == 9
     plain = fit_triad(own, POLYNOMIAL, 0.02, walk=1e-6)
     np.testing.assert_allclose(fit.terms.at(AT)[:, :12], plain.terms.at(AT), atol=2e-5)
 
@@ -163,7 +164,7 @@ def test_what_a_turntable_about_two_axes_does_not_tell_stands_in_the_verdict():
     assert [TERMS[j] for j in np.flatnonzero(~fit.told)] == ["misalignment xz", "misalignment yz", "scale z"]
     assert np.all(fit.terms.at(AT)[:, ~fit.told] == 0)
     assert np.all(fit.sigma(AT)[:, ~fit.told] > 0.009)  # its usual size
-    lines = fit.verdict()
+    lines = verdict(fit)
     assert sum("no segment turns about z; add segments about z" in line for line in lines) == 3
 
 
@@ -177,7 +178,7 @@ def test_one_rate_about_an_axis_leaves_its_scale_and_the_bias_one():
     )
     assert not fit.told[TERMS.index("scale z")]
     assert fit.told[:3].all()
-    assert np.all(fit.sigma(AT)[:, 2] > 0.5 * 0.01 * np.deg2rad(100))  # the scale that is not told counts in the bias
+    assert np.all(fit.sigma(AT)[:, 2] > 0.5 * 0.01 * np.deg2rad(100))  # an unobservable scale counts in the bias
 
 
 def test_faces_alone_tell_no_misalignment():
@@ -186,14 +187,14 @@ def test_faces_alone_tell_no_misalignment():
     assert [TERMS[j] for j in np.flatnonzero(fit.free & ~fit.told)] == [
         "misalignment xy", "misalignment xz", "misalignment yz",
     ]  # fmt: skip
-    assert "add some tilted by 45 deg between the two" in fit.verdict()[0]
+    assert "add some tilted by 45 deg between the two" in verdict(fit)[0]
 
 
 def test_a_face_that_is_missing_is_named():
     """An accelerometer that stays upright: its z axis sees all of gravity, and nothing else."""
     up = np.random.default_rng(1).normal(size=(20, 3)) * [0.03, 0.03, 0.0] + [0, 0, 1]
     fit = fit_triad(placed_forces(up=up, temperatures=[20.0]), POLYNOMIAL, 0.5)
-    lines = {line.split(":")[0]: line for line in fit.verdict()}
+    lines = {line.split(":")[0]: line for line in verdict(fit)}
     assert "no placement has +x or -x up; add one each" in lines["scale x"]
     assert "no placement has -z up; add one" in lines["scale z"]
 
@@ -208,13 +209,13 @@ def test_a_part_of_the_stimulus_at_one_temperature_tells_no_change():
     assert [TERMS[j] for j in np.flatnonzero(fit.untold_changes)] == ["misalignment xy", "scale y", "misalignment zy"]
     sigma = fit.sigma(AT)[:, TERMS.index("scale y")]
     assert sigma[1] < 1e-4 < 5e-3 < sigma[0]
-    assert "change from -20.0 to 60.0 °C: not told for misalignment xy, scale y" in fit.verdict()[-1]
+    assert "change from -20.0 to 60.0 °C: not observable for misalignment xy, scale y" in verdict(fit)[-1]
 
 
 def test_one_temperature_gives_constants_and_says_so():
     fit = fit_triad(known_rates(temperatures=[25.0] * 3), POLYNOMIAL, 0.02)
     assert all(curve.name == "constant" for curve in fit.terms.curves)
-    assert "no change over temperature is told: all of it lies at 25.0 °C" in fit.verdict()[0]
+    assert "no change over temperature is observable: all of it lies at 25.0 °C" in verdict(fit)[0]
     assert fit.grid.tolist() == [24.0, 26.0]
 
 
@@ -237,7 +238,7 @@ def test_a_stimulus_whose_input_is_not_what_it_says_tells_nothing():
     fit = fit_triad(wrong, POLYNOMIAL, 0.02)
     assert not fit.told.any()
     assert np.all(fit.sigma(AT) > 0.4 * fit.usual)
-    assert len(fit.verdict()) >= 12
+    assert len(verdict(fit)) >= 12
 
 
 def test_too_few_segments_are_refused():
