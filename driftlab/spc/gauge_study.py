@@ -190,7 +190,7 @@ class _Soaks:
 
 def gauge_study(
     records: Iterable[UnitRecord], limits: Limits | None = None, appraiser: str = "",
-    columns: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None,
+    columns: Mapping[str, Sequence[Mapping[str, str]]] | None = None,
 ) -> GaugeStudy | None:  # fmt: skip
     """Return the gauge R&R of units that were soaked twice or more; None where no unit was, and none is asked for.
 
@@ -202,16 +202,17 @@ def gauge_study(
         Of the config.
     appraiser : str, optional
         Column of the manifest whose values are the appraisers.
-    columns : mapping of str to mapping of str to mapping of str to str, optional
-        By unit and recording, the values of the manifest's columns.
+    columns : mapping of str to sequence of mapping of str to str, optional
+        By unit, of each of its soaks, the values of the manifest's columns.
     """
     soaks, axes, si, names = _Soaks(), tuple[str, ...](), "", (*FIGURES, LEVEL)
     for record in records:
         if len(record.repeats) > 1:
             axes, si = axes or record.axes, si or record.bias_unit
+            given = (columns or {}).get(record.unit, ())
             for soak in record.repeats:
                 soaks.units.append(record.unit)
-                soaks.appraisers.append((columns or {}).get(record.unit, {}).get(soak.name, {}).get(appraiser, ""))
+                soaks.appraisers.append(given[soak.place].get(appraiser, "") if soak.place < len(given) else "")
                 soaks.values.append(soak.table(names, len(axes))[0])
     if not soaks.units and not appraiser:
         return None
@@ -279,6 +280,8 @@ def _balanced(cells: Mapping[tuple[str, str], list[float]]) -> Array | None:
     best: Array | None = None
     for a in range(2, len(order) + 1):
         parts = sorted(set.intersection(*(by[who] for who in order[:a])))
+        if len(parts) < MIN_UNITS:
+            break  # one appraiser more has no more of them
         counts = sorted({len(cells[unit, who]) for unit in parts for who in order[:a]})
         for r in counts:
             full = [unit for unit in parts if all(len(cells[unit, who]) >= r for who in order[:a])]

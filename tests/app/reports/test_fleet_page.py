@@ -251,7 +251,7 @@ def test_gauge_study_and_notes_are_on_the_page_and_fit_the_sheet(opened, tmp_pat
     for one in found.records[:12]:
         usual = np.array(one.figures["noise"].value)
         figures = [{"noise": Figure(value=tuple(usual * f), sigma=(None,) * 3)} for f in 1 + 0.02 * rng.normal(size=2)]
-        repeats = [RepeatedSoak(name=f"{k}.h5", figures=own) for k, own in enumerate(figures)]
+        repeats = [RepeatedSoak(name=f"{k}.h5", place=k, figures=own) for k, own in enumerate(figures)]
         records.append(one.model_copy(update={"repeats": repeats}))
     why = [of_outlier(outlier) for outlier in found.odd["0003"]]
     notes = new_notes({"0003": NASTY}, "anna", {"0003": why}, {"0003": ""})
