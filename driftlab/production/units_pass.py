@@ -51,7 +51,7 @@ class FleetOptions:
     certificate: bool = False  # of each unit that is done
     family: Path | None = None  # one that is known already
     rules: str | None = None  # run rules of the charts
-    by: tuple[str, ...] = ()  # columns by which the yield is told
+    by: tuple[str, ...] = ()  # columns by which the yield is grouped
     appraiser: str = ""  # column of the gauge study
     notes: Mapping[str, str] = field(default_factory=dict)  # on alarms, by unit
     operator: str | None = None  # who wrote them; None: the account

@@ -11,7 +11,7 @@ appraisers A, their interaction PA and repeated soaks E::
     GRR^2 = EV^2 + INT^2 + AV^2,  TV^2 = GRR^2 + PV^2,  ndc = 1.41 PV / GRR
 
 Where p of the interaction is above 0.25 it is pooled with the repeated soaks; of one soak on each appraiser it cannot
-be told from them. Without appraisers PV^2 = (MS_P - MS_E) / r, where units differ in r of its mean for that
+be distinguished from them. Without appraisers PV^2 = (MS_P - MS_E) / r, where units differ in r of its mean for that
 (Searle, Casella and McCulloch, Variance Components, 1992, section 3.6). What comes out negative is 0.
 
 Intervals are generalised (Hamada and Weerahandi 2000): each mean square is divided by draws of chi-squared over its
@@ -46,11 +46,11 @@ class GaugeComponents:
     Attributes
     ----------
     parts, appraisers, soaks : int
-        Numbers in the analysis; 1 appraiser: none was told apart.
+        Numbers in the analysis; 1 appraiser: they are taken together.
     ev, av, interaction, grr, pv, tv : float
     grr_95, share_95 : (low, high)
     p_interaction : float or None
-        None where there is none to be told.
+        None where there is no such test.
     pooled : bool
     mean : float
         Of all soaks.
@@ -145,7 +145,7 @@ class GaugeStudy:
     rows : tuple of GaugeRow
         Figure by figure, none where `why_not` says why.
     appraiser : str
-        Column of the manifest; empty: none is told apart.
+        Column of the manifest; empty: appraisers are taken together.
     why_not : str
     remark : str
         What was left out.
