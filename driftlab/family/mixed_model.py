@@ -180,10 +180,10 @@ def _means_of_all(
     L, inverse, spread = (np.stack(part) for part in zip(*(fit.law.root() for fit in fits), strict=True))
     centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[None], G, axis=0)
     centres[present] += np.stack([fit.expected.means.shifts for fit in fits], axis=1)
-    told = partial(_of_their_lots, knots, L, np.array([fit.limit for fit in fits]))
+    of_lots = partial(_of_their_lots, knots, L, np.array([fit.limit for fit in fits]))
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
     at_centres = np.einsum("dij,gdj->gdi", inverse, centres)
-    for g, (own_information, own_weighted) in units.reduce(told, lot, ByLot(at_centres, lot)).items():
+    for g, (own_information, own_weighted) in units.reduce(of_lots, lot, ByLot(at_centres, lot)).items():
         information[:, g], weighted[:, g] = own_information, own_weighted
     return [means_of(*own).turned(L[k]) for k, own in enumerate(zip(information, weighted, spread, strict=True))]
 

@@ -127,10 +127,9 @@ class Partitions(Generic[C]):
         """
         return chain.from_iterable(self.engine(partial(_each, function), self._blocks(of_units)))
 
-    def reduce(self, function: Callable[..., R], *of_units: Any, add: Callable[[R, R], R] | None = None) -> R:
+    def reduce(self, function: Callable[..., R], *of_units: Any) -> R:
         """Return the sum of the function's results of all partitions, of which there is at least one; see `map`."""
-        add = add or added
-        return tree(self.engine(partial(_sum, function, add), self._blocks(of_units)), add)
+        return tree(self.engine(partial(_sum, function), self._blocks(of_units)))
 
     def keep(self, name: str, function: Callable[..., R], *of_units: Any) -> Partitions[R]:
         """Return the function's results as partitions, which stay where they were made; see `map`."""
@@ -201,17 +200,17 @@ def added(one: Any, other: Any) -> Any:
     return one + other
 
 
-def tree(leaves: Iterable[R], add: Callable[[R, R], R]) -> R:
+def tree(leaves: Iterable[R]) -> R:
     """Return the sum of at least one leaf, as a binary tree over them in their order."""
     held: list[tuple[int, R]] = []  # levels fall
     for leaf in leaves:
         level, value = 0, leaf
         while held and held[-1][0] == level:
-            level, value = level + 1, add(held.pop()[1], value)
+            level, value = level + 1, added(held.pop()[1], value)
         held.append((level, value))
     _, value = held.pop()
     while held:
-        value = add(held.pop()[1], value)
+        value = added(held.pop()[1], value)
     return value
 
 
@@ -219,12 +218,12 @@ def _each(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> list[
     return [function(part.read(), *of_units) for part, *of_units in block]
 
 
-def _sum(function: Callable[..., R], add: Callable[[R, R], R], block: Sequence[tuple[Any, ...]]) -> R:
-    return tree((function(part.read(), *of_units) for part, *of_units in block), add)
+def _sum(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> R:
+    return tree(function(part.read(), *of_units) for part, *of_units in block)
 
 
 def _write(function: Callable[..., Any], content: Any, paths: Sequence[Path], *of_units: Any) -> None:
     """Write the function's result of a partition, whole or not at all: a worker may end, or two may do the same."""
-    new = paths[0].with_name(f"{paths[0].name}.{os.getpid()}")
+    new = paths[0].with_name(f"{paths[0].name}.{token_hex(6)}")
     new.write_bytes(pickle.dumps(function(content, *of_units), pickle.HIGHEST_PROTOCOL))
     os.replace(new, paths[0])

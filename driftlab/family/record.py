@@ -95,9 +95,13 @@ class Figures(BaseModel):
 
 
 class RepeatedSoak(Figures):
-    """One of the soaks of a unit by itself: the name of its recording, the figures of its own map, and its `level`."""
+    """One of the soaks of a unit by itself: the figures of its own map, and its `level`.
+
+    `name` is that of its recording, `place` its number among the unit's soaks from 0 on: names change where files move.
+    """
 
     name: str
+    place: int
 
 
 class UnitRecord(Figures):

@@ -53,9 +53,7 @@ class ManifestEntry:
     date: str = ""  # ISO 8601
     recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by role: calibration, train, holdout
     more: Mapping[str, str] = field(default_factory=dict)  # the other columns
-    of_soaks: Mapping[str, Mapping[str, str]] = field(
-        default_factory=dict
-    )  # the same of each soak, where it has several
+    of_soaks: tuple[Mapping[str, str], ...] = ()  # the same of each soak, where it has several
 
 
 @dataclass(frozen=True)
@@ -226,14 +224,14 @@ def _iso(date: str) -> str:
 def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, wrong: _Mistakes) -> ManifestEntry:
     recordings: dict[str, list[str]] = {}
     more: dict[str, dict[str, None]] = {}
-    soaks: dict[str, dict[str, str]] = {}
+    soaks: list[dict[str, str]] = []
     lots: dict[str, int] = {}
     dates: dict[str, str] = {}
     for number, row in rows:
         role = ROLES[row["role"].lower()]
-        recordings.setdefault(role, []).append(path := _placed(folder, row["path"]))
+        recordings.setdefault(role, []).append(_placed(folder, row["path"]))
         if role == "calibration":
-            soaks[path] = {column: value for column, value in row.items() if column not in COLUMNS}
+            soaks.append({column: value for column, value in row.items() if column not in COLUMNS})
         if row["lot"]:
             lots.setdefault(row["lot"], number)
         if row["date"]:
@@ -249,7 +247,7 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, w
     date = dates.get("calibration", next(iter(dates.values()), ""))
     others = {column: ", ".join(values) for column, values in more.items()}
     of_roles = {role: tuple(paths) for role, paths in recordings.items()}
-    return ManifestEntry(unit, next(iter(lots), ""), date, of_roles, others, soaks if len(soaks) > 1 else {})
+    return ManifestEntry(unit, next(iter(lots), ""), date, of_roles, others, tuple(soaks) if len(soaks) > 1 else ())
 
 
 class _Mistakes:

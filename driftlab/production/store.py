@@ -13,12 +13,12 @@ from __future__ import annotations
 import errno
 import json
 import os
-import socket
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 from pydantic import ValidationError
@@ -274,9 +274,7 @@ class UnitPlace:
         record = record.model_copy(update={"written": _digests(files)})
         place, hidden = self.path / UNITS / record.unit, f".{record.unit}"
         old = place.with_name(f"{hidden}{OLD}")
-        new = _made(
-            place.with_name(f"{hidden}.{socket.gethostname()}-{os.getpid()}{NEW}"), {**files, RECORD: _content(record)}
-        )
+        new = _made(place.with_name(f"{hidden}.{token_hex(6)}{NEW}"), {**files, RECORD: _content(record)})
         if os.path.lexists(place):
             _take_along(old, place)  # of one who ended here
             os.rename(place, old)

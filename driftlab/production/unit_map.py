@@ -209,8 +209,10 @@ def repeated(config: Config, soaks: Mapping[str, str], tests: Sequence[str]) -> 
         return [], notes
     T = np.linspace(max(ranges[name][0] for name in same), min(ranges[name][1] for name in same), 25)
     result = []
-    for name in same:
-        unit, soak = units[name], soaks[name]
+    for place, (name, soak) in enumerate(soaks.items()):
+        if name not in same:
+            continue
+        unit = units[name]
         soaked, densities = soaked_of(name, unit.axes, unit.soak.rows(unit.fitted.record.channel))
         level = unit.fitted.bias(T).mean(axis=0)
         own = {**figures_of(unit.fitted, soaked, densities), LEVEL: figure(level, np.full(len(level), np.nan))}
@@ -218,7 +220,7 @@ def repeated(config: Config, soaks: Mapping[str, str], tests: Sequence[str]) -> 
             own |= coasted(unit, tests, [soak], soaked.walk).figures
         except FusionError as error:
             notes.append(f"no prediction of {name} by itself: {error}")
-        result.append(RepeatedSoak(name=name, figures=own))
+        result.append(RepeatedSoak(name=name, place=place, figures=own))
     return result, notes
 
 

@@ -51,7 +51,7 @@ class FleetOptions:
     certificate: bool = False  # of each unit that is done
     family: Path | None = None  # one that is known already
     rules: str | None = None  # run rules of the charts
-    by: tuple[str, ...] = ()  # columns by which the yield is told
+    by: tuple[str, ...] = ()  # columns by which the yield is grouped
     appraiser: str = ""  # column of the gauge study
     notes: Mapping[str, str] = field(default_factory=dict)  # on alarms, by unit
     operator: str | None = None  # who wrote them; None: the account
@@ -201,7 +201,7 @@ class UnitJobs:
                 whole = self.folder.record(entry.unit)
                 assert whole is not None
                 self.folder.note(whole.model_copy(update=given))
-            key.update(repr((entry.unit, record.key, record.state, given)).encode())
+            key.update(repr((entry.unit, record.key, record.state, given, entry.of_soaks)).encode())
         return FleetStatus(self.folder.records.of([entry.unit for entry in self.manifest.units]), key.hexdigest())
 
     def _wants_page(self, unit: str) -> bool:
@@ -324,7 +324,7 @@ class FleetStatus:
     """The units of a manifest as they are in the folder."""
 
     records: RecordsOfUnits = field(default_factory=lambda: UnitRecords().of(()))  # in the order of the manifest
-    key: str = ""  # hash of all that the family stands on: the keys of the units, their lots and dates
+    key: str = ""  # hash of all that family and page stand on: the keys of the units, and the manifest's columns
 
     @cached_property
     def done(self) -> RecordsOfUnits:

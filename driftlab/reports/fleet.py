@@ -36,7 +36,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     failed = [(record.unit, "", record.error) for record in records if record.state == "failed"]
     done, odd, table = len(records) - len(failed), len(reasons), _table(overview, reasons)
     domains = [record.domain for record in records if record.domain and record.state == "done"]
-    lists = _lists(overview, reasons)
+    lists, shown_below = _lists(overview, reasons), in_tables(line)
     write_page(
         path,
         "fleet",
@@ -48,7 +48,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         use=_use(line, len(lists["odd"]), len(lists["alarms"])),
         yields=overview.yields,
         called=figure_name,
-        remarks=[*(one for one in line.sentences[1:] if one not in in_tables(line)), *overview.remarks],
+        remarks=[*(one for one in line.sentences[1:] if one not in shown_below), *overview.remarks],
         numbers=_numbers(records),
         maps=map_charts(overview, np.array(domains, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
@@ -79,11 +79,11 @@ def _lists(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, lis
     out = {line.units[k]: "; ".join(one.text for one in why) for k, why in alarms(line).items()}
     noted = {note.unit: f" (noted before: {note.text()})" for note in overview.notes}
 
-    def rows(said: Mapping[str, str]) -> list[tuple[str, str, str]]:
-        still = {unit: why + noted.get(unit, "") for unit, why in said.items() if unit not in known}
+    def rows(reasons: Mapping[str, str]) -> list[tuple[str, str, str]]:
+        still = {unit: why + noted.get(unit, "") for unit, why in reasons.items() if unit not in known}
         return [(unit, overview.links.get(unit, ""), why) for unit, why in still.items()]
 
-    both = {unit: "; ".join(said[unit] for said in (reasons, out) if unit in said) for unit in known}
+    both = {unit: "; ".join(own[unit] for own in (reasons, out) if unit in own) for unit in known}
     listed = [(unit, overview.links.get(unit, ""), f"{note.text()}: {both[unit]}") for unit, note in known.items()]
     return {"odd": rows(reasons), "alarms": rows(out), "acknowledged": listed}
 

@@ -11,7 +11,7 @@ appraisers A, their interaction PA and repeated soaks E::
     GRR^2 = EV^2 + INT^2 + AV^2,  TV^2 = GRR^2 + PV^2,  ndc = 1.41 PV / GRR
 
 Where p of the interaction is above 0.25 it is pooled with the repeated soaks; of one soak on each appraiser it cannot
-be told from them. Without appraisers PV^2 = (MS_P - MS_E) / r, where units differ in r of its mean for that
+be distinguished from them. Without appraisers PV^2 = (MS_P - MS_E) / r, where units differ in r of its mean for that
 (Searle, Casella and McCulloch, Variance Components, 1992, section 3.6). What comes out negative is 0.
 
 Intervals are generalised (Hamada and Weerahandi 2000): each mean square is divided by draws of chi-squared over its
@@ -46,11 +46,11 @@ class GaugeComponents:
     Attributes
     ----------
     parts, appraisers, soaks : int
-        Numbers in the analysis; 1 appraiser: none was told apart.
+        Numbers in the analysis; 1 appraiser: they are taken together.
     ev, av, interaction, grr, pv, tv : float
     grr_95, share_95 : (low, high)
     p_interaction : float or None
-        None where there is none to be told.
+        None where there is no such test.
     pooled : bool
     mean : float
         Of all soaks.
@@ -145,7 +145,7 @@ class GaugeStudy:
     rows : tuple of GaugeRow
         Figure by figure, none where `why_not` says why.
     appraiser : str
-        Column of the manifest; empty: none is told apart.
+        Column of the manifest; empty: appraisers are taken together.
     why_not : str
     remark : str
         What was left out.
@@ -190,7 +190,7 @@ class _Soaks:
 
 def gauge_study(
     records: Iterable[UnitRecord], limits: Limits | None = None, appraiser: str = "",
-    columns: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None,
+    columns: Mapping[str, Sequence[Mapping[str, str]]] | None = None,
 ) -> GaugeStudy | None:  # fmt: skip
     """Return the gauge R&R of units that were soaked twice or more; None where no unit was, and none is asked for.
 
@@ -202,16 +202,17 @@ def gauge_study(
         Of the config.
     appraiser : str, optional
         Column of the manifest whose values are the appraisers.
-    columns : mapping of str to mapping of str to mapping of str to str, optional
-        By unit and recording, the values of the manifest's columns.
+    columns : mapping of str to sequence of mapping of str to str, optional
+        By unit, of each of its soaks, the values of the manifest's columns.
     """
     soaks, axes, si, names = _Soaks(), tuple[str, ...](), "", (*FIGURES, LEVEL)
     for record in records:
         if len(record.repeats) > 1:
             axes, si = axes or record.axes, si or record.bias_unit
+            given = (columns or {}).get(record.unit, ())
             for soak in record.repeats:
                 soaks.units.append(record.unit)
-                soaks.appraisers.append((columns or {}).get(record.unit, {}).get(soak.name, {}).get(appraiser, ""))
+                soaks.appraisers.append(given[soak.place].get(appraiser, "") if soak.place < len(given) else "")
                 soaks.values.append(soak.table(names, len(axes))[0])
     if not soaks.units and not appraiser:
         return None
@@ -279,6 +280,8 @@ def _balanced(cells: Mapping[tuple[str, str], list[float]]) -> Array | None:
     best: Array | None = None
     for a in range(2, len(order) + 1):
         parts = sorted(set.intersection(*(by[who] for who in order[:a])))
+        if len(parts) < MIN_UNITS:
+            break  # one appraiser more has no more of them
         counts = sorted({len(cells[unit, who]) for unit in parts for who in order[:a]})
         for r in counts:
             full = [unit for unit in parts if all(len(cells[unit, who]) >= r for who in order[:a])]

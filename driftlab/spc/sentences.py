@@ -192,8 +192,8 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     if alike:
         more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
         lines.append(
-            f"Units resemble those before them (autocorrelation: {', '.join(alike[:NAMED])}{more}): changes are told "
-            "beyond that, and limits by neighbours alarm more often than they say."
+            f"Units resemble those before them (autocorrelation: {', '.join(alike[:NAMED])}{more}): changes are "
+            "reported beyond that, and limits by neighbours alarm more often than they say."
         )
     if line.too_few:
         lines.append(f"Too few units for a chart: {', '.join(line.too_few)}.")

@@ -30,7 +30,7 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
     "T_high": lambda record: f"{record.domain[1]:g}" if record.domain else "",
     "hours": lambda record: f"{record.hours:g}" if record.hours else "",
 }
-"""Columns of the units' table by which a line is told, beside those of the manifest itself."""
+"""Columns of the units' table by which a yield is grouped, beside those of the manifest itself."""
 UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
 SAID = {"fail": "above limit", "undecided": "undecided", "not measured": "not measured"}
 NO_VALUE = "not known"

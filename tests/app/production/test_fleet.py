@@ -463,6 +463,7 @@ def test_units_that_were_soaked_twice_are_a_gauge_study(fleet):
     assert asked == [one[0]]
     repeats = result.record(one[0]).repeats
     assert [soak.name.rpartition("/")[2] for soak in repeats] == ["soak.h5", "again.h5"]
+    assert [soak.place for soak in repeats] == [0, 1]
     record = result.record(one[0])
     for name in ("residual", "noise", "swing", "coast", "level"):
         apart = [soak.figures[name].value for soak in repeats]

@@ -55,6 +55,14 @@ def test_a_row_is_a_recording_and_paths_are_relative_to_the_manifest(manifest):
     assert [list(unit.more) for unit in read.units] == [["chamber"], ["chamber"]]
 
 
+def test_of_several_soaks_each_has_its_own_columns_in_the_order_of_the_rows(manifest):
+    rows = ["1,soak,b.h5,K2", "1,train,c.h5,K3", "2,soak,e.h5,K1", "1,soak,a.h5,K1", "1,soak,d.h5,"]
+    first, second = manifest("\n".join(["unit,role,path,chamber", *rows])).units
+    assert first.recordings["calibration"] == ("b.h5", "a.h5", "d.h5")
+    assert first.of_soaks == ({"chamber": "K2"}, {"chamber": "K1"}, {"chamber": ""})
+    assert second.of_soaks == ()
+
+
 @pytest.mark.parametrize(
     "text", ["unit;path\n1;a.h5\n", "unit\tpath\n1\ta.h5\n", "\ufeffUnit,Path\r\n1 , a.h5\r\n\r\n"]
 )

@@ -19,6 +19,7 @@ from driftlab.reports.line_charts import control_charts
 from driftlab.spc.acknowledgements import new_notes, of_outlier
 from driftlab.spc.gauge_study import gauge_study
 from driftlab.spc.line import line_of
+from driftlab.spc.sentences import in_tables
 from driftlab.spc.yields import yields_of
 from driftlab.units import RATE
 
@@ -83,8 +84,11 @@ def cells(shown, column):
 def test_it_says_what_the_fleet_is(path, overview, opened):
     shown = opened(path)
     text = shown.locator("body").inner_text()
+    (first, *rest), tables = overview.line.sentences, in_tables(overview.line)
+    assert not set(rest) <= tables
     for said in (
-        "120 units: 118 done, 2 failed", "2 odd", *overview.line.sentences, "z bends at 41 degC; noise as the family",
+        "120 units: 118 done, 2 failed", "2 odd", first, *(one for one in rest if one not in tables),
+        "z bends at 41 degC; noise as the family",
         "no file of unit 7", "hysteresis: 2.1 deg/h a K", "a remark", "240.0 h",
         verdict_of_units(one.limits for one in overview.records).capitalize(),
     ):  # fmt: skip
@@ -251,7 +255,7 @@ def test_gauge_study_and_notes_are_on_the_page_and_fit_the_sheet(opened, tmp_pat
     for one in found.records[:12]:
         usual = np.array(one.figures["noise"].value)
         figures = [{"noise": Figure(value=tuple(usual * f), sigma=(None,) * 3)} for f in 1 + 0.02 * rng.normal(size=2)]
-        repeats = [RepeatedSoak(name=f"{k}.h5", figures=own) for k, own in enumerate(figures)]
+        repeats = [RepeatedSoak(name=f"{k}.h5", place=k, figures=own) for k, own in enumerate(figures)]
         records.append(one.model_copy(update={"repeats": repeats}))
     why = [of_outlier(outlier) for outlier in found.odd["0003"]]
     notes = new_notes({"0003": NASTY}, "anna", {"0003": why}, {"0003": ""})

@@ -123,6 +123,7 @@ def soaked(count, soaks=2, spread=0.02, **more):
         repeats = [
             RepeatedSoak(
                 name=f"{k}/{j}.h5",
+                place=j,
                 figures={"noise": Figure(value=tuple(own * (1 + spread * rng.normal(size=3))), sigma=(None,) * 3)},
             )
             for j in range(soaks)
@@ -154,11 +155,11 @@ def test_a_class_is_named_only_where_the_whole_interval_is_in_it():
 
 def test_of_appraisers_that_are_a_column_of_the_manifest():
     records = soaked(10, 4)
-    columns = {one.unit: {soak.name: {"chamber": f"K{j % 2}"} for j, soak in enumerate(one.repeats)} for one in records}
+    columns = {one.unit: [{"chamber": f"K{soak.place % 2}"} for soak in one.repeats] for one in records}
     found = gauge_study(records, None, "chamber", columns)
     assert {row.found.appraisers for row in found.rows} == {2}
     assert " by chamber" in found.sentences()[0]
-    apart = {unit: {name: {"chamber": unit} for name in of_unit} for unit, of_unit in columns.items()}
+    apart = {unit: [{"chamber": unit} for _ in of_unit] for unit, of_unit in columns.items()}
     assert "no reproducibility: " in gauge_study(records, None, "chamber", apart).sentences()[0]
 
 
@@ -170,6 +171,6 @@ def test_too_few_repeats_are_said_with_what_to_record():
     assert few.startswith(f"gauge R&R: {MIN_UNITS - 1} units were soaked twice")
     (alone,) = gauge_study(
         soaked(6), None, "chamber",
-        {one.unit: {s.name: {"chamber": s.name} for s in one.repeats} for one in soaked(6)},
+        {one.unit: [{"chamber": s.name} for s in one.repeats] for one in soaked(6)},
     ).sentences()  # fmt: skip
     assert "too few soaks are repeated on one appraiser" in alone
