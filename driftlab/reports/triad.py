@@ -13,7 +13,7 @@ from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.fit import TriadFit
 from driftlab.triad.model import AXES, BIAS, GROUPS, NARROW, SCALE, TERMS
-from driftlab.units import RATE, BiasUnit, number
+from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
 GRAVITY = 9.80665  # m/s^2, in a g
@@ -88,7 +88,7 @@ def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
             of_range = ["none", "-"]
         rows.append([f"{fit.names[j]} [{name}]", *of_term, *of_range, curve])
     heads = ("term", f"at {T[0]:.1f} °C", "sigma", "change", "sigma", "curve")
-    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False, rigid=True)
+    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False)
 
 
 def frame_line(fit: TriadFit) -> str:
@@ -98,16 +98,17 @@ def frame_line(fit: TriadFit) -> str:
     return "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)"
 
 
-def result(fit: TriadFit, channel: str) -> str:
+def result(fit: TriadFit, unit: BiasUnit, channel: str) -> str:
     """Return the number of terms that are known, and how well, in a sentence."""
     M, (low, high) = [*SCALE, *CROSS], fit.domain
     sigma = np.max(fit.sigma(fit.grid), axis=0)
     told, free = int(np.sum(fit.told[M])), int(np.sum(fit.free[M]))
     parts = [f"{channel}: {told} of {free} terms of scale factor and misalignment are known"]
-    for name, some in (("scale factors", SCALE), ("misalignments", CROSS)):
+    strained = range(len(TERMS), len(fit.names))
+    for name, some in (("scale factors", SCALE), ("misalignments", CROSS), ("g-sensitivities", strained)):
         known = [j for j in some if fit.told[j]]
         if known:
-            shown, factor = unit_of(known[0], RATE)
+            shown, factor = unit_of(known[0], unit)
             parts.append(f"{name} to {np.max(sigma[known]) * factor:.2g} {shown}")
     over = f"from {low:.1f} to {high:.1f} °C" if high - low >= NARROW else f"at {(low + high) / 2:.1f} °C"
     return f"{', '.join(parts)} (one sigma, where it is largest {over})" if told else parts[0]
@@ -136,7 +137,7 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
 
 
 def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
-    """Return the charts of scale factor and misalignment, of the bias, and of the residuals."""
+    """Return the charts of scale factor and misalignment, of the bias, of g-sensitivity, and of the residuals."""
     T = fit.grid
     values, sigma = fit.terms.at(T) * unit.factor, fit.sigma(T) * unit.factor
 
@@ -144,7 +145,22 @@ def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
         yield band(T, values[:, k], 2 * sigma[:, k], "bias")
 
     bias = Chart(axis_panels(tuple(AXES), lines, "bias", unit.shown), TEMPERATURE, "Bias", "Bands: two sigma.")
-    return [chart(fit, unit), bias, _residual_chart(fit, unit)]
+    strained = [_sensitivity_chart(fit, unit)] if len(fit.names) > len(TERMS) else []
+    return [chart(fit, unit), bias, *strained, _residual_chart(fit, unit)]
+
+
+def _sensitivity_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
+    """Return the g-sensitivities of each axis with their bands."""
+    T, (shown, factor) = fit.grid, unit_of(len(TERMS), unit)
+    values, sigma = fit.terms.at(T) * factor, fit.sigma(T) * factor
+
+    def lines(k: int) -> Iterator[Line]:
+        for j, other in enumerate(AXES):
+            at = len(TERMS) + 3 * k + j
+            yield band(T, values[:, at], 2 * sigma[:, at], f"force along {other}", f"series:{j}")
+
+    panels = axis_panels(tuple(AXES), lines, "g-sensitivity", shown)
+    return Chart(panels, TEMPERATURE, "g-sensitivity", "Bands: two sigma.")
 
 
 def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
@@ -189,12 +205,14 @@ def chart(fit: TriadFit, unit: BiasUnit) -> Chart:
 
 def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Sequence[str], sheet: Sheet) -> str:
     """Return the page of a fit."""
+    strained = len(fit.names) > len(TERMS)
+    terms = "scale factor, misalignment and g-sensitivity" if strained else "scale factor and misalignment"
     return page(
         "triad",
-        title=f"Bias, scale factor and misalignment of the {channel}",
+        title=f"Bias, {terms} of the {channel}",
         lead=lead,
         sheet=sheet,
-        result=result(fit, channel),
+        result=result(fit, unit, channel),
         use=use(fit, unit),
         untold=verdict(fit),
         terms=table(fit, unit),

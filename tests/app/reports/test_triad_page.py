@@ -76,7 +76,7 @@ def test_the_page_begins_with_the_result_and_what_it_means(opened, tmp_path, mad
 def test_what_the_stimulus_does_not_tell_stands_on_page_and_certificate(opened, tmp_path):
     turned(tmp_path, axes=range(2), more={"limits": {"scale": "2 %"}})
     page = opened(tmp_path / "map.report.html")
-    assert page.locator("h2").first.inner_text() == "Not told by the stimulus"
+    assert page.locator("h2").first.inner_text() == "Not observable"
     assert (
         "scale z: not observable, and taken as zero, since no segment turns about z; add segments"
         in page.inner_text("ul")
