@@ -161,6 +161,10 @@ def fit_triad_map(
     if out is not None:
         read = own.files_to_fit() if "bias" in names else own.files()
         check_all(out, report, [*read, *paths_of(recordings)], names_of(certificate=certificate), "fit-map")
+    if "g_sensitivity" in names and "bias" not in names:
+        raise ConfigError(
+            "--terms: g_sensitivity without bias is of no use, since the bias of a soak has its part of it; add bias"
+        )
     known = None if "bias" in names else _known_bias(own, settings)
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")

@@ -12,11 +12,10 @@ from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.fit import TriadFit
-from driftlab.triad.model import AXES, BIAS, GROUPS, NARROW, SCALE, TERMS
+from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, SCALE, TERMS
 from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
-GRAVITY = 9.80665  # m/s^2, in a g
 CROSS = GROUPS["misalignment"]
 TEMPERATURE = "temperature [°C]"
 MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the error, and where the errors are

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from driftlab.triad.model import (
     BIAS,
+    GRAVITY,
     GRID,
     NARROW,
     SCALE,
@@ -54,7 +55,7 @@ from fusion_core.errors import SingularFit
 STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
 UNTOLD = 0.5  # of the usual size: a term that is not known better is not observable
-USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / 9.80665  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
+USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / GRAVITY  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
