@@ -42,7 +42,7 @@ class MatrixCurve(Frozen):
     kinds : (9,) texts
         The curve of each term.
     told : (9,) bools
-        Whether the stimulus tells a term; one that it does not is zero.
+        Whether the stimulus shows a term; one that it does not is zero.
     error : CurveError, optional
         Of the 9 terms, with how their errors go together. Its modes are those of the error of the bias, one by one.
         None of a matrix that was imported: not known.

@@ -110,7 +110,7 @@ def test_a_run_takes_scale_and_misalignment_off(folder, bias):
     quiet = np.random.default_rng(0).normal(0, 1e-3, y.shape)
     data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (quiet, "rad/s"), "temperature": (T, "degC")}
     made = driftlab.fit_map(config, data, terms=TERMS, out=folder / f"{bias}.json")
-    assert made.fit.told.sum() == 9
+    assert made.fit.observable.sum() == 9
 
     N, up, g = 3000, np.array([0.6, 0.0, 0.8]), 9.806199
     T = np.linspace(-15, 55, N)
