@@ -12,7 +12,7 @@ import typer
 from driftlab.commands.console import print_json, say, say_lines, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Units, config_with
 from driftlab.config import Config, maps_of
-from driftlab.filtering.setup import check_channels, loaded_map, prior
+from driftlab.filtering.setup import FORCE, check_channels, loaded_map, prior
 from driftlab.recordings.screening import head
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import FittedMap, Sensor
@@ -103,7 +103,8 @@ def _turns(sensor: Sensor, chunk: Chunk) -> Iterator[str]:
     fitted = _with_matrix(sensor)
     if fitted is None or sensor.unit != "rad/s" or not {sensor.channel, "temperature"} <= set(chunk.channels):
         return
-    omega = chunk[sensor.channel] - fitted.bias(np.clip(chunk["temperature"], *fitted.domain), chunk.t)
+    force = chunk[FORCE] if FORCE in chunk.channels else None
+    omega = fitted.corrected(chunk[sensor.channel], np.clip(chunk["temperature"], *fitted.domain), chunk.t, force)
     parts = np.array_split(omega, max(len(omega) // ROWS, 1))
     rate = max(float(np.linalg.norm(part.mean(axis=0))) for part in parts)
     if rate < TURNING:

@@ -25,6 +25,7 @@ from driftlab.storage.hdf5 import columns_of, reading
 from driftlab.storage.json import plain, write_json
 from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import document, foreign, sign
+from driftlab.triad.model import GRAVITY
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import (
@@ -51,7 +52,6 @@ from fusion_core.units import along_axes
 
 CONFIGS = (".yaml", ".yml")
 SHOWN = {"rad/s": "deg/h", "m/s^2": "mg", "T": "uT"}  # units in which people read those of a map's file
-GRAVITY = 9.80665  # m/s^2, in a g
 LOSS = "loss.json"
 SCHEMA = 2  # of its layout
 NEEDED = ("t", "tau", "rate", "coast", "still", "used", "innovations", "x")

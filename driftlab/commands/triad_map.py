@@ -52,7 +52,7 @@ class TriadMapResult(Result):
         `map.corrected(reading, T)` gives the input (N, 3), `map.bias(T)` the bias; with g-sensitivity
         `map.corrected(reading, T, force=f)`.
     fit : TriadFit
-        Terms with their joint covariance, which of them the stimulus does not tell is in `lines()`.
+        Terms with their joint covariance, which of them are not observable is in `lines()`.
     written : tuple of Path
     """
 
@@ -87,7 +87,7 @@ class TriadMapResult(Result):
         }  # fmt: skip
 
     def lines(self) -> list[str]:
-        """Return the frame, what the stimulus does not tell, and the notes on the recordings."""
+        """Return the frame, what is not observable, and the notes on the recordings."""
         return [words.frame_line(self.fit), *words.verdict(self.fit), *self.faults.lines()]
 
     def _chart(self) -> Chart:
@@ -161,6 +161,10 @@ def fit_triad_map(
     if out is not None:
         read = own.files_to_fit() if "bias" in names else own.files()
         check_all(out, report, [*read, *paths_of(recordings)], names_of(certificate=certificate), "fit-map")
+    if "g_sensitivity" in names and "bias" not in names:
+        raise ConfigError(
+            "--terms: g_sensitivity without bias is of no use, since the bias of a soak has its part of it; add bias"
+        )
     known = None if "bias" in names else _known_bias(own, settings)
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
@@ -236,7 +240,7 @@ def _map_of(
 
 
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
-    """Print the terms, what the stimulus does not tell, and where the map was written."""
+    """Print the terms, what is not observable, and where the map was written."""
     terminal().print(words.table(result.fit, result.unit))
     say_lines([words.frame_line(result.fit), *words.verdict(result.fit)])
     print_verdict(result.limits_verdict, "limits: ")

@@ -160,8 +160,10 @@ def _terms(fitted: FittedMap | None, sensor: Sensor) -> tuple[str, ...]:
     """Return the terms of a sensor that its map takes off."""
     axes, matrix = sensor.axes, None if fitted is None else fitted.record.matrix
     bias = [] if fitted is None else [f"bias {axis}" for axis in axes]
-    pairs = () if matrix is None else np.argwhere(np.reshape(matrix.told, (3, 3)))
-    return (*bias, *(f"scale {axes[i]}" if i == j else f"misalignment {axes[i]}{axes[j]}" for i, j in pairs))
+    strain = None if fitted is None else fitted.record.sensitivity
+    pairs, strained = ([] if one is None else np.argwhere(np.reshape(one.told, (3, 3))) for one in (matrix, strain))
+    of_M = (f"scale {axes[i]}" if i == j else f"misalignment {axes[i]}{axes[j]}" for i, j in pairs)
+    return (*bias, *of_M, *(f"g-sensitivity {axes[i]}{axes[j]}" for i, j in strained))
 
 
 def _condition(run: Run, recording: Chunk, initial_error: float, threshold: float) -> Condition:

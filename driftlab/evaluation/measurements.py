@@ -73,17 +73,16 @@ def _of_matrix(matrix: TriadMatrix, axes: Sequence[str]) -> Iterator[tuple[str, 
     An axis is below a limit where it is at every temperature, with its guard.
     """
     T = np.linspace(matrix.T[0], matrix.T[-1], POINTS)
-    M, told = np.abs(matrix.at(T)), np.array(matrix.told).reshape(3, 3)
-    own = np.eye(3, dtype=bool)
-    free = np.triu(np.ones((3, 3), dtype=bool)) if matrix.frame == "sensor" else ~np.zeros((3, 3), dtype=bool)
+    M, told = np.abs(matrix.at(T)), np.reshape(matrix.told, (3, 3))
+    own, free = np.eye(3, dtype=bool), matrix.free.reshape(3, 3)
     sigma = None if matrix.error is None else matrix.sigma(T).reshape(-1, 3, 3)
     for name, some in (("scale", own), ("misalignment", ~own & free)):
         rows = np.any(some, axis=1)
         names = [axis for axis, row in zip(axes, rows, strict=True) if row]
         values = np.max(np.where(some, M, 0.0), axis=(0, 2))[rows]
         measured = Measured(values, names, stands_on=f"M(T), {T[0]:.4g} to {T[-1]:.4g} °C", otherwise=LONGER)
-        if untold := [axes[i] + axes[j] for i, j in np.argwhere(some & ~told)]:
-            measured = replace(measured, missing=f"the stimulus does not tell {', '.join(untold)}")
+        if hidden := [axes[i] + axes[j] for i, j in np.argwhere(some & ~told)]:
+            measured = replace(measured, missing=f"not observable by the stimulus: {', '.join(hidden)}")
         elif sigma is not None:
             low, high = (np.where(some, M + side * SIDE * sigma, 0.0) for side in (-1, 1))
             at = np.argmax(np.where(some, M, 0.0).max(axis=2), axis=0)[rows]

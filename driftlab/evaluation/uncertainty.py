@@ -37,12 +37,12 @@ from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, TriadMatrix
+from fusion_core.contracts.stimulus import PAIRS
 
 K = 2.0  # coverage factor
 COVERED = 0.9545  # of a normal law within K deviations
 MIN_RECORDINGS = 3  # of two, a deviation is known to a factor of ten
 MAX_ROWS, MATRIX_ROWS = 9, 5  # temperatures of a table, of bias and of M
-PAIRS, BELOW = tuple(i + j for i in "xyz" for j in "xyz"), ("yx", "zx", "zy")  # of M, and of it zero in its own frame
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0)  # K, between them
 NEAR = 0.4  # of a step: a round temperature so near to an end of the domain is left out
 
@@ -141,13 +141,12 @@ def matrix_budget(
         ends = np.clip([T - h, T + h], low, high)
         slope = (matrix.terms(ends[1]) - matrix.terms(ends[0])) / (ends[1] - ends[0])[:, None]
         sources.append(UncertaintySource("thermometer", "B", np.abs(slope) * thermometer / K))
-    untold = [f"of {pair}" for pair, known in zip(PAIRS, matrix.told, strict=True) if not known]
+    hidden = [PAIRS[k] for k in np.flatnonzero(matrix.free & ~np.array(matrix.told))]
     missing = ["axes and rates of the stimulus, which are taken as exact"] if matrix.frame == "given" else []
     if matrix.frame == "sensor":
-        untold = [one for one in untold if one[-2:] not in BELOW]
         missing = ["the angles between the triad's own frame and the case"]
-    if untold:
-        missing.append(f"terms {', '.join(untold)}, which the stimulus does not tell")
+    if hidden:
+        missing.append(f"terms {', '.join(hidden)} of M, which are not observable")
     return UncertaintyBudget(T, terms, sources, missing)
 
 

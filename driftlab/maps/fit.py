@@ -150,9 +150,9 @@ def term_lines(matrix: TriadMatrix, axes: Sequence[str]) -> list[str]:
             f"{name} {of} {value * factor:{spec}} {shown} = {value:.4g}{si} at {T[100]:.1f} °C, {low:{spec}} to "
             f"{high:{spec}} {shown} {over}, {known}"
         )
-    free = np.triu(np.ones((3, 3))) if matrix.frame == "sensor" else np.ones((3, 3))
-    if untold := [axes[i] + axes[j] for i, j in np.argwhere(free * ~np.reshape(matrix.told, (3, 3)))]:
-        lines.append(f"terms of M that are not known, and taken as zero: {', '.join(untold)}")
+    hidden = np.reshape(matrix.free & ~np.array(matrix.told), (3, 3))
+    if unknown := [axes[i] + axes[j] for i, j in np.argwhere(hidden)]:
+        lines.append(f"terms of M that are not known, and taken as zero: {', '.join(unknown)}")
     return lines
 
 
@@ -168,8 +168,8 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     if record.matrix is not None:
         lines += [f"map {record.kind}: {line}" for line in term_lines(record.matrix, axes_of(fitted))]
     if record.sensitivity is not None:
-        told = sum(record.sensitivity.told)
-        lines.append(f"map {record.kind}: with g-sensitivity, {told} terms of G(T), taken off where accel is recorded")
+        known = sum(record.sensitivity.told)
+        lines.append(f"map {record.kind}: with g-sensitivity, {known} terms of G(T), taken off where accel is recorded")
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"

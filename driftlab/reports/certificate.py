@@ -30,13 +30,13 @@ from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from driftlab.storage.json import plain, text_of
 from driftlab.triad.fit import TriadFit
-from driftlab.triad.model import AXES, PAIRS
+from driftlab.triad.model import AXES, GRAVITY, PAIRS
 from driftlab.units import BiasUnit, default_unit, duration, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 
 FILES = ("certificate.html", "certificate.json")
-LARGE = {"rad/s": (np.deg2rad(1.0), "deg/s"), "m/s^2": (9.80665, "m/s^2")}  # beyond which another unit is the usual
+LARGE = {"rad/s": (np.deg2rad(1.0), "deg/s"), "m/s^2": (GRAVITY, "m/s^2")}  # beyond which another unit is the usual
 USUAL = {"rad/s": "deg/h", "m/s^2": "mg"}
 MAX_RECORDINGS = 3  # that are listed on the sheet; of more it has one hash of all
 MAX_DECIMALS = 6  # of a number without a power of ten
@@ -141,7 +141,7 @@ class Certificate:
     fit : TriadFit, optional
         Of scale factor and misalignment, where it is at hand.
     levelled : bool
-        Whether the stimulus tells the level of the bias.
+        Whether the stimulus shows the level of the bias.
     """
 
     command: str
@@ -320,7 +320,7 @@ class Certificate:
         units = [OF_M["scale" if i == j else "misalignment"] for i, j in pairs]
         terms = [
             {"term": f"{axes[i]}{axes[j]}", "of": "scale" if i == j else "misalignment", "shown_unit": unit.shown,
-             "told": matrix.told[k], "free": matrix.frame == "given" or i <= j}
+             "told": matrix.told[k], "free": bool(matrix.free[k])}
             for k, ((i, j), unit) in enumerate(zip(pairs, units, strict=True))
         ]  # fmt: skip
         table = _table(budget, np.array([unit.factor for unit in units]))
@@ -354,6 +354,10 @@ class Certificate:
         """Yield the sources that the uncertainties do not cover, in words."""
         yield from () if self.budget is None else self.budget.missing
         yield from () if self.matrix_budget is None else self.matrix_budget.missing
+        strained = None if self.fitted is None else self.fitted.record.sensitivity
+        if strained is not None:
+            G = GRAVITY * float(np.max(np.linalg.norm(strained.at(np.array(strained.T)), axis=2)))
+            yield f"the g-sensitivity: the bias is that without a force, to which 1 g adds up to {self._size(G)}"
         if self.si == "rad/s" and not self._turned and not (self._vertical and self.config.heading is not None):
             part = math.cos(self.config.latitude or 0.0) if self._vertical else 1.0
             which = "horizontal part of the " if self._vertical else ""

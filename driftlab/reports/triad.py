@@ -12,11 +12,10 @@ from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.fit import TriadFit
-from driftlab.triad.model import AXES, BIAS, GROUPS, NARROW, SCALE, TERMS
-from driftlab.units import RATE, BiasUnit, number
+from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, SCALE, TERMS
+from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
-GRAVITY = 9.80665  # m/s^2, in a g
 CROSS = GROUPS["misalignment"]
 TEMPERATURE = "temperature [°C]"
 MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the error, and where the errors are
@@ -28,27 +27,27 @@ POOR = 0.1  # of a usual size: a term that is known better is well known
 
 
 def verdict(fit: TriadFit) -> list[str]:
-    """Return a sentence for each term that the stimulus does not tell, with the reason and the remedy."""
+    """Return a sentence for each term that is not observable, with the reason and the remedy."""
     lines = []
     middle = fit.sigma(np.array([np.mean(fit.domain)]))[0]
     for j, name in enumerate(fit.names):
         if not fit.free[j]:
             continue
-        if not fit.told[j]:
+        if not fit.observable[j]:
             lines.append(f"{name}: not observable, and taken as zero, since {fit.stimulus.lacking(j)}")
         elif middle[j] > POOR * fit.usual[j]:
             lines.append(f"{name}: poorly observable, {middle[j] / fit.usual[j]:.0%} of a usual size, since "
                          f"{fit.stimulus.lacking(j)}")  # fmt: skip
     low, high = fit.domain
-    untold = [fit.names[j] for j in np.flatnonzero(fit.untold_changes)]
+    hidden = [fit.names[j] for j in np.flatnonzero(fit.unobservable_changes)]
     if high - low < NARROW:
         lines.append(
             f"no change over temperature is observable: all of it lies at {np.mean(fit.domain):.1f} °C; repeat it at "
             "other temperatures, 20 K apart or more"
         )
-    elif untold:
+    elif hidden:
         lines.append(
-            f"change from {low:.1f} to {high:.1f} °C: not observable for {', '.join(untold)}, whose part of the "
+            f"change from {low:.1f} to {high:.1f} °C: not observable for {', '.join(hidden)}, whose part of the "
             "stimulus lies at too few temperatures; repeat that part near both ends"
         )
     return lines
@@ -80,15 +79,15 @@ def table(fit: TriadFit, unit: BiasUnit) -> TextTable:
         of_term = [f"{values[j] * factor:{spec}}", f"{sigma[j] * factor:.2g}"]
         of_range = [f"{change[j] * factor:{spec}}", f"{of_change[j] * factor:.2g}"]
         curve = fit.terms.curves[j].name
-        if not fit.told[j]:
+        if not fit.observable[j]:
             of_term[0], of_range, curve = "-", ["-", "-"], "not observable"
-        elif high - low < np.ptp(fit.grid) or fit.untold_changes[j]:
+        elif high - low < np.ptp(fit.grid) or fit.unobservable_changes[j]:
             of_range = ["not observable", "-"]
         elif curve == "constant":
             of_range = ["none", "-"]
         rows.append([f"{fit.names[j]} [{name}]", *of_term, *of_range, curve])
     heads = ("term", f"at {T[0]:.1f} °C", "sigma", "change", "sigma", "curve")
-    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False, rigid=True)
+    return TextTable(heads, rows, f"terms from {low:.1f} to {high:.1f} °C", framed=False)
 
 
 def frame_line(fit: TriadFit) -> str:
@@ -98,19 +97,20 @@ def frame_line(fit: TriadFit) -> str:
     return "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)"
 
 
-def result(fit: TriadFit, channel: str) -> str:
+def result(fit: TriadFit, unit: BiasUnit, channel: str) -> str:
     """Return the number of terms that are known, and how well, in a sentence."""
     M, (low, high) = [*SCALE, *CROSS], fit.domain
     sigma = np.max(fit.sigma(fit.grid), axis=0)
-    told, free = int(np.sum(fit.told[M])), int(np.sum(fit.free[M]))
-    parts = [f"{channel}: {told} of {free} terms of scale factor and misalignment are known"]
-    for name, some in (("scale factors", SCALE), ("misalignments", CROSS)):
-        known = [j for j in some if fit.told[j]]
+    known_terms, free = int(np.sum(fit.observable[M])), int(np.sum(fit.free[M]))
+    parts = [f"{channel}: {known_terms} of {free} terms of scale factor and misalignment are known"]
+    strained = range(len(TERMS), len(fit.names))
+    for name, some in (("scale factors", SCALE), ("misalignments", CROSS), ("g-sensitivities", strained)):
+        known = [j for j in some if fit.observable[j]]
         if known:
-            shown, factor = unit_of(known[0], RATE)
+            shown, factor = unit_of(known[0], unit)
             parts.append(f"{name} to {np.max(sigma[known]) * factor:.2g} {shown}")
     over = f"from {low:.1f} to {high:.1f} °C" if high - low >= NARROW else f"at {(low + high) / 2:.1f} °C"
-    return f"{', '.join(parts)} (one sigma, where it is largest {over})" if told else parts[0]
+    return f"{', '.join(parts)} (one sigma, where it is largest {over})" if known_terms else parts[0]
 
 
 def use(fit: TriadFit, unit: BiasUnit) -> str:
@@ -128,7 +128,7 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
     text = f"{motion} is right within {number(along)} {shown} {about}"
     text += f" and {number(across)} {shown} {others}" if cross else ""
     text += f" (two sigma); with the bias alone taken off, up to {number(alone)} {shown} of it were wrong."
-    if np.any(fit.free & ~fit.told):
+    if np.any(fit.free & ~fit.observable):
         text += " Terms that are not observable count as 1 % or 10 mrad."
     hour, hourly = HOURLY[unit.si]
     level = 2 * float(np.max(sigma[list(BIAS)])) * hour
@@ -136,7 +136,7 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
 
 
 def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
-    """Return the charts of scale factor and misalignment, of the bias, and of the residuals."""
+    """Return the charts of scale factor and misalignment, of the bias, of g-sensitivity, and of the residuals."""
     T = fit.grid
     values, sigma = fit.terms.at(T) * unit.factor, fit.sigma(T) * unit.factor
 
@@ -144,7 +144,22 @@ def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
         yield band(T, values[:, k], 2 * sigma[:, k], "bias")
 
     bias = Chart(axis_panels(tuple(AXES), lines, "bias", unit.shown), TEMPERATURE, "Bias", "Bands: two sigma.")
-    return [chart(fit, unit), bias, _residual_chart(fit, unit)]
+    strained = [_sensitivity_chart(fit, unit)] if len(fit.names) > len(TERMS) else []
+    return [chart(fit, unit), bias, *strained, _residual_chart(fit, unit)]
+
+
+def _sensitivity_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
+    """Return the g-sensitivities of each axis with their bands."""
+    T, (shown, factor) = fit.grid, unit_of(len(TERMS), unit)
+    values, sigma = fit.terms.at(T) * factor, fit.sigma(T) * factor
+
+    def lines(k: int) -> Iterator[Line]:
+        for j, other in enumerate(AXES):
+            at = len(TERMS) + 3 * k + j
+            yield band(T, values[:, at], 2 * sigma[:, at], f"force along {other}", f"series:{j}")
+
+    panels = axis_panels(tuple(AXES), lines, "g-sensitivity", shown)
+    return Chart(panels, TEMPERATURE, "g-sensitivity", "Bands: two sigma.")
 
 
 def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
@@ -189,14 +204,16 @@ def chart(fit: TriadFit, unit: BiasUnit) -> Chart:
 
 def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Sequence[str], sheet: Sheet) -> str:
     """Return the page of a fit."""
+    strained = len(fit.names) > len(TERMS)
+    terms = "scale factor, misalignment and g-sensitivity" if strained else "scale factor and misalignment"
     return page(
         "triad",
-        title=f"Bias, scale factor and misalignment of the {channel}",
+        title=f"Bias, {terms} of the {channel}",
         lead=lead,
         sheet=sheet,
-        result=result(fit, channel),
+        result=result(fit, unit, channel),
         use=use(fit, unit),
-        untold=verdict(fit),
+        hidden=verdict(fit),
         terms=table(fit, unit),
         frame=frame_line(fit),
         charts=charts(fit, unit),
@@ -209,14 +226,15 @@ def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:
     T: Array = fit.grid
     change, of_change = fit.change()
     values, sigma = fit.terms.at(T), fit.sigma(T)
+    moves = fit.observable & ~fit.unobservable_changes & (np.ptp(fit.domain) >= np.ptp(T))
     return {
         "frame": "sensor" if fit.stimulus.sensor_frame else "given",
         "temperature": T.tolist(),
         "verdict": verdict(fit),
         "terms": {
             name: {
-                "unit": si_unit_of(j, unit), "told": bool(fit.told[j]), "free": bool(fit.free[j]),
-                "change_told": bool(fit.told[j] and not fit.untold_changes[j] and np.ptp(fit.domain) >= np.ptp(T)),
+                "unit": si_unit_of(j, unit), "told": bool(fit.observable[j]), "free": bool(fit.free[j]),
+                "change_told": bool(moves[j]),
                 "curve": fit.terms.curves[j].name, "value": values[:, j].tolist(), "sigma": sigma[:, j].tolist(),
                 "change": float(change[j]), "change_sigma": float(of_change[j]),
             }

@@ -15,7 +15,7 @@ with p the effective number of coefficients: the price of a coefficient among q 
 Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
 noise and walk are means over their restricted likelihood; the prior of the density of the walk is half-Cauchy (Gelman,
 Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. A term that the
-equations do not tell is zero, and its usual size counts in the error of the others.
+equations do not show is zero, and its usual size counts in the error of the others.
 
 What was decided counts in the error too. A term that stays constant may move by b, sigma s, all the same; it does with
 the probability that follows from the two models' evidence (Schwarz, Annals of Statistics 6 (1978) 461)::
@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from driftlab.triad.model import (
     BIAS,
+    GRAVITY,
     GRID,
     NARROW,
     SCALE,
@@ -53,8 +54,8 @@ from fusion_core.errors import SingularFit
 
 STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
-UNTOLD = 0.5  # of the usual size: a term that is not known better is not observable
-USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / 9.80665  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
+UNOBSERVABLE = 0.5  # of the usual size: a term that is not known better is not observable
+USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / GRAVITY  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
@@ -78,10 +79,10 @@ class TriadFit:
         Sizes of the terms of a usual unit, beside which a deviation is large or small.
     free : (q,) array of bool
         Terms that were looked for.
-    told : (q,) array of bool
-        Terms that the stimulus tells; the others are zero.
-    untold_changes : (q,) array of bool
-        Told terms whose change over temperature it does not tell.
+    observable : (q,) array of bool
+        Terms that the stimulus shows; the others are zero.
+    unobservable_changes : (q,) array of bool
+        Observable terms whose change over temperature is not observable.
     design, root : TriadTerms' curves and (n, n) array
         Curves of the error, and the root of the covariance of their coefficients.
     noise : tuple of float
@@ -95,8 +96,8 @@ class TriadFit:
     domain: tuple[float, float]
     usual: Array
     free: NDArray[np.bool_]
-    told: NDArray[np.bool_]
-    untold_changes: NDArray[np.bool_]
+    observable: NDArray[np.bool_]
+    unobservable_changes: NDArray[np.bool_]
     design: Sequence[TermCurve]
     root: Array
     noise: tuple[float, ...]
@@ -177,7 +178,7 @@ class TriadFit:
             slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
         return {
             "T": tuple(T.tolist()), "values": tuple(map(tuple, self.terms.at(T)[:, part].tolist())),
-            "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.told[part].tolist()),
+            "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.observable[part].tolist()),
             "kinds": tuple(curve.name for curve in self.terms.curves[part]), "error": self.curve_error(part),
         }  # fmt: skip
 
@@ -224,15 +225,15 @@ def fit_triad(
     search = _Search(stimulus, curves_of(settings, domain), usual, free, walk)
     search.check()
     if not search.converge():
-        search.drop_untold()
+        search.drop_unobservable()
     for _ in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
-        before = [*search.chosen, *search.told]
+        before = [*search.chosen, *search.observable]
         search.choose()
         search.converge()
         search.measure_walk()
         search.converge(noise=False)
-        search.drop_untold()
-        if before == [*search.chosen, *search.told]:
+        search.drop_unobservable()
+        if before == [*search.chosen, *search.observable]:
             break
     if not search.converge(noise=False):
         raise SingularFit(
@@ -254,16 +255,16 @@ class _Search:
         declared: float | None = None,
     ) -> None:
         self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
-        self.told = free.copy()
+        self.observable = free.copy()
         self.chosen = [0] * len(free)
         self.x: list[Array] = [np.zeros(1) for _ in free]
         self.s, self.walk, self.declared = np.ones(2), 0.0, declared
-        self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of told terms
+        self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of these terms
         self.linearise()
 
     def check(self) -> None:
         """Raise SingularFit where there are fewer equations than terms."""
-        equations, count = len(self.e.left), int(np.sum(self.told))
+        equations, count = len(self.e.left), int(np.sum(self.observable))
         if equations <= count:
             raise SingularFit(
                 f"the stimulus has {equations} equations for {count} terms; add placements or segments, more than "
@@ -334,7 +335,7 @@ class _Search:
         fall, size = np.inf, 1 / TINY
         for k in range(STEPS):
             self.linearise()
-            N, A = self._system(self._curves(self.chosen), self.told)
+            N, A = self._system(self._curves(self.chosen), self.observable)
             inverse = np.linalg.inv(N)
             solution = np.asarray(inverse @ (A.T @ self.z))
             self._take(solution)
@@ -358,12 +359,12 @@ class _Search:
 
     def measure_walk(self) -> None:
         """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
-        if not np.any(self.told):
+        if not np.any(self.observable):
             return
         prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
         z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
         curves = self._curves(self.chosen)
-        X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.told[j]])
+        X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.observable[j]])
         usual = 1.0 if not self.declared else self.declared**2 * float(np.max(np.diag(self._walked()))) + TINY
         for walk in WALKS:
             root = np.linalg.cholesky(self._covariance_of_noise(walk))
@@ -388,7 +389,7 @@ class _Search:
     def _covariance(self) -> Array:
         """Return the covariance (q, q) of the terms in the middle, by the columns that are free."""
         curves, T = self._curves(self.chosen), np.array([(self.e.T.min() + self.e.T.max()) / 2])
-        N, _ = self._system(curves, self.told)
+        N, _ = self._system(curves, self.observable)
         B = np.zeros((len(self.free), len(N)))
         at = 0
         for j, curve in enumerate(curves):
@@ -396,15 +397,15 @@ class _Search:
             at += curve.q
         return np.asarray(B @ np.linalg.inv(N) @ B.T)
 
-    def drop_untold(self) -> None:
+    def drop_unobservable(self) -> None:
         """Set unobservable terms to zero, the least known first, and of those that are alike the bias last."""
         while True:
-            sigma = np.sqrt(np.diag(self._covariance())) / self.usual * self.told
+            sigma = np.sqrt(np.diag(self._covariance())) / self.usual * self.observable
             sigma[list(BIAS)] *= 0.9
             worst = int(np.argmax(sigma))
-            if sigma[worst] <= UNTOLD:
+            if sigma[worst] <= UNOBSERVABLE:
                 return
-            self.told[worst] = False
+            self.observable[worst] = False
             self.chosen[worst], self.x[worst] = 0, np.zeros(1)
 
     def choose(self) -> None:
@@ -413,9 +414,9 @@ class _Search:
         Where all terms move, one alone hardly lowers the residual of the others, and does not pay; so the search begins
         with constants, and again with the curve that is best for all.
         """
-        alike = [[k * int(told) for told in self.told] for k in range(len(self.curves))]
+        alike = [[k * int(seen) for seen in self.observable] for k in range(len(self.curves))]
         _, self.chosen = min(map(self._cheapest, (alike[0], min(alike, key=self._price))))
-        N, A = self._system(self._curves(self.chosen), self.told)
+        N, A = self._system(self._curves(self.chosen), self.observable)
         self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
 
     def _cheapest(self, chosen: list[int]) -> tuple[float, list[int]]:
@@ -423,7 +424,7 @@ class _Search:
         best = self._price(chosen)
         while True:
             trials = []
-            for j in np.flatnonzero(self.told):
+            for j in np.flatnonzero(self.observable):
                 for k in range(max(chosen[j] - AHEAD, 0), min(chosen[j] + 1 + AHEAD, len(self.curves))):
                     tried = [*chosen[:j], k, *chosen[j + 1 :]]
                     trials.append((self._price(tried), tried))
@@ -434,7 +435,7 @@ class _Search:
 
     def _price(self, chosen: list[int]) -> float:
         curves, m, p = self._curves(chosen), len(self.z), 0.0
-        N, A = self._system(curves, self.told)
+        N, A = self._system(curves, self.observable)
         left, shares = self.z - A @ np.linalg.solve(N, A.T @ self.z), np.diag(np.linalg.solve(N, A.T @ A))
         for curve, own in zip(curves, np.split(shares, np.cumsum([curve.q for curve in curves])[:-1]), strict=True):
             p += float(np.sum(own)) + 1 if np.any(curve.penalty) else curve.q
@@ -453,13 +454,14 @@ class _Search:
         starts = np.cumsum([0, *(curve.q for curve in design)])
         whole = np.linalg.inv(N)
         sigma, moved = np.sqrt(np.diag(whole)), whole @ (A.T @ self.z)
-        untold, pinned = np.zeros(len(self.free), dtype=bool), []
+        hidden, pinned = np.zeros(len(self.free), dtype=bool), []
         for j, start in enumerate(starts[:-1]):
             own = range(start, starts[j + 1])
-            if self.told[j] and straight[j]:
-                untold[j] = sigma[start + 1] > UNTOLD * self.usual[j]
+            line = self.observable[j] and straight[j]
+            if line:
+                hidden[j] = sigma[start + 1] > UNOBSERVABLE * self.usual[j]
             # no change was seen where one would have been: there is none; and terms that are not free are known
-            known = own[1:] if self.told[j] and straight[j] and not untold[j] else own[:0] if self.free[j] else own
+            known = own[1:] if line and not hidden[j] else own[:0] if self.free[j] else own
             N[known, known] += 1 / TINY
             pinned += list(known) if self.free[j] else []
         length = np.zeros((len(N), 1))  # an input whose size is unsure: all scale factors go with it
@@ -476,13 +478,13 @@ class _Search:
         root = np.hstack([inside, scatter, length])
         columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
-            self.stimulus, self.terms, domain, self.usual, self.free, self.told.copy(), untold, design, root,
+            self.stimulus, self.terms, domain, self.usual, self.free, self.observable.copy(), hidden, design, root,
             tuple(self.s.tolist()), columns,
         )  # fmt: skip
 
     def _scatter_over_walks(self, starts: Array) -> Array:
         """Return the modes (n, walks) of the coefficients' scatter over the walks that are likely."""
-        sizes = [curve.q if told else 0 for curve, told in zip(self._curves(self.chosen), self.told, strict=True)]
+        sizes = [curve.q if seen else 0 for curve, seen in zip(self._curves(self.chosen), self.observable, strict=True)]
         places = np.concatenate([start + np.arange(q) for start, q in zip(starts[:-1], sizes, strict=True)])
         modes = np.zeros((int(starts[-1]), len(self.by_walk)))
         if all(len(x) == len(places) for _, x in self.by_walk):

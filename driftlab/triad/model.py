@@ -26,6 +26,7 @@ from fusion_core.contracts.stimulus import TERMS as TERMS
 from fusion_core.contracts.stimulus import inverted as inverted
 from fusion_core.errors import ConfigError
 
+GRAVITY = 9.80665  # m/s^2, in a g
 BIAS, SCALE = range(3), (3, 7, 11)
 GROUPS = {"bias": [*BIAS], "scale": [*SCALE], "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 NARROW = 2.0  # K: temperatures that move less have one value of each term

@@ -144,9 +144,8 @@ class MatrixLoss:
 
     def __str__(self) -> str:
         shown = ((self.scale, 1e6, "ppm of scale factor"), (self.misalignment, 1e3, "mrad of misalignment"))
-        return " and ".join(
-            f"{'/'.join(f'{v * factor:.3g}' for v in deviation.largest)} {what}" for deviation, factor, what in shown
-        )
+        rows = [([float(f"{v * factor:.3g}") for v in lost.largest], what) for lost, factor, what in shown]
+        return " and ".join(f"{'/'.join(f'{v:g}' for v in values)} {what}" for values, what in rows)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
@@ -41,7 +42,7 @@ class MatrixCurve(Frozen):
     kinds : (9,) texts
         The curve of each term.
     told : (9,) bools
-        Whether the stimulus tells a term; one that it does not is zero.
+        Whether the stimulus shows a term; one that it does not is zero.
     error : CurveError, optional
         Of the 9 terms, with how their errors go together. Its modes are those of the error of the bias, one by one.
         None of a matrix that was imported: not known.
@@ -106,6 +107,12 @@ class TriadMatrix(MatrixCurve):
         if np.max(rows) >= SINGULAR:
             raise ValueError(f"a row of the matrix adds up to {np.max(rows):.3g}, below {SINGULAR:g} was expected")
         return self
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """True for the terms (9,) that the frame leaves free, row by row."""
+        whole = np.ones((3, 3), dtype=bool)
+        return (whole if self.frame == "given" else np.triu(whole)).ravel()
 
     def distortion(self, less: Array, T: Array) -> Array:
         """Return M u (N, 3), the part of readings less their bias (I + M) u (N, 3) that is no input."""

@@ -182,7 +182,7 @@ def matrix_lines(name: str, matrix: Array) -> list[str]:
 
 
 def _exact(value: float) -> str:
-    return f"{value:.1f}" if value in (0.0, 1.0) else f"{value:.9e}"
+    return f"{abs(value):.1f}" if value in (0.0, 1.0) else f"{value:.9e}"
 
 
 def _largest(

@@ -52,7 +52,7 @@ def test_a_recording_of_the_plan_has_the_sigma_that_it_promises(tmp_path):
         data = {"time": (t, "s"), "gyro": (y, "rad/s"), "temperature": (T, "degC")}
         stimulus = {"kind": "rate_table", "segments": str(tmp_path / "plan" / "segments.csv")}
         fit = driftlab.fit_map({**CONFIG, "stimulus": stimulus}, data, terms="bias,scale,misalignment").fit
-        assert fit.told.all()
+        assert fit.observable.all()
         off.append(fit.terms.at(AT)[:, 3:] - np.array([bent(T).ravel() for T in AT]))
     ratio = np.sqrt(np.mean(np.array(off) ** 2, axis=0)) / promised[:, 3:]
     assert 0.8 < np.sqrt(np.mean(ratio**2)) < 1.2  # of 8 units with 27 values each

@@ -73,7 +73,11 @@ def test_g_sensitivity_is_fitted_held_and_left_out_of_exports(folder, accel):
         "filter": {"gyro": {"noise": "8e-5 rad/s/sqrt(Hz)", "bias": walk}},
         "stimulus": {"kind": "rate_table", "segments": str(folder / "strained.csv")},
     } | ({} if accel else {"latitude": "0 deg"})  # fmt: skip
-    made = driftlab.fit_map(config, data, terms=f"{TERMS},g_sensitivity", out=folder / "g.json")
+    made = driftlab.fit_map(config, data, terms=f"{TERMS},g_sensitivity", out=folder / "g.json", certificate=True)
+    page, sheet = (folder / f"g.{name}.html" for name in ("report", "certificate"))
+    assert "g-sensitivities to" in page.read_text()
+    assert "force along z" in page.read_text()
+    assert "1 g adds up to 560 deg/h" in sheet.read_text()  # the largest row of G, 2.77e-4 rad/s a m/s^2
     assert made["terms"].shape[1] == len(made.labels["terms"]) == len(made.units["terms"]) == 21
     assert (made.labels["terms"][12], made.units["terms"][12]) == ("g-sensitivity_xx", "rad/s/(m/s^2)")
     at = np.array([0.0, 20.0, 40.0])
@@ -106,7 +110,7 @@ def test_a_run_takes_scale_and_misalignment_off(folder, bias):
     quiet = np.random.default_rng(0).normal(0, 1e-3, y.shape)
     data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (quiet, "rad/s"), "temperature": (T, "degC")}
     made = driftlab.fit_map(config, data, terms=TERMS, out=folder / f"{bias}.json")
-    assert made.fit.told.sum() == 9
+    assert made.fit.observable.sum() == 9
 
     N, up, g = 3000, np.array([0.6, 0.0, 0.8]), 9.806199
     T = np.linspace(-15, 55, N)
@@ -302,6 +306,7 @@ def test_a_mat_file_holds_all_terms_and_gives_them_back(folder):
     ("options", "message"),
     [
         (["--terms", "bias,scala"], "'scala' is none of bias, scale, misalignment, g_sensitivity; name those"),
+        (["--terms", "scale,g_sensitivity"], "the bias of a soak has its part of it; add bias"),
         (["--stimulus", "tumble"], "--stimulus: is that of --terms"),
         (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
         (

@@ -76,7 +76,7 @@ def test_the_page_begins_with_the_result_and_what_it_means(opened, tmp_path, mad
 def test_what_the_stimulus_does_not_tell_stands_on_page_and_certificate(opened, tmp_path):
     turned(tmp_path, axes=range(2), more={"limits": {"scale": "2 %"}})
     page = opened(tmp_path / "map.report.html")
-    assert page.locator("h2").first.inner_text() == "Not told by the stimulus"
+    assert page.locator("h2").first.inner_text() == "Not observable"
     assert (
         "scale z: not observable, and taken as zero, since no segment turns about z; add segments"
         in page.inner_text("ul")
@@ -85,11 +85,11 @@ def test_what_the_stimulus_does_not_tell_stands_on_page_and_certificate(opened, 
     assert "count as 1 % or 10 mrad" in page.inner_text(".use")
     signed = content(tmp_path)
     assert signed["verdict"].startswith("INCOMPLETE")
-    assert signed["limits"][0]["note"] == "the stimulus does not tell zz"
+    assert signed["limits"][0]["note"] == "not observable by the stimulus: zz"
     shown = [row["shown"] for row in signed["matrix"]["rows"]]
     assert {row[8] for row in shown} == {"not observable"}
     assert "not observable" not in {row[0] for row in shown}
-    assert any("terms of xz, of yz, of zz" in text for text in signed["not_covered"])
+    assert any("terms xz, yz, zz of M" in text for text in signed["not_covered"])
 
 
 @pytest.mark.parametrize("made", [turned, tumbled])

@@ -48,7 +48,7 @@ def test_terms_over_temperature_are_within_their_sigma(stimulus, sensor, size, u
     z = []
     for seed in range(200, 208):
         fit = fit_triad(stimulus(seed), POLYNOMIAL, usual, walk=1e-6)
-        z.append(((fit.terms.at(AT) - truth(sensor, size)) / fit.sigma(AT))[:, fit.told])
+        z.append(((fit.terms.at(AT) - truth(sensor, size)) / fit.sigma(AT))[:, fit.observable])
     z = np.array(z)
     assert z.shape[2] == (12 if stimulus is known_rates else 9)
     assert 0.6 < np.mean(np.abs(z) < 1) < 0.85
@@ -68,7 +68,7 @@ def test_g_sensitivity_over_temperature_is_within_its_sigma():
         fit = fit_triad(known_rates(seed, made=strained), POLYNOMIAL, 0.02, ALL, walk=1e-6)
         z.append((fit.terms.at(AT) - true) / fit.sigma(AT))
     z = np.array(z)
-    assert fit.told.all()
+    assert fit.observable.all()
     assert fit.names[12:14] == ("g-sensitivity xx", "g-sensitivity xy")
     assert np.max(fit.sigma(AT)[:, 12:]) < 2e-6  # 0.001 deg/s/g
     for part in (z[..., :12], z[..., 12:]):
@@ -82,7 +82,7 @@ def test_g_sensitivity_over_temperature_is_within_its_sigma():
 def test_g_sensitivity_goes_with_the_bias_where_no_axis_points_both_ways():
     """Of b + G f with f along +x, +y, +z alone, one sum an axis stays open: the error of all four has it."""
     fit = fit_triad(known_rates(made=strained, ways=(1,)), POLYNOMIAL, 0.02, ALL, walk=1e-6)
-    assert np.sum(~fit.told[12:]) == 3
+    assert np.sum(~fit.observable[12:]) == 3
     assert np.all(fit.sigma(AT)[:, :3] > 0.4 * 1.78e-4 * 9.8)
     assert np.all(fit.sigma(AT)[:, 12:] > 0.4 * 1.78e-4)
     line = next(line for line in verdict(fit) if "not observable, and taken as zero" in line)
@@ -93,7 +93,7 @@ def test_g_sensitivity_goes_with_the_bias_where_no_axis_points_both_ways():
 def test_without_a_known_force_no_g_sensitivity_is_told():
     own = known_rates()
     fit = fit_triad(own, POLYNOMIAL, 0.02, ALL, walk=1e-6)
-    assert not fit.told[12:].any()
+    assert not fit.observable[12:].any()
     assert np.all(fit.terms.at(AT)[:, 12:] == 0)
     assert sum("no specific force is known; record the accelerometers too" in line for line in verdict(fit)) == 9
     plain = fit_triad(own, POLYNOMIAL, 0.02, walk=1e-6)
@@ -161,9 +161,9 @@ def test_the_file_has_terms_and_joint_error_of_the_fit():
 
 def test_what_a_turntable_about_two_axes_does_not_tell_stands_in_the_verdict():
     fit = fit_triad(known_rates(axes=(0, 1)), POLYNOMIAL, 0.02)
-    assert [TERMS[j] for j in np.flatnonzero(~fit.told)] == ["misalignment xz", "misalignment yz", "scale z"]
-    assert np.all(fit.terms.at(AT)[:, ~fit.told] == 0)
-    assert np.all(fit.sigma(AT)[:, ~fit.told] > 0.009)  # its usual size
+    assert [TERMS[j] for j in np.flatnonzero(~fit.observable)] == ["misalignment xz", "misalignment yz", "scale z"]
+    assert np.all(fit.terms.at(AT)[:, ~fit.observable] == 0)
+    assert np.all(fit.sigma(AT)[:, ~fit.observable] > 0.009)  # its usual size
     lines = verdict(fit)
     assert sum("no segment turns about z; add segments about z" in line for line in lines) == 3
 
@@ -176,15 +176,15 @@ def test_one_rate_about_an_axis_leaves_its_scale_and_the_bias_one():
         POLYNOMIAL,
         0.02,
     )
-    assert not fit.told[TERMS.index("scale z")]
-    assert fit.told[:3].all()
+    assert not fit.observable[TERMS.index("scale z")]
+    assert fit.observable[:3].all()
     assert np.all(fit.sigma(AT)[:, 2] > 0.5 * 0.01 * np.deg2rad(100))  # an unobservable scale counts in the bias
 
 
 def test_faces_alone_tell_no_misalignment():
     faces = np.repeat(np.vstack([np.eye(3), -np.eye(3)]), 2, axis=0)
     fit = fit_triad(placed_forces(up=faces), POLYNOMIAL, 0.5)
-    assert [TERMS[j] for j in np.flatnonzero(fit.free & ~fit.told)] == [
+    assert [TERMS[j] for j in np.flatnonzero(fit.free & ~fit.observable)] == [
         "misalignment xy", "misalignment xz", "misalignment yz",
     ]  # fmt: skip
     assert "add some tilted by 45 deg between the two" in verdict(fit)[0]
@@ -206,7 +206,11 @@ def test_a_part_of_the_stimulus_at_one_temperature_tells_no_change():
     fit = fit_triad(
         KnownRates(*(v[some] for v in (whole.u, whole.y, whole.temperatures, whole.times))), POLYNOMIAL, 0.02
     )
-    assert [TERMS[j] for j in np.flatnonzero(fit.untold_changes)] == ["misalignment xy", "scale y", "misalignment zy"]
+    assert [TERMS[j] for j in np.flatnonzero(fit.unobservable_changes)] == [
+        "misalignment xy",
+        "scale y",
+        "misalignment zy",
+    ]
     sigma = fit.sigma(AT)[:, TERMS.index("scale y")]
     assert sigma[1] < 1e-4 < 5e-3 < sigma[0]
     assert "change from -20.0 to 60.0 °C: not observable for misalignment xy, scale y" in verdict(fit)[-1]
@@ -236,7 +240,7 @@ def test_a_stimulus_whose_input_is_not_what_it_says_tells_nothing():
     rng = np.random.default_rng(0)
     wrong = KnownRates(own.u, rng.normal(0, 2.0, own.y.shape), own.temperatures, own.times)
     fit = fit_triad(wrong, POLYNOMIAL, 0.02)
-    assert not fit.told.any()
+    assert not fit.observable.any()
     assert np.all(fit.sigma(AT) > 0.4 * fit.usual)
     assert len(verdict(fit)) >= 12
 

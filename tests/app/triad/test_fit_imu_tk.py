@@ -53,9 +53,9 @@ def test_hand_placements_agree_with_imu_tk(xsens):
     stimulus = POSITIONS.inputs([chunk], "accel", Site(), (9.8, 0.01))
     fit = fit_triad(stimulus, SPLINE, 0.5)
     terms, sigma = fit.terms.at(np.array([25.0]))[0], fit.sigma(np.array([25.0]))[0]
-    assert fit.told.sum() == 9
+    assert fit.observable.sum() == 9
     assert cost(terms) < 1.02 * cost(published("accel"))
-    apart = np.abs(terms - published("accel"))[fit.told] / sigma[fit.told]
+    apart = np.abs(terms - published("accel"))[fit.observable] / sigma[fit.observable]
     assert np.all(apart < 3)
     assert np.median(apart) < 1.5
 
@@ -64,6 +64,6 @@ def test_hand_placements_agree_with_imu_tk(xsens):
     fit = fit_triad(turned, SPLINE, np.deg2rad(1.0))
     terms, sigma = fit.terms.at(np.array([25.0]))[0], fit.sigma(np.array([25.0]))[0]
     apart = (np.abs(terms - published("gyro")) / sigma)[3:]  # imu_tk's bias is that of the first rest alone
-    assert fit.told.all()
+    assert fit.observable.all()
     assert np.all(apart < 2)
     assert np.all(sigma[3:] < 1.5e-3)
