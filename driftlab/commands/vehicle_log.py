@@ -241,19 +241,23 @@ def sensors_of(product: str, recordings: Sequence[str], site: Mapping[str, str])
     Raises
     ------
     ConfigError
-        If a log is there twice, or two devices have one number.
+        If a log is there twice, or two devices have one number, or one id.
     """
     rest = {name: topic for name, topic in PLATFORMS[product].topics.items() if product != "px4_log" and name in HELD}
     more = {name: f"{topic.name}.{topic.axes[0]}" for name, topic in rest.items()}  # or their rows are not read
     source = _config(product, site, more).source
     assert isinstance(source, FileSource)
+    _check_twice(recordings)
     found = dict[tuple[str, str | int], LogSensor]()
     for name in recordings:
         for one in _in_log(product, source, name):
-            key = one.channel, one.device or one.number
-            before = found.get(key)
+            before = found.get(key := (one.channel, one.device or one.number))
+            if before is not None and name in before.recordings:
+                raise ConfigError(
+                    f"{name}: has the device id {one.device} as {before.name} and as {one.name}, two sensors were "
+                    "expected to have two; use fit-map with a config for each"
+                )
             found[key] = one if before is None else before.beside(one)
-    _check_twice(recordings)
     order, first = list(PLATFORMS[product].topics), dict[str, LogSensor]()
     for one in found.values():
         if (other := first.setdefault(one.name, one)) is not one:

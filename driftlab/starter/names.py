@@ -37,8 +37,9 @@ UNITS = {
 COUNTS = {"lsb", "lsbs", "raw", "adc", "cnt", "cnts", "counts", "digits"}
 """Last words of the names of values as a converter gives them."""
 SCALE = re.compile(
-    r"[(\[{,_]?\s*(?:(?P<per>\d+(?:[.,]\d+)?)\s*(?:LSB|counts?|digits?)\s*(?:/|per)\s*(?P<unit>[^\]}]+?)|"
-    r"(?P<size>\d+(?:[.,]\d+)?(?:e-?\d+)?)\s*(?P<each>[^\[({]+?)\s*(?:/|per)\s*(?:LSB|count|digit))\s*[)\]}]?$",
+    r"[(\[{,_]?\s?(?<!\d)(?<!\d[.,])(?:(?P<per>\d{1,9}(?:[.,]\d{1,12})?)\s?(?:LSB|counts?|digits?)\s?(?:/|per)\s?"
+    r"(?P<unit>[^\]}]{1,40}?)|(?P<size>\d{1,9}(?:[.,]\d{1,12})?(?:e-?\d{1,2})?)\s?(?P<each>[^\[({]{1,40}?)\s?(?:/|per)"
+    r"\s?(?:LSB|count|digit))\s?[)\]}]?$",
     re.I,
 )  # of a count, as [131 LSB/(deg/s)] or (0.0305 deg/s/LSB)
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}

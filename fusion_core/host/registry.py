@@ -115,8 +115,9 @@ class Registry:
     def kinds(self, contract: type[Plugin]) -> list[str]:
         """Return the kinds of a family's plugins; one that was not loaded yet may turn out to be broken."""
         name = self.family_of(contract).name
-        loaded = {e.kind for e in self._entries if e.family == name and e.plugin}
-        return sorted(loaded | {kind for family, kind in self._waiting if family == name})
+        with self._lock:  # what another thread is loading is in neither
+            loaded = {e.kind for e in self._entries if e.family == name and e.plugin}
+            return sorted(loaded | {kind for family, kind in self._waiting if family == name})
 
     def find(self, contract: type[Plugin], kind: str) -> type[Plugin] | None:
         """Return the plugin of a family and kind; None where there is none that works."""

@@ -160,6 +160,9 @@ def test_what_it_cannot_use_is_said(folder, tmp_path):
         driftlab.vehicle(tmp_path / "a.csv")
     with pytest.raises(ConfigError, match="export c: is no autopilot's"):
         driftlab.vehicle(folder / "soak.ulg", export="c")
+    one_id = px4(tmp_path / "one_id.ulg", gyros=(GYROS[0], GYROS[0]))
+    with pytest.raises(ConfigError, match=f"has the device id {GYROS[0]} as gyro 0 and as gyro 1"):
+        driftlab.vehicle(one_id)
     with pytest.raises(ConfigError, match="instance: is of one sensor"):
         driftlab.vehicle(folder / "soak.ulg", settings={"instance": 1})
 

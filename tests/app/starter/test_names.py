@@ -1,5 +1,7 @@
 """Names of columns as loggers, data sheets and messages write them, and the channel that each means."""
 
+from time import process_time
+
 import pytest
 
 from driftlab.starter.names import named, read_name
@@ -20,11 +22,19 @@ from driftlab.starter.names import named, read_name
     ("t_s", "time", None, "s"),
     ("timestamp_utc", "time", None, None), ("Time [ns]", "time", None, "ns"),
     ("gyro_bias_x", None, "x", None), ("bias_truth_x", None, "x", None), ("mag_x", None, "x", None),
+    ("Gyro,131 LSB/(deg/s)", "gyro", None, "0.00763358779 deg/s"), ("ax 4.88e-4 g per LSB", "accel", "x", "0.000488 g"),
     ("pressure", None, None, None), ("ppm", None, None, None), ("index", None, None, None),
 ])  # fmt: skip
 def test_a_name_says_quantity_axis_and_unit(path, quantity, axis, unit):
     name = read_name(path)
     assert (name.quantity, name.axis if quantity else axis, name.unit) == (quantity, axis, unit)
+
+
+@pytest.mark.parametrize("path", ["1" * 999, "1" + " " * 998, "1 " * 499, "1" * 400 + " LSB/g"])
+def test_a_long_name_without_a_scale_is_read_at_once(path):
+    begin = process_time()
+    assert read_name(path).unit is None
+    assert process_time() - begin < 1
 
 
 def test_columns_of_one_sensor_go_together_whole_ones_first():

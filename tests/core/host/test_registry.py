@@ -3,8 +3,10 @@
 import subprocess
 import sys
 import types
+from concurrent.futures import ThreadPoolExecutor, wait
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from threading import Event
 from typing import Annotated, Literal
 
 import numpy as np
@@ -170,3 +172,25 @@ def test_a_config_that_names_a_built_in_plugin_which_cannot_be_loaded_says_why(m
         validate(Holder, Document(Path("c.yaml"), {"bias": {"kind": "gone"}}), registry.broken)
     with pytest.raises(ConfigError, match=r"kind 'stil' is not installed; did you mean still\?"):
         validate(Holder, Document(Path("c.yaml"), {"bias": {"kind": "stil"}}), registry.broken)
+
+
+def test_a_kind_that_another_thread_is_loading_is_not_missing(monkeypatch):
+    begun, go_on = Event(), Event()
+
+    class Slow(BuiltIn):
+        def load(self):
+            begun.set()
+            go_on.wait(10)
+            return super().load()
+
+    monkeypatch.setattr(module, "entry_points", lambda group: [Slow("still", "fusion_plugins.bias_models.still", "x")])
+    registry = Registry()
+    registry.load()
+    with ThreadPoolExecutor() as threads:
+        loading = threads.submit(registry.find, BiasModel, "still")
+        assert begun.wait(10)
+        kinds = threads.submit(registry.kinds, BiasModel)
+        wait([kinds], 0.1)
+        go_on.set()
+        assert kinds.result(10) == ["still"]
+        assert loading.result(10) is Still
