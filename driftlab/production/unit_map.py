@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.commands.run import RunResult, run
+from driftlab.commands.triad_map import TriadMapResult, fit_triad_map
 from driftlab.config import Config, with_recording
 from driftlab.evaluation.limits import SIDE
 from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
@@ -66,6 +67,7 @@ class UnitMap:
     settings: ThermalMap  # of its fit
     soak: GatheredSoak  # the samples
     verdict: MapVerdict
+    triad: TriadMapResult | None = None  # its terms, where it has a stimulus
 
     @property
     def fitted(self) -> FittedMap:
@@ -105,13 +107,21 @@ class UnitMap:
             return path.read_bytes()
 
 
-def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMap:
-    """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
+def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus: Sequence[str] = ()) -> UnitMap:
+    """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`.
+
+    With recordings of a stimulus it has scale factor and misalignment beside the bias of the soaks.
+    """
     settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, soak)
+    triad = None
+    if stimulus:
+        with_bias = _with_map(config, settings, fitted)
+        triad = fit_triad_map(with_bias, stimulus, "scale,misalignment", None, None, None)
+        fitted = triad.map
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
-    return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict)
+    return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict, triad)
 
 
 def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
