@@ -31,7 +31,8 @@ def own_matrix(seed):
 def write_stimulus(folder, name, seed, matrix, temperatures=TEMPERATURES, axes=range(3)):
     """Write the recording of a horizontal turntable, and the table of its segments beside the config."""
     t, gyro, T, table = turntable(seed, temperatures, hold=8.0, matrix=matrix, axes=axes)
-    family.write(folder / name, {"time": t, "gyro": gyro, "accel": np.zeros_like(gyro), "temperature": T})
+    accel = np.random.default_rng(seed).normal([0.0, 0.0, 9.8], 0.01, gyro.shape)
+    family.write(folder / name, {"time": t, "gyro": gyro, "accel": accel, "temperature": T})
     (folder / "table.csv").write_text(table)
 
 
