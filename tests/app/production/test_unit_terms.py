@@ -6,12 +6,16 @@ from pathlib import Path
 import family
 import fleets
 import numpy as np
+import other_families
 import polars as pl
 import pytest
 from turned_units import matrix_of, turntable
 
 from driftlab.config import load_config
 from driftlab.errors import ConfigError
+from driftlab.family.mixed_model import fit_family
+from driftlab.family.outliers import find_outliers
+from driftlab.family.record import TERM_FIGURES, Figure
 from driftlab.production import fleet as job
 from driftlab.production import units_pass
 from driftlab.production.unit import Task, key_of, work
@@ -73,7 +77,7 @@ def off_by(record, matrix):
 def test_terms_are_as_far_from_the_truth_as_their_deviations_say(folder, tmp_path):
     z = []
     (tmp_path / "soak.h5").write_bytes((folder / "soak.h5").read_bytes())
-    for seed in (11, 12, 13):
+    for seed in (11, 12):
         write_stimulus(tmp_path, "turned.h5", seed, own_matrix(seed))
         record = work(task(tmp_path)).record
         assert record.state == "done", record.error
@@ -131,16 +135,13 @@ def test_another_table_of_segments_is_another_unit(folder, tmp_path):
     assert units_pass.stamp_of(task(tmp_path), "1") != stamp != ""
 
 
-def test_an_odd_scale_factor_is_the_reason(tmp_path, monkeypatch):
-    """Of twelve units one has a scale factor off by 12 times their spread, and no other stands out for a term."""
-    count, odd = 12, 7
+def test_a_fleet_has_the_terms_in_its_table_and_its_summary(tmp_path, monkeypatch):
+    count = 2
     units = fleets.write_fleet(tmp_path, count, lots=1)
     rows = (tmp_path / "units.csv").read_text().splitlines()
     rows = ["unit,role,path", *(f"{row.split(',')[0]},soak,{row.split(',')[1]}" for row in rows[1:])]
     for k, unit in enumerate(units):
-        matrix = own_matrix(k)
-        more = 12 * SPREAD * np.diag([0.0, k == odd, 0.0])
-        write_stimulus(tmp_path, f"{unit.name}.h5", k, lambda T, M=matrix, more=more: M(T) + more)
+        write_stimulus(tmp_path, f"{unit.name}.h5", k, own_matrix(k))
         rows.append(f"{unit.name},stimulus,{unit.name}.h5")
     (tmp_path / "units.csv").write_text("\n".join(rows))
     (tmp_path / "family.yaml").write_text(TEXT)
@@ -148,34 +149,77 @@ def test_an_odd_scale_factor_is_the_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(units_pass, "Pool", lambda workers: fleets.Here())
     job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
     told = json.loads(Path("made/fleet.json").read_text())
-    named = {unit: "; ".join(why) for unit, why in told["family"]["odd"].items()}
-    of_terms = {unit: why for unit, why in named.items() if "scale factor" in why or "misalignment" in why}
-    assert list(of_terms) == [units[odd].name], named
-    assert "error of the scale factor of y is" in of_terms[units[odd].name]
-    assert "ppm, of most units" in of_terms[units[odd].name]
     assert told["terms"]["units"] == count
-    true = np.array([np.diag(own_matrix(k)(20.0))[0] for k in range(count)])
-    assert told["terms"]["scale x"]["median"] == pytest.approx(np.median(true), abs=2e-4)
-    assert 0.3 * SPREAD < told["terms"]["misalignment xy"]["spread"] < 3 * SPREAD
-    assert any(line.startswith("scale factor and misalignment of 12 units") for line in told["lines"])
-    table = pl.read_parquet("made/units.parquet").filter(pl.col("unit") == units[odd].name)
-    of_odd = own_matrix(odd)(20.0) + 12 * SPREAD * np.diag([0.0, 1.0, 0.0])
-    sigma = table["scale_factor_sigma"].to_numpy()
-    assert np.all(np.abs(table["scale_factor"].to_numpy() - np.diag(of_odd)) < 4.5 * sigma)
+    true = np.array([own_matrix(k)(20.0) for k in range(count)])
+    for name, i, j in (("scale x", 0, 0), ("misalignment xy", 0, 1), ("misalignment zx", 2, 0)):
+        assert told["terms"][name]["median"] == pytest.approx(np.median(true[:, i, j]), abs=2e-4)
+        spread = 1.4826 * abs(true[0, i, j] - true[1, i, j]) / 2
+        assert told["terms"][name]["spread"] == pytest.approx(spread, abs=3e-4)
+    assert any(line.startswith("scale factor and misalignment of 2 units") for line in told["lines"])
+    table = pl.read_parquet("made/units.parquet").filter(pl.col("unit") == units[1].name)
+    off = table["scale_factor"].to_numpy() - np.diag(true[1])
+    assert np.all(np.abs(off) < 4.5 * table["scale_factor_sigma"].to_numpy())
     assert table["misalignment_x"].to_list()[0] is None
+
+
+def units_with_terms(seed, count=30):
+    """Units as of a family, with terms that spread by SPREAD and are known to a tenth of it; the soak says nothing."""
+    units = other_families.deal("polynomial", count, seed)
+    rng = np.random.default_rng([5, seed])
+    pairs, records = [], []
+    for unit in units:
+        M, sigma = rng.normal(0.002, SPREAD, (4, 1)), 0.1 * SPREAD
+        M += sigma * rng.normal(size=M.shape)
+        terms = {n: Figure(value=tuple(v), sigma=(sigma,)) for n, v in zip(TERM_FIGURES, M.tolist(), strict=True)}
+        record = unit.record(seed, ("x",))
+        records.append(record.model_copy(update={"figures": {**record.figures, **terms}}))
+        pairs.append((unit.soaked(seed, ("x",)), unit.lot))
+    return pairs, records
+
+
+def with_term(record, figure, value, sigma):
+    return record.model_copy(update={"figures": {**record.figures, figure: Figure(value=(value,), sigma=(sigma,))}})
+
+
+def test_a_term_far_from_the_others_is_the_reason_and_an_unsure_one_is_none():
+    """Of either sign, and not one that is as far off but known no better; units without a term stay judged."""
+    pairs, records = units_with_terms(1)
+    records[3] = with_term(records[3], "scale_factor", 0.002 - 10 * SPREAD, 0.1 * SPREAD)
+    records[4] = with_term(records[4], "misalignment_y", 0.002 + 10 * SPREAD, 0.1 * SPREAD)
+    records[5] = with_term(records[5], "misalignment_z", 0.002 + 10 * SPREAD, 10 * SPREAD)
+    records[6] = records[6].model_copy(update={"figures": {"noise": records[6].figures["noise"]}})
+    odd = find_outliers(fit_family(pairs), pairs, records).odd
+    said = {(name, one.what): one.sentence for name, why in odd.items() for one in why if one.what in TERM_FIGURES}
+    assert set(said) == {(records[3].unit, "scale_factor"), (records[4].unit, "misalignment_y")}
+    scale = next(iter(said.values()))
+    assert scale.startswith(("error of the scale factor of gyro is -", "error of the scale factor of x is -"))
+    assert "ppm, of most units" in scale
+    assert "mrad, of most units" in said[records[4].unit, "misalignment_y"]
+
+
+def test_hardly_an_ordinary_unit_is_odd_for_a_term():
+    found = 0
+    for seed in range(20, 26):
+        pairs, records = units_with_terms(seed)
+        odd = find_outliers(fit_family(pairs), pairs, records).odd
+        found += sum(any(one.what in TERM_FIGURES for one in why) for why in odd.values())
+    assert found <= 5  # of 180 units; at FALSE one of twenty families has one
 
 
 @pytest.mark.parametrize(
     ("config", "said"),
     [
         (TEXT.replace("stimulus:", "# "), "and the config no stimulus; add `stimulus: {kind: rate_table}`"),
-        (TEXT.replace("filter:\n", "filter:\n  track: accel\n"), "which is for gyros; fit other sensors"),
+        (
+            TEXT.replace("filter:\n", "filter:\n  track: accel\n").replace("residual: 3 deg/h, ", ""),
+            "which is for gyros; fit other sensors",
+        ),
     ],
     ids=["no stimulus", "accelerometers"],
 )
 def test_a_stimulus_that_the_config_does_not_know_is_refused(tmp_path, config, said):
     (tmp_path / "units.csv").write_text("unit,role,path\n1,soak,a.h5\n1,stimulus,b.h5\n")
-    (tmp_path / "line.yaml").write_text(config.replace("# {", "# {"))
+    (tmp_path / "line.yaml").write_text(config)
     with pytest.raises(ConfigError, match="unit 1 has a recording of the role stimulus") as error:
         job.fleet(load_config(tmp_path / "line.yaml"), str(tmp_path / "units.csv"), tmp_path / "made")
     assert said in str(error.value)
