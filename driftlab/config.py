@@ -147,7 +147,7 @@ class Config(Settings):
 
     def files_to_fit(self) -> list[Path]:
         """Return the files that a fit of the tracked sensor's map reads, a stimulus's tables among them."""
-        given = () if self.stimulus is None else vars(self.stimulus).values()
+        given: Iterable[Any] = () if self.stimulus is None else vars(self.stimulus).values()
         tables = (path for value in given for path in (value if isinstance(value, tuple) else (value,)))
         return [*self._files(self._other_maps()), *(path for path in tables if isinstance(path, Path))]
 

@@ -316,12 +316,12 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
                 )
                 odd.append(LotOutlier(name, SHAPE, called, T, sentence))
     for name, axis, lot_name, times in tests.lots:
-        off = f"{times:.2g} times that of"
+        differs = f"{times:.2g} times that of"
         if name in TERM_FIGURES:
             shown = _shown(name, unit)
-            off = f"{_number(times, shown)} {shown.shown} off"
+            differs = f"{_number(times, shown)} {shown.shown} off"
         sentence = (
-            f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {off} the other lots; its "
+            f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
             f"{tests.of_lots.count(lot_name)} units are held against one another"
         )
         odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))

@@ -55,7 +55,8 @@ class UnitRecords:
         lot, date, more, channel, bias_unit, axes, driftlab, limits = common
         low, high, hours, samples, seconds, *rest = np.frombuffer(content).tolist()
         cells, d = [None if value != value else value for value in rest], len(axes)
-        figures, names = {}, HELD[: len(cells) // max(2 * d, 1)]
+        figures = {}
+        names = HELD[: len(cells) // max(2 * d, 1)]
         for k, name in enumerate(names):
             value, sigma = (tuple(cells[(part * len(names) + k) * d :][:d]) for part in (0, 1))
             figures[name] = Figure.model_construct(value=value, sigma=sigma)
