@@ -31,7 +31,6 @@ from driftlab.family.unit_noise import Densities, soaked_of
 from driftlab.production.manifest import ManifestEntry
 from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map, repeated
-from driftlab.production.unit_terms import figures_of_terms
 from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.certificate import Certificate
 from driftlab.reports.provenance import map_facts, sheet_of
@@ -181,8 +180,6 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if len(soaks) > 1:
         names = dict(zip(task.recordings[CALIBRATION], soaks, strict=True))
         repeats, notes = repeated(config, names, recordings.get(HOLDOUT, ()))
-    terms = {} if unit.triad is None else figures_of_terms(unit.triad.fit)
-    of_terms = [] if unit.triad is None else unit.triad.lines()
     record: dict[str, Any] = {
         "state": "done",
         "channel": fitted.record.channel,
@@ -191,7 +188,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "domain": fitted.domain,
         "hours": sum(float(part.span.sum()) for part in rows) / 3600,
         "samples": len(unit.soak.T),
-        "figures": {**figures_of(fitted, soaked, densities), **run.figures, **terms},
+        "figures": {**figures_of(fitted, soaked, densities), **run.figures, **unit.terms()},
         "coast_of": str(run.name)
         if isinstance(run.name, CopyName) or not run.name
         else os.path.relpath(run.name, task.folder),
@@ -199,7 +196,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "repeats": repeats,
         "map_sigma": None if good is None else tuple(good.tolist()),
         "map_file": unit.file,
-        "verdict": [*unit.verdict.sentences(unit.bias_unit), *of_terms],
+        "verdict": unit.sentences(),
         "limits": run.limits,
         "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes, *notes],
         "plugins": participants(unit.config),

@@ -39,6 +39,7 @@ from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, usual_settings
 from driftlab.maps.residual import AVERAGED
+from driftlab.production.unit_terms import figures_of_terms
 from driftlab.soak.blocks import means, runs
 from driftlab.spc.charts import LEVEL
 from driftlab.storage.json import plain
@@ -98,6 +99,14 @@ class UnitMap:
         if self.settings.outside != "refuse":
             return self.config
         return _with_map(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
+
+    def terms(self) -> dict[str, Figure]:
+        """Return its scale factors and misalignments; empty without a stimulus."""
+        return {} if self.triad is None else figures_of_terms(self.triad.fit)
+
+    def sentences(self) -> list[str]:
+        """Return the verdict on it in sentences, and what its stimulus does not tell."""
+        return [*self.verdict.sentences(self.bias_unit), *([] if self.triad is None else self.triad.lines())]
 
     def content(self) -> bytes:
         """Return the content of its file."""
