@@ -146,8 +146,10 @@ class Config(Settings):
         return self._files(self.maps())
 
     def files_to_fit(self) -> list[Path]:
-        """Return the files that a fit of the tracked sensor's map reads: all of them but for that map."""
-        return self._files(self._other_maps())
+        """Return the files that a fit of the tracked sensor's map reads, a stimulus's tables among them."""
+        given: Iterable[Any] = () if self.stimulus is None else vars(self.stimulus).values()
+        tables = (path for value in given for path in (value if isinstance(value, tuple) else (value,)))
+        return [*self._files(self._other_maps()), *(path for path in tables if isinstance(path, Path))]
 
     def _files(self, maps: Iterable[ThermalMap]) -> list[Path]:
         recording = self.source.path if isinstance(self.source, FileSource) else None

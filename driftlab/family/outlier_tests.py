@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.reml import WEIGHT
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
@@ -39,8 +39,21 @@ WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
 SEEN = 1e-6  # of the largest information of a soak on a bump: on one with less it has none
 MAX_OWN = 0.9  # of Sigma, that a unit may have been
 CURVES = ("level", "scale", "bump", "curve")  # statistics of the curve of an axis
-FIGURES = ("residual", "noise", "walk", "coast", "hysteresis", "soaks")  # not the swing: it is the curve's
-TWO_SIDED = ("level", "scale", "noise")  # a sensor may be too quiet; of other figures less is only better
+FIGURES = (
+    "residual",
+    "noise",
+    "walk",
+    "coast",
+    "hysteresis",
+    "soaks",
+    *TERM_FIGURES,
+)  # not the swing: it is the curve's
+TWO_SIDED = (
+    "level",
+    "scale",
+    "noise",
+    *TERM_FIGURES,
+)  # a sensor may be too quiet; of other figures less is only better
 OF_NOISE = ("hysteresis", "soaks")  # compared with noise alone, where other units do not show the usual
 SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than its estimate
 MIN_UNITS_OF_LOT, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
@@ -163,7 +176,8 @@ class Tests:
     of_lots : list of str
         The units' lots.
     lots : list of (str, int, str, float)
-        Figures of lots that are off as a whole: figure, axis, lot, and how many times that of the others it is.
+        Figures of lots that are off as a whole: figure, axis, lot, and how many times that of the others it is; of a
+        term of M by how much it is off, SI.
     """
 
     names: list[str]
@@ -218,9 +232,14 @@ def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[li
 
 
 def _times(name: str, law: FigureLaw, axis: int, off: dict[str, float]) -> list[tuple[str, float]]:
-    """Return lots that are `off` in a figure of an axis, and how many times that of the other lots it is."""
+    """Return lots that are `off` in a figure of an axis, and how many times that of the other lots it is.
+
+    Of a term of M, which has a sign, by how much it is off.
+    """
     usual, *shifted = (unscaled(name, law.centre[axis] + by, law.usual[axis]) for by in (0.0, *off.values()))
-    return [(lot, size / usual) for lot, size in zip(off, shifted, strict=True)]
+    return [
+        (lot, size - usual if name in TERM_FIGURES else size / usual) for lot, size in zip(off, shifted, strict=True)
+    ]
 
 
 def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLaw | None, list[dict[str, float]]]:
@@ -284,8 +303,10 @@ def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array,
 
     A density of white noise is known to a few percent and compared by its logarithm. All others are roots of sums of
     few squares, whose power 2/3 is about normal (Wilson and Hilferty 1931) also where little or nothing shows; what
-    noise makes is compared with what noise lets expect.
+    noise makes is compared with what noise lets expect. A term of M is compared as it is.
     """
+    if name in TERM_FIGURES:
+        return values / usual, sigma / usual
     known = np.isfinite(values)
     x = np.where(known, values, np.nan)
     if name in OF_NOISE:
@@ -299,6 +320,8 @@ def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array,
 
 def unscaled(name: str, x: float, usual: float) -> float:
     """Return the figure of an ordinary unit, of one in the scale of `scaled`."""
+    if name in TERM_FIGURES:
+        return usual * x
     return usual * (float(np.exp(x)) if name in LOGARITHMIC else max(x, 0.0) ** 1.5)
 
 
@@ -317,7 +340,7 @@ def _of_noise(columns: Array, times: float) -> Array:
 
 def _usual(name: str, values: Array, sigma: Array) -> float:
     """Return the usual size of a figure (n,); of one that shows in less than half of the units what would just show."""
-    of = sigma if name in OF_NOISE else values
+    of = sigma if name in OF_NOISE else np.abs(values)
     known = np.isfinite(of)
     usual = float(np.median(of[known])) if np.any(known) else 1.0
     if usual > 0:

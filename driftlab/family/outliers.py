@@ -26,6 +26,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from driftlab.evaluation.limits import OF_M
 from driftlab.family.bands import deviation
 from driftlab.family.mixed_model import Family
 from driftlab.family.outlier_tests import (
@@ -41,14 +42,14 @@ from driftlab.family.outlier_tests import (
     unscaled,
 )
 from driftlab.family.partitions import FamilyUnits, in_partitions
-from driftlab.family.record import PER, UnitRecord, figure_name
+from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
 FOLLOWS = {
-    "soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")),
+    "soaks": (*CURVES, *(name for name in FIGURES if name not in ("soaks", *TERM_FIGURES))),
     "hysteresis": ("walk", "residual", "coast"),
 }
 """Tests that an odd figure makes odd too, and that are not reported: a joint fit takes it for a walk."""
@@ -247,16 +248,16 @@ class _Words:
         return Outlier(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)
 
     def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
-        tests, factor = self.tests, self.unit.factor
+        tests, shown = self.tests, _shown(what, self.unit)
         value = float(tests.values[k, tests.what.index((what, axis))])
-        size, called = f"{value * factor:.3g} {self.unit.shown}{PER.get(what, '')}", self._axis(axis)
+        size, called = f"{_number(value, shown)} {shown.shown}{PER.get(what, '')}", self._axis(axis)
         law = tests.laws.figures.get(what)
         low, middle, high = (np.nan,) * 3 if law is None else _usual(what, law, axis)
         sentence = {
             "hysteresis": f"{called} differs by {size} between warming and cooling",
             "soaks": f"two soaks differ more than one unit can: by {size} on {called}",
         }.get(what, f"{figure_name(what)} of {called} is {size}")
-        of_most = f"of most units {low * factor:.3g} to {high * factor:.3g}"
+        of_most = f"of most units {_number(low, shown)} to {_number(high, shown)}"
         sentence += ", more than noise explains" if law is None else f", {of_most}"
         return Outlier(
             tests.names[k], what, self.family.axes[axis], p, value, middle, (high - low) / 4, None, sentence, fine
@@ -266,6 +267,17 @@ class _Words:
         """Return the name of an axis: its letter, or its channel where it is the only one."""
         family = self.family
         return family.axes[axis] if len(family.axes) > 1 else axis_name(family.channel, family.axes[axis])
+
+
+def _shown(what: str, unit: BiasUnit) -> BiasUnit:
+    """Return the unit in which a figure is shown, but for PER: that of the bias, or of a term of M."""
+    return OF_M["misalignment" if what != TERM_FIGURES[0] else "scale"] if what in TERM_FIGURES else unit
+
+
+def _number(value: float, shown: BiasUnit) -> str:
+    """Return a figure in the unit in which it is shown; ppm without an exponent."""
+    size = value * shown.factor
+    return f"{size:.0f}" if shown is OF_M["scale"] and abs(size) >= 1000 else f"{size:.3g}"
 
 
 def _usual(what: str, law: FigureLaw, axis: int) -> tuple[float, float, float]:
@@ -304,8 +316,12 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
                 )
                 odd.append(LotOutlier(name, SHAPE, called, T, sentence))
     for name, axis, lot_name, times in tests.lots:
+        differs = f"{times:.2g} times that of"
+        if name in TERM_FIGURES:
+            shown = _shown(name, unit)
+            differs = f"{_number(times, shown)} {shown.shown} off"
         sentence = (
-            f"lot {lot_name}: {name} of {family.axes[axis]} is {times:.2g} times that of the other lots; its "
+            f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
             f"{tests.of_lots.count(lot_name)} units are held against one another"
         )
         odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))

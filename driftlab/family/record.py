@@ -55,12 +55,17 @@ RoundedCovariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_
 FIGURES = ("residual", "noise", "walk", "swing", "coast")
 """Figures of each axis on the charts of a line: rms of 30 s averages about the own map, densities of white noise and of
 the walk, largest less smallest bias of the map, rms of the error of 10 min without a measurement."""
+TERM_FIGURES = ("scale_factor", "misalignment_x", "misalignment_y", "misalignment_z")
+"""Terms of M of each axis in the middle of the temperatures of a stimulus: the error of its scale factor, and the parts
+of the input along x, y and z that it reads. The figures `scale_factor_change`, ... are their changes over these."""
 PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}  # of the unit of a figure, beside that of the bias
 
 
 def figure_name(figure: str) -> str:
     """Return the name of a figure for people, where files have another."""
-    return {"coast": "prediction"}.get(figure, figure)
+    if figure in TERM_FIGURES[1:]:
+        return f"misalignment to {figure[-1]}"
+    return {"coast": "prediction", "scale_factor": "error of the scale factor"}.get(figure, figure)
 
 
 class Figure(BaseModel):
@@ -131,7 +136,8 @@ class UnitRecord(Figures):
         Of recordings at rest.
     samples : int
     figures : dict of str to Figure
-        FIGURES by name; `coast_1min`, `coast_5min`, `coast_end` too.
+        FIGURES by name; `coast_1min`, `coast_5min`, `coast_end` too, and of a unit with a stimulus TERM_FIGURES and
+        their changes, None where the stimulus does not tell them.
     coast_of : str
         Which recording was predicted.
     coast_in_sample : bool

@@ -23,6 +23,8 @@ from driftlab.production.result import FleetResult
 from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, fleet_folder, stored_units
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
+from driftlab.production.unit import STIMULUS
+from driftlab.production.unit_terms import terms_of_units
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.recordings.identity import sha256
 from driftlab.spc.acknowledgements import (
@@ -167,10 +169,28 @@ def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifes
     manifest = read_manifest(units)
     # which refuses a source of no files
     with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])
+    _check_stimulus(config, manifest)
     options.check_pages(manifest)
     options.check_columns(manifest)
     author = checked(options.notes, options.operator, [entry.unit for entry in manifest.units])
     return manifest, replace(options, operator=author)
+
+
+def _check_stimulus(config: Config, manifest: Manifest) -> None:
+    """Raise ConfigError where units have a stimulus, and the config describes none or is not that of gyros.
+
+    An accelerometer's bias in a soak holds the terms of gravity, so that it must be fitted together with them.
+    """
+    unit = next((entry.unit for entry in manifest.units if STIMULUS in entry.recordings), None)
+    if unit is None:
+        return
+    has = f"--units {manifest.name}: unit {quote(unit)} has a recording of the role stimulus"
+    if config.filter is None or config.filter.tracked.channel != "gyro":
+        raise ConfigError(
+            f"{has}, which is for gyros; fit other sensors with `driftlab fit-map --terms bias,scale,misalignment`"
+        )
+    if config.stimulus is None:
+        raise ConfigError(f"{has}, and the config no stimulus; add `stimulus: {{kind: rate_table}}` with its segments")
 
 
 @contextmanager
@@ -333,6 +353,7 @@ class _Command:
             limits=status.limits,
             acceptance=status.acceptance,
             pass_with_hysteresis=status.beside,
+            terms=terms_of_units(status.done),
             yields=self.yields,
             gauge=self.gauge,
             acknowledgements=self.notes,

@@ -37,6 +37,7 @@ ROLES = {
     "train": "train",
     "test": "holdout",
     "holdout": "holdout",
+    "stimulus": "stimulus",
 }
 COLUMNS = ("unit", "role", "path", "lot", "date")  # those with a meaning here
 CELLS = 10 * COUNT
@@ -51,7 +52,7 @@ class ManifestEntry:
     unit: str
     lot: str = ""
     date: str = ""  # ISO 8601
-    recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by role: calibration, train, holdout
+    recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by role, one of ROLES
     more: Mapping[str, str] = field(default_factory=dict)  # the other columns
     of_soaks: tuple[Mapping[str, str], ...] = ()  # the same of each soak, where it has several
 
@@ -192,7 +193,7 @@ def _mistakes_of(row: Mapping[str, str]) -> Iterator[str]:
     if why := _name_mistake(unit):
         yield f"unit '{quote(unit)}' {why}; name it otherwise"
     if role not in ROLES:
-        yield f"role '{quote(role)}' is not known; write calibration (or soak), train or holdout"
+        yield f"role '{quote(role)}' is not known; write calibration (or soak), train, holdout or stimulus"
         return
     if not row["path"]:
         yield f"unit {quote(unit)} has no path; name its recording"

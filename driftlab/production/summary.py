@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 
 from driftlab import __version__
 from driftlab.commands.console import session, terminal
+from driftlab.production.unit_terms import sentence_of
 from driftlab.spc.acknowledgements import Acknowledgement
 from driftlab.spc.gauge_study import GaugeStudy
 from driftlab.spc.yields import Yield
@@ -155,6 +156,7 @@ class FleetSummary(BaseModel):
     limits: dict[str, int] = {}
     acceptance: Annotated[str, Field(exclude=True)] = ""
     pass_with_hysteresis: int = 0
+    terms: dict[str, Any] | None = None
     yields: Annotated[Yield | None, Field(exclude=True)] = None
     gauge: Annotated[GaugeStudy | None, Field(exclude=True)] = None
     acknowledgements: list[Acknowledgement] = []
@@ -182,7 +184,8 @@ class FleetSummary(BaseModel):
         """Return the summary in sentences, most important first."""
         family = [] if self.family is None else self.family.sentences()
         gauge = [] if self.gauge is None else self.gauge.sentences()
-        return [*self._of_units(), *self._of_the_manifest(), *self.certificates_failed, *family, *gauge]
+        terms = [] if self.terms is None else [sentence_of(self.terms)]
+        return [*self._of_units(), *self._of_the_manifest(), *self.certificates_failed, *terms, *family, *gauge]
 
     def _of_units(self) -> list[str]:
         now, done, failed = (self.counts[name] for name in ("done_now", "done", "failed"))

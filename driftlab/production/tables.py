@@ -25,7 +25,7 @@ from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import Partitions, UnitOfLot
 from driftlab.family.posterior_map import UnitPosterior, informed_where_unknown, posterior_of
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
@@ -54,7 +54,8 @@ from fusion_core.errors import UnreadableFile
 if TYPE_CHECKING:
     import polars as pl
 
-FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
+OF_TERMS = (*TERM_FIGURES, *(f"{name}_change" for name in TERM_FIGURES))
+FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end", *OF_TERMS)
 ROWS = 20_000  # of a group, which is written at once
 MOST_CURVES = 5000  # maps that the report draws
 Row = dict[str, Any]
@@ -303,6 +304,14 @@ COLUMNS: dict[str, UnitColumn] = dict([
     *_with_sigma("coast_1min", "SI", "the same of 1 min"),
     *_with_sigma("coast_5min", "SI", "the same of 5 min"),
     *_with_sigma("coast_end", "SI", "the same to the end of the recording"),
+    *_with_sigma("scale_factor", "1", "error of the scale factor, in the middle of the stimulus' temperatures"),
+    *_with_sigma("misalignment_x", "1", "part of the input along x that the axis reads, there"),
+    *_with_sigma("misalignment_y", "1", "the same along y"),
+    *_with_sigma("misalignment_z", "1", "the same along z"),
+    *_with_sigma("scale_factor_change", "1", "change of it over the stimulus' temperatures"),
+    *_with_sigma("misalignment_x_change", "1", "the same of `misalignment_x`"),
+    *_with_sigma("misalignment_y_change", "1", "the same of `misalignment_y`"),
+    *_with_sigma("misalignment_z_change", "1", "the same of `misalignment_z`"),
     ("coast_of", UnitColumn("text", "", "recording that was predicted")),
     ("coast_in_sample", UnitColumn("flag", "", "whether the own map was fitted on it")),
     ("map_sigma", UnitColumn("number", "SI", "rms of the standard deviation of the own map over its domain")),

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from driftlab.production.unit_map import CoastResult, UnitMap
     from driftlab.reports.provenance import Sheet
 
-CALIBRATION, TRAIN, HOLDOUT = "calibration", "train", "holdout"  # roles
+CALIBRATION, TRAIN, HOLDOUT, STIMULUS = "calibration", "train", "holdout", "stimulus"  # roles
 MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
 Recordings = Mapping[str, Sequence[str]]  # by role
 
@@ -171,7 +171,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     soaks = recordings.get(CALIBRATION, ())
     if not soaks:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
-    unit = fit_unit_map(config, soaks, faults)
+    unit = fit_unit_map(config, soaks, faults, recordings.get(STIMULUS, ()))
     fitted, rows = unit.fitted, unit.soak.rows(unit.fitted.record.channel)
     soaked, densities = soaked_of(task.unit, unit.axes, rows)
     run = coasted(unit, recordings.get(HOLDOUT, ()), soaks, soaked.walk)
@@ -188,7 +188,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "domain": fitted.domain,
         "hours": sum(float(part.span.sum()) for part in rows) / 3600,
         "samples": len(unit.soak.T),
-        "figures": {**figures_of(fitted, soaked, densities), **run.figures},
+        "figures": {**figures_of(fitted, soaked, densities), **run.figures, **unit.terms()},
         "coast_of": str(run.name)
         if isinstance(run.name, CopyName) or not run.name
         else os.path.relpath(run.name, task.folder),
@@ -196,7 +196,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "repeats": repeats,
         "map_sigma": None if good is None else tuple(good.tolist()),
         "map_file": unit.file,
-        "verdict": unit.verdict.sentences(unit.bias_unit),
+        "verdict": unit.sentences(),
         "limits": run.limits,
         "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes, *notes],
         "plugins": participants(unit.config),

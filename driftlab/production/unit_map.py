@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.commands.run import RunResult, run
+from driftlab.commands.triad_map import TriadMapResult, fit_triad_map
 from driftlab.config import Config, with_recording
 from driftlab.evaluation.limits import SIDE
 from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
@@ -38,6 +39,7 @@ from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, usual_settings
 from driftlab.maps.residual import AVERAGED
+from driftlab.production.unit_terms import figures_of_terms
 from driftlab.soak.blocks import means, runs
 from driftlab.spc.charts import LEVEL
 from driftlab.storage.json import plain
@@ -66,6 +68,7 @@ class UnitMap:
     settings: ThermalMap  # of its fit
     soak: GatheredSoak  # the samples
     verdict: MapVerdict
+    triad: TriadMapResult | None = None  # its terms, where it has a stimulus
 
     @property
     def fitted(self) -> FittedMap:
@@ -97,6 +100,14 @@ class UnitMap:
             return self.config
         return _with_map(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
 
+    def terms(self) -> dict[str, Figure]:
+        """Return its scale factors and misalignments; empty without a stimulus."""
+        return {} if self.triad is None else figures_of_terms(self.triad.fit)
+
+    def sentences(self) -> list[str]:
+        """Return the verdict on it in sentences, and what its stimulus does not tell."""
+        return [*self.verdict.sentences(self.bias_unit), *([] if self.triad is None else self.triad.lines())]
+
     def content(self) -> bytes:
         """Return the content of its file."""
         with tempfile.TemporaryDirectory(prefix="driftlab-", dir=IN_MEMORY) as folder:
@@ -105,13 +116,21 @@ class UnitMap:
             return path.read_bytes()
 
 
-def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMap:
-    """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
+def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus: Sequence[str] = ()) -> UnitMap:
+    """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`.
+
+    With recordings of a stimulus it has scale factor and misalignment beside the bias of the soaks.
+    """
     settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, soak)
+    triad = None
+    if stimulus:
+        with_bias = _with_map(config, settings, fitted)
+        triad = fit_triad_map(with_bias, stimulus, "scale,misalignment", None, None, None)
+        fitted = triad.map
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
-    return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict)
+    return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict, triad)
 
 
 def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:

@@ -11,9 +11,9 @@ from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 
-from driftlab.family.record import FIGURES, Figure, RepeatedSoak, UnitRecord
+from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, UnitRecord
 
-HELD = (*FIGURES, "hysteresis", "soaks")  # figures that are compared over units
+HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
 NUMBERS = 5  # before the figures: domain, hours, samples, seconds
 OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
 
@@ -43,7 +43,8 @@ class UnitRecords:
                  record.driftlab, limits)  # fmt: skip
         common = tuple(self._common.setdefault(text, text) for text in texts)
         numbers = [*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds]
-        figures = record.table(HELD, len(record.axes))
+        names = HELD if TERM_FIGURES[0] in record.figures else HELD[: -len(TERM_FIGURES)]  # of few fleets
+        figures = record.table(names, len(record.axes))
         self._briefs[unit] = _Brief(
             record.key, record.state, record.error, self._common.setdefault(common, common),
             np.concatenate([np.array(numbers, dtype=np.float64), figures.ravel()]).tobytes(), tuple(record.repeats),
@@ -55,8 +56,9 @@ class UnitRecords:
         low, high, hours, samples, seconds, *rest = np.frombuffer(content).tolist()
         cells, d = [None if value != value else value for value in rest], len(axes)
         figures = {}
-        for k, name in enumerate(HELD):
-            value, sigma = (tuple(cells[(part * len(HELD) + k) * d :][:d]) for part in (0, 1))
+        names = HELD[: len(cells) // max(2 * d, 1)]
+        for k, name in enumerate(names):
+            value, sigma = (tuple(cells[(part * len(names) + k) * d :][:d]) for part in (0, 1))
             figures[name] = Figure.model_construct(value=value, sigma=sigma)
         return UnitRecord.model_construct(
             key=key, unit=unit, lot=lot, date=date, more=dict(more), state=state, error=error, channel=channel,

@@ -29,7 +29,7 @@ from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
 from driftlab.production.store import PAGE, FleetFolder, UnitPlace
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
-from driftlab.production.unit import Task, UnitResult, certificate_of, key_of, work
+from driftlab.production.unit import STIMULUS, Task, UnitResult, certificate_of, config_of, key_of, work
 from driftlab.production.unit_records import RecordsOfUnits, UnitRecords
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
@@ -284,7 +284,9 @@ def stamp_of(task: Task, versions: str) -> str:
     """
     work = [task.config, task.explain, task.folder, {role: list(names) for role, names in task.recordings.items()}]
     try:
-        looks = [look for name in task.names for look in _looks(task.folder, name)]
+        fitted = config_of(task.config, task.folder).files_to_fit() if STIMULUS in task.recordings else []
+        names = [*task.names, *(os.path.abspath(path) for path in fitted if path.is_file())]
+        looks = [look for name in names for look in _looks(task.folder, name)]
     except OSError:
         return ""
     if None in looks:
