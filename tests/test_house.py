@@ -171,7 +171,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3605
+    assert 0 < count <= 3610
 
 
 def imports():
@@ -239,31 +239,31 @@ def test_tests_mirror_the_tree():
 
 
 BUDGET = {
-    "driftlab": 635,
-    "driftlab/commands": 3718,
+    "driftlab": 637,
+    "driftlab/commands": 3727,
     "driftlab/evaluation": 1449,
-    "driftlab/family": 3010,
+    "driftlab/family": 3044,
     "driftlab/filtering": 1209,
     "driftlab/identification": 2155,
     "driftlab/live": 848,
     "driftlab/maps": 1789,
     "driftlab/noise": 1199,
     "driftlab/planning": 1263,
-    "driftlab/production": 2815,
+    "driftlab/production": 2910,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
-    "driftlab/reports": 3458,
+    "driftlab/reports": 3475,
     "driftlab/soak": 658,
-    "driftlab/spc": 1486,
-    "driftlab/starter": 849,
+    "driftlab/spc": 1489,
+    "driftlab/starter": 850,
     "driftlab/storage": 1261,
-    "driftlab/triad": 441,
+    "driftlab/triad": 444,
     "fusion_core": 1838,
-    "fusion_core/contracts": 1949,
+    "fusion_core/contracts": 1948,
     "fusion_core/fast": 737,
-    "fusion_core/host": 747,
+    "fusion_core/host": 748,
     "fusion_core/testing": 1001,
-    "fusion_core/thermal": 1048,
+    "fusion_core/thermal": 1053,
     "fusion_core/units": 431,
     "plugins": 302,
     "plugins/bias_models": 254,

@@ -104,9 +104,9 @@ def fleet(
         Run rules of the control charts, beside three sigma.
         `western-electric` or `nelson`; they alarm more often, also of a line in control.
     by : sequence of str
-        Column by which yield and reasons are told, e.g. lot; may be repeated.
+        Column by which yield and reasons are reported, e.g. lot; may be repeated.
         `lot`, `date`, `channel`, `driftlab`, `T_low`, `T_high`, `hours` or one of the manifest's own; numbers of which
-        there are many are told in quarters. Without it by lot, where the units have lots.
+        there are many are grouped in quarters. Without it by lot, where the units have lots.
     appraiser : str, optional
         Column of the appraisers of the gauge R&R, e.g. chamber.
         Of units that were soaked twice or more (`driftlab.spc.gauge_study`).
