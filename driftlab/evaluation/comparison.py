@@ -161,9 +161,10 @@ def _terms(fitted: FittedMap | None, sensor: Sensor) -> tuple[str, ...]:
     axes, matrix = sensor.axes, None if fitted is None else fitted.record.matrix
     bias = [] if fitted is None else [f"bias {axis}" for axis in axes]
     strain = None if fitted is None else fitted.record.sensitivity
-    pairs, strained = ([] if one is None else np.argwhere(np.reshape(one.told, (3, 3))) for one in (matrix, strain))
-    of_M = (f"scale {axes[i]}" if i == j else f"misalignment {axes[i]}{axes[j]}" for i, j in pairs)
-    return (*bias, *of_M, *(f"g-sensitivity {axes[i]}{axes[j]}" for i, j in strained))
+    told = (np.zeros((3, 3)) if one is None else np.reshape(one.told, (3, 3)) for one in (matrix, strain))
+    of_M, of_G = map(np.argwhere, told)
+    scale = (f"scale {axes[i]}" if i == j else f"misalignment {axes[i]}{axes[j]}" for i, j in of_M)
+    return (*bias, *scale, *(f"g-sensitivity {axes[i]}{axes[j]}" for i, j in of_G))
 
 
 def _condition(run: Run, recording: Chunk, initial_error: float, threshold: float) -> Condition:

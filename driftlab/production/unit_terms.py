@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 def figures_of_terms(fit: TriadFit) -> dict[str, Figure]:
     """Return TERM_FIGURES of a fit in the middle of its temperatures, and their changes from the lowest to the highest.
 
-    NaN, None in a figure, stands for what the stimulus does not tell.
+    NaN, None in a figure, stands for a term that is not observable.
     """
     low, high = fit.domain
     middle = np.array([(low + high) / 2])
-    moved = fit.told & ~fit.untold_changes & (high - low >= NARROW)
-    at_middle = _by_axis(fit.terms.at(middle)[0], fit.sigma(middle)[0], fit.told)
+    moved = fit.observable & ~fit.unobservable_changes & (high - low >= NARROW)
+    at_middle = _by_axis(fit.terms.at(middle)[0], fit.sigma(middle)[0], fit.observable)
     change = _by_axis(*fit.change(), moved)
     return at_middle | {f"{name}_change": figure for name, figure in change.items()}
 
