@@ -249,7 +249,7 @@ BUDGET = {
     "driftlab/maps": 1789,
     "driftlab/noise": 1199,
     "driftlab/planning": 1263,
-    "driftlab/production": 2910,
+    "driftlab/production": 2911,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
     "driftlab/reports": 3475,

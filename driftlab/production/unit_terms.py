@@ -18,6 +18,8 @@ from driftlab.triad.model import AXES, NARROW
 from driftlab.units import number
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from driftlab.triad.fit import TriadFit
     from fusion_core.chunk import Array
 
@@ -35,7 +37,7 @@ def figures_of_terms(fit: TriadFit) -> dict[str, Figure]:
     return at_middle | {f"{name}_change": figure for name, figure in change.items()}
 
 
-def _by_axis(values: Array, sigma: Array, known: Array) -> dict[str, Figure]:
+def _by_axis(values: Array, sigma: Array, known: NDArray[np.bool_]) -> dict[str, Figure]:
     """Return TERM_FIGURES of all terms (q,) and their deviations, of those that are known."""
     M, S = (np.where(known, part, np.nan)[3:12].reshape(3, 3) for part in (values, sigma))
     diagonal, off = np.diag(M), np.where(np.eye(3, dtype=bool), np.nan, M)
