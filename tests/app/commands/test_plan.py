@@ -46,6 +46,9 @@ FILES = ["plan.json", "report.html", "setpoints.csv"]
 def bench(tmp_path, monkeypatch):
     (tmp_path / "unit.yaml").write_text(UNIT)
     (tmp_path / "bare.yaml").write_text("latitude: 40.9 deg\n")
+    for sensor in ("gyro", "accel"):
+        tracked = f"filter: {{track: {sensor}, {sensor}: {{calibration: {{kind: polynomial}}}}}}"
+        (tmp_path / f"{sensor}.yaml").write_text(f"extends: mems_crs05\nlatitude: 0 deg\n{tracked}\n")
     wander = "{kind: gauss_markov, sigma: 5 deg/h, tau: 300 s}"
     (tmp_path / "wander.yaml").write_text(f"extends: mems_crs05\nfilter: {{gyro: {{bias: {wander}}}}}\n")
     monkeypatch.chdir(tmp_path)

@@ -138,7 +138,7 @@ def test_what_is_not_measured_here_names_the_command_that_does():
     assert {row.name for row in rows} == set(NAMES) == set(MEASURED_BY) == set(Limits.model_fields)
     for row in rows:
         assert row.note == f"`{MEASURED_BY[row.name]}` measures it"
-    assert verdict(rows).startswith("INCOMPLETE: 0 of 6 limits kept; not measured: bias instability, ")
+    assert verdict(rows).startswith("INCOMPLETE: 0 of 8 limits kept; not measured: bias instability, ")
 
 
 def test_only_what_is_set_is_judged():
