@@ -17,7 +17,7 @@ def test_compiling_is_not_announced_where_nobody_asks(monkeypatch, capsys):
 
 
 def test_compiling_is_announced_once_on_standard_error(monkeypatch, capsys):
-    monkeypatch.setattr(console, "COMPILED", 0.1)
+    monkeypatch.setattr(console, "COMPILED", 0.5)
     console.note_compiling.cache_clear()
     for _ in range(2):  # as two commands of one process do
         console.note_compiling()
@@ -26,7 +26,7 @@ def test_compiling_is_announced_once_on_standard_error(monkeypatch, capsys):
     assert capsys.readouterr().err == ""  # of a moment nobody needs to know
     for _ in range(2):
         with event.trigger_event("numba:compile"), event.trigger_event("numba:compile"):
-            sleep(0.3)
+            sleep(0.8)
     printed = capsys.readouterr()
     assert printed.err.startswith("compiling the filter for this processor")
     assert printed.err.count("compiling the filter") == 1
