@@ -9,7 +9,6 @@ from driftlab.commands import console
 
 def test_compiling_is_not_announced_where_nobody_asks(monkeypatch, capsys):
     monkeypatch.setattr(console, "COMPILED", float("inf"))  # as the other tests have it
-    console.note_compiling.cache_clear()
     console.note_compiling()
     with event.trigger_event("numba:compile"), event.trigger_event("numba:compile"):
         sleep(0.1)  # a failure in a thread fails the test
@@ -18,7 +17,6 @@ def test_compiling_is_not_announced_where_nobody_asks(monkeypatch, capsys):
 
 def test_compiling_is_announced_once_on_standard_error(monkeypatch, capsys):
     monkeypatch.setattr(console, "COMPILED", 0.5)
-    console.note_compiling.cache_clear()
     for _ in range(2):  # as two commands of one process do
         console.note_compiling()
     with event.trigger_event("numba:compile"):
