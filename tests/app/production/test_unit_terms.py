@@ -92,8 +92,11 @@ def test_terms_are_as_far_from_the_truth_as_their_deviations_say(folder, found, 
         record = work(task(tmp_path)).record
         assert record.state == "done", record.error
         z.append(off_by(record, own_matrix(seed)))
+    z = np.concatenate([np.ravel(one) for one in z])
+    z = z[z != 0]  # a change that was found to be none is none in truth
+    assert len(z) > 15
     assert np.max(np.abs(z)) < 4.5
-    assert 0.3 < np.mean(np.square(z)) < 2.0
+    assert 0.2 < np.mean(z**2) < 2.0
 
 
 def test_the_map_has_the_bias_of_the_soak_and_m_of_the_stimulus(found, alone, tmp_path):
