@@ -115,7 +115,7 @@ def test_openvins_takes_off_scale_factor_and_misalignment_at_a_temperature(tmp_p
     assert not any("misalignment" in note for note in lost.notes)
     for channel, matrix in matrices.items():
         M = np.abs(matrix.at(np.linspace(-20, 60, 2001)))
-        largest = "/".join(f"{1e6 * M[:, k, k].max():.3g}" for k in range(3))
+        largest = "/".join(f"{float(f'{1e6 * M[:, k, k].max():.3g}'):g}" for k in range(3))
         assert any(text.startswith(f"{channel}: {largest} ppm of scale factor and ") for text in lost.left_out)
 
 
