@@ -161,6 +161,7 @@ WRONG_ANSWERS = [  # family, member, its wrong answer, its arguments, what is sa
     ("bias_models", "transition", (Transition(np.eye(3), np.eye(3), np.zeros(3)), None), (CHUNK, None), "F has shape"),
     ("bias_models", "labels", ("x", "x"), (), "its labels x, x are not all different"),
     ("bias_models", "requires", None, (), "has a NoneType where a tuple of texts"),
+    ("stimuli", "inputs", None, ([CHUNK], "gyro", None, None), "inputs is a NoneType, a TriadInput was expected"),
     ("measurement_models", "equations", None, EQUATIONS, "equations answers a NoneType, a pair of the steps and"),
     ("measurement_models", "equations", (None, None), EQUATIONS, "transition is a NoneType, a Transition was expected"),
     ("measurement_models", "equations", equations(H=np.zeros((4, 7))), EQUATIONS,
