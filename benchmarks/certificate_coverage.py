@@ -17,7 +17,7 @@ import numpy as np
 from limits import DEG_H, DT, LAWS, PROGRAMS, WHITE
 from numpy.typing import NDArray
 
-from driftlab.evaluation.uncertainty import BiasBudget, bias_budget
+from driftlab.evaluation.uncertainty import UncertaintyBudget, bias_budget
 from driftlab.maps.assessment import MapVerdict
 from driftlab.soak.blocks import brief
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -31,7 +31,7 @@ PLAY = "play, walk 0.03"
 CELLS = [(kind, law, off) for laws in (LAWS, [PLAY]) for kind in KINDS for law in laws for off in (0.0, THERMOMETER)]
 
 
-def soaked(rng: np.random.Generator, kind: str, law: str, off: float, program: str) -> tuple[BiasBudget, Array]:
+def soaked(rng: np.random.Generator, kind: str, law: str, off: float, program: str) -> tuple[UncertaintyBudget, Array]:
     """Return the budget of a simulated soak, and the truths (2, N, d) at its temperatures; `off` is expanded, K."""
     hours, shape = PROGRAMS[program]
     T = shape(np.arange(int(hours * 3600 / DT)) * DT / hours / 3600)
@@ -65,7 +65,7 @@ def coverages(soaks: int, seed: int, only: str = "") -> Iterator[tuple[str, floa
         for k in range(soaks):
             rng = np.random.default_rng([seed, number, k])
             budget, truth = soaked(rng, kind, law, off, list(PROGRAMS)[k % len(PROGRAMS)])
-            errors.append(((budget.bias - truth) / budget.u).ravel())
+            errors.append(((budget.values - truth) / budget.u).ravel())
         all_of_them = np.concatenate(errors)
         name = f"{kind}, {law}, thermometer {off:g} K"
         yield name, float(np.mean(np.abs(all_of_them) <= 2)), float(np.sqrt(np.mean(all_of_them**2)))

@@ -2,6 +2,7 @@
 
 import ast
 import collections
+import importlib
 import importlib.util
 import inspect
 import os
@@ -186,6 +187,21 @@ def imports():
             elif isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
         yield name, (found & set(known)) - {name}
+
+
+def test_what_tests_and_benchmarks_import_is_there():
+    """Else a module of them fails before its first test, or a benchmark that nobody runs rots."""
+    gone = []
+    for path in (
+        path for folder in ("tests", "benchmarks", "examples", "docs") for path in (ROOT / folder).rglob("*.py")
+    ):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in FOLDERS.values():
+                for name in (alias.name for alias in node.names):
+                    module = importlib.util.find_spec(node.module) and importlib.import_module(node.module)
+                    if not hasattr(module, name) and not importlib.util.find_spec(f"{node.module}.{name}"):
+                        gone.append(f"{path.relative_to(ROOT)}: {node.module}.{name}")
+    assert not gone
 
 
 def circles(graph):

@@ -11,7 +11,7 @@ from lines import DEG_H, line
 
 from driftlab.errors import ConfigError, Unwritable
 from driftlab.production.database import Database, tables_of
-from driftlab.production.tables import rows_of, write_table
+from driftlab.production.tables import frame_of, join_tables, rows_of
 
 NASTY = "x'); DROP TABLE driftlab_units; --"
 LIMIT = {"name": "noise", "axis": "x", "value": 2.0 * DEG_H, "guard": 0.1 * DEG_H, "limit": 3 * DEG_H,
@@ -27,10 +27,12 @@ def tables(folder, units, key="k", **family):
     """Return the tables of a fleet."""
     path = folder / "units.parquet"
     more = dict.fromkeys(name for one in units for name in one.more)
-    write_table(path, (row for one in units for row in rows_of(one, odd=())), more, {})
+    frame_of((row for one in units for row in rows_of(one, odd=())), more).write_parquet(folder / "part")
+    join_tables(path, [folder / "part"], more, {})
     known = {"odd": {"0001": ["x bends", "y bends"]}, "alarms": {"0002": ["z noise 5"]}, **family}
     counts = {"units": len(units), "done": len(units), "failed": 0}
-    return tables_of("line", {"counts": counts, "units_from": "u.csv", "key": key, "family": known}, units, path)
+    summary = {"counts": counts, "units_from": "u.csv", "key": key, "family": known}
+    return tables_of("line", summary, more, units, path)
 
 
 @pytest.fixture(params=["sqlite", "duckdb"])
