@@ -199,7 +199,8 @@ def test_what_tests_and_benchmarks_import_is_there():
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in FOLDERS.values():
                 for name in (alias.name for alias in node.names):
                     module = importlib.util.find_spec(node.module) and importlib.import_module(node.module)
-                    if not hasattr(module, name) and not importlib.util.find_spec(f"{node.module}.{name}"):
+                    inner = hasattr(module, "__path__") and importlib.util.find_spec(f"{node.module}.{name}")
+                    if not hasattr(module, name) and not inner:
                         gone.append(f"{path.relative_to(ROOT)}: {node.module}.{name}")
     assert not gone
 
