@@ -125,6 +125,9 @@ class OutsideDomain(DataError):
         self.what, self.and_so, self.t = what, and_so, t
         super().__init__(f"{what}{'' if t is None else f' at t = {seconds(t)}'}{and_so}")
 
+    def __reduce__(self) -> tuple[type[OutsideDomain], tuple[str, str, float | None]]:
+        return type(self), (self.what, self.and_so, self.t)  # it comes whole from another process
+
     def at(self, when: Callable[[float], str]) -> OutsideDomain:
         """Return the same error with the moment as `when` says it."""
         return self if self.t is None else OutsideDomain(f"{self.what} at {when(self.t)}", self.and_so)

@@ -315,7 +315,9 @@ class _Command:
         frozen = "" if options.family is None else sha256(options.family)
         records = {unit: self.jobs.folder.record(unit) for unit in about}
         basis = {unit: "" if record is None else basis_of(record, frozen) for unit, record in records.items()}
-        self.notes += new_notes(options.notes, options.operator or "", about, basis)
+        said = {unit: (note.note, note.by) for unit, note in in_force(self.notes, about, basis).items()}
+        new = new_notes(options.notes, options.operator or "", about, basis)
+        self.notes += [note for note in new if said.get(note.unit) != (note.note, note.by)]
         return in_force(self.notes, about, basis), about
 
     def _tell(self, odd: Collection[str]) -> None:

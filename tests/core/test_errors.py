@@ -1,8 +1,10 @@
-"""The wording of a moment."""
+"""The wording of a moment, and errors from another process."""
+
+import pickle
 
 import pytest
 
-from fusion_core.errors import OutsideDomain, moment, seconds
+from fusion_core.errors import OutsideDomain, PluginError, moment, seconds
 
 
 @pytest.mark.parametrize(
@@ -32,3 +34,12 @@ def test_what_is_outside_a_map_says_when():
     placed = error.at(lambda t: moment(t, 1000.0))
     assert str(placed) == "polynomial: T = 61 degC at 60.0 s (t = 1060.0 s in the file) is outside; refit"
     assert str(OutsideDomain("T", " is outside").at(seconds)) == "T is outside"
+
+
+def test_errors_come_whole_from_another_process():
+    outside = OutsideDomain("polynomial: T = 61 degC", " is outside; refit", 1060.0)
+    for error in (outside, PluginError("broken", plugin="acme", family="sources")):
+        again = pickle.loads(pickle.dumps(error))
+        assert type(again) is type(error)
+        assert str(again) == str(error)
+        assert vars(again) == vars(error)

@@ -411,6 +411,7 @@ def test_a_note_on_an_alarm_stays_until_the_alarm_is_another(fleet):
     first, _ = fleet(out="new", family=known)
     assert first.summary["family"]["open"] == ["0000", "0001", "0002"]
     noted, asked = fleet(out="new", family=known, acknowledge={"0001": nasty, "0003": "none"}, operator="anna")
+    fleet(out="new", family=known, acknowledge={"0001": nasty}, operator="anna")  # the same note again is no other
     assert asked == []
     assert noted.summary["family"]["open"] == ["0000", "0002"]
     assert f"acknowledged: unit 0001: {nasty} (anna, " in "\n".join(noted.lines())
