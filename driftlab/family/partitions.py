@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, chain, islice
@@ -67,11 +68,50 @@ class InMemory(Generic[C]):
         return self.content
 
 
+class Scratch(Protocol):
+    """A place for files that the passes of one command need, which all who work on them see."""
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file."""
+        ...
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file, whole or not at all: a worker may end, or two may do the same."""
+        ...
+
+    def files(self, names: Sequence[str]) -> AbstractContextManager[list[Path]]:
+        """Give files paths here, until the end of the block."""
+        ...
+
+
+@dataclass(frozen=True)
+class ScratchFolder:
+    """Such a place in a file system."""
+
+    path: Path
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file."""
+        return (self.path / name).read_bytes()
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file, whole or not at all."""
+        new = self.path / f"{name}.{token_hex(6)}"
+        new.write_bytes(content)
+        os.replace(new, self.path / name)
+
+    @contextmanager
+    def files(self, names: Sequence[str]) -> Iterator[list[Path]]:
+        """Give the paths of files."""
+        yield [self.path / name for name in names]
+
+
 @dataclass(frozen=True)
 class InFile:
     """A partition in a file that a worker wrote."""
 
-    path: Path
+    scratch: Scratch
+    name: str
     count: int
 
     def __len__(self) -> int:
@@ -79,7 +119,7 @@ class InFile:
 
     def read(self) -> Any:
         """Return its content."""
-        return pickle.loads(self.path.read_bytes())
+        return pickle.loads(self.scratch.read(self.name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +144,13 @@ class Partitions(Generic[C]):
     ----------
     parts : sequence of Partition
     engine : Engine
-    folder : Path or None
+    scratch : Scratch or None
         Where workers keep what is to stay; None: in memory.
     """
 
     parts: Sequence[Partition[C]]
     engine: Engine = serial
-    folder: Path | None = None
+    scratch: Scratch | None = None
 
     def __len__(self) -> int:
         return sum(map(len, self.parts))
@@ -133,16 +173,16 @@ class Partitions(Generic[C]):
 
     def keep(self, name: str, function: Callable[..., R], *of_units: Any) -> Partitions[R]:
         """Return the function's results as partitions, which stay where they were made; see `map`."""
-        if self.folder is None:
+        if self.scratch is None:
             results = self.map(function, *of_units)
             held = [InMemory(result, len(part)) for part, result in zip(self.parts, results, strict=True)]
             return Partitions(held, self.engine)
         own = f"{name}-{token_hex(6)}"  # no worker of another pass, or of a command that has ended, writes these
-        files: list[Partition[R]] = [InFile(self.folder / f"{own}-{k}", len(part)) for k, part in enumerate(self.parts)]
-        paths = [[file.path] * len(file) for file in files if isinstance(file, InFile)]
-        for _ in self.map(partial(_write, function), [*chain.from_iterable(paths)], *of_units):
+        files = [InFile(self.scratch, f"{own}-{k}", len(part)) for k, part in enumerate(self.parts)]
+        places = [[file] * len(file) for file in files]
+        for _ in self.map(partial(_write, function), [*chain.from_iterable(places)], *of_units):
             pass
-        return Partitions(files, self.engine, self.folder)
+        return Partitions(files, self.engine, self.scratch)
 
     def chosen(self: Partitions[Sequence[UnitOfLot]], places: Iterable[int], size: int = SIZE) -> (
         Partitions[Sequence[UnitOfLot]]
@@ -158,7 +198,7 @@ class Partitions(Generic[C]):
                     at += 1
                 sources.setdefault(at, []).append(place - starts[at])
             parts.append(ChosenUnits(tuple((self.parts[k], tuple(own)) for k, own in sources.items())))
-        return Partitions(parts, self.engine, self.folder)
+        return Partitions(parts, self.engine, self.scratch)
 
     def read(self: Partitions[Sequence[UnitOfLot]]) -> Iterator[UnitOfLot]:
         """Yield the units, read here one after the other."""
@@ -222,8 +262,7 @@ def _sum(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> R:
     return tree(function(part.read(), *of_units) for part, *of_units in block)
 
 
-def _write(function: Callable[..., Any], content: Any, paths: Sequence[Path], *of_units: Any) -> None:
-    """Write the function's result of a partition, whole or not at all: a worker may end, or two may do the same."""
-    new = paths[0].with_name(f"{paths[0].name}.{token_hex(6)}")
-    new.write_bytes(pickle.dumps(function(content, *of_units), pickle.HIGHEST_PROTOCOL))
-    os.replace(new, paths[0])
+def _write(function: Callable[..., Any], content: Any, places: Sequence[InFile], *of_units: Any) -> None:
+    """Write the function's result of a partition into its file."""
+    place, result = places[0], function(content, *of_units)
+    place.scratch.write(place.name, pickle.dumps(result, pickle.HIGHEST_PROTOCOL))

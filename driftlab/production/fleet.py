@@ -20,7 +20,7 @@ from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, fleet_folder, stored_units
+from driftlab.production.store import FAMILY, REPORT, TABLE, fleet_folder, stored_units
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS
@@ -68,6 +68,7 @@ def fleet(
     acknowledge: Mapping[str, str] | None = None,
     operator: str | None = None,
     to: str | None = None,
+    store: str | None = None,
     force: bool = False,
     channel: str | None = None,
     progress: FleetProgress | None = None,
@@ -118,6 +119,9 @@ def fleet(
     to : str, optional
         SQL database that takes the results as tables, e.g. sqlite:///line.db.
         A URL as SQLAlchemy has it (`driftlab.production.database`); needs driftlab[sql].
+    store : str, optional
+        URL for the folders of the units, e.g. s3://bucket/line; default: in `out`.
+        Workers put them there themselves (`driftlab.production.unit_store`); needs fsspec and what it needs for it.
     force : bool
         Do every unit again.
     channel : as that of `run`
@@ -145,7 +149,7 @@ def fleet(
     )  # fmt: skip
     manifest, options = _checked(understood, str(units), options)
     read = [] if options.family is None else [options.family]
-    with _database(to) as database, fleet_folder(Path(out), read) as folder:
+    with _database(to) as database, fleet_folder(Path(out), read, store) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
         jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), options, report)
         command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
@@ -257,10 +261,10 @@ class _Command:
             return self._mark(**{name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark()
         # of matrices of forty rows more threads make less
-        with threadpool_limits(1), folder.scratch() as scratch:
-            engine = jobs.engine() if len(status.done) > ALONE else serial
+        engine, seen = jobs.engine() if len(status.done) > ALONE else (serial, folder.place)
+        with threadpool_limits(1), seen.scratch() as scratch:
             units, whole = (
-                stored_units(folder.path, of.units, [record.lot for record in of], engine, scratch)
+                stored_units(folder.units, of.units, [record.lot for record in of], engine, scratch)
                 for of in (status.done, status.records)
             )
             learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
@@ -282,7 +286,7 @@ class _Command:
         self.jobs.progress(Stage("database"))
         folder, records = self.jobs.folder, self.status.records
         own = dict.fromkeys(column for record in records for column in record.more)
-        whole = filter(None, map(folder.record, records.units))
+        whole = filter(None, map(folder.units.record, records.units))
         name = folder.out.name or folder.path.name
         database.replace(summary["id"], tables_of(name, summary, own, whole, folder.path / TABLE))
 
@@ -313,7 +317,7 @@ class _Command:
             about.setdefault(analysis.line.units[k], []).extend(why)
         about = {unit: why for unit, why in about.items() if why}
         frozen = "" if options.family is None else sha256(options.family)
-        records = {unit: self.jobs.folder.record(unit) for unit in about}
+        records = {unit: self.jobs.folder.units.record(unit) for unit in about}
         basis = {unit: "" if record is None else basis_of(record, frozen) for unit, record in records.items()}
         said = {unit: (note.note, note.by) for unit, note in in_force(self.notes, about, basis).items()}
         new = new_notes(options.notes, options.operator or "", about, basis)
@@ -345,8 +349,7 @@ class _Command:
         """Write `fleet.json`, and return its content."""
         jobs, folder, status = self.jobs, self.jobs.folder, self.status
         names = {entry.unit for entry in jobs.manifest.units}
-        here = (path for path in (folder.path / UNITS).iterdir() if (path / "unit.json").is_file())
-        left = sorted(path.name for path in here if path.name not in names)
+        left = [unit for unit in folder.units.names() if unit not in names]
         counts = {"units": len(names), "done": len(status.done), "failed": len(status.failed)}
         summary = FleetSummary(
             plugins=participants(self.config),
@@ -360,6 +363,7 @@ class _Command:
             gauge=self.gauge,
             acknowledgements=self.notes,
             id=self.id,
+            store=folder.mark.get("store"),
             replaced=jobs.again,
             kept_without_recordings=jobs.without_recordings,
             left=left,

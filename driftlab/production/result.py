@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from driftlab.commands.result import Result
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.production.store import FAMILY, REPORT, TABLE, UNITS, record_of
+from driftlab.production.store import FAMILY, REPORT, TABLE
 from driftlab.production.tables import COLUMNS
+from driftlab.production.unit_folders import UnitFolders, UnitPlace
+from driftlab.production.unit_store import UnitStore
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -73,14 +75,19 @@ class FleetResult(Result):
         """Names of the columns of each (U, d) array: the axes."""
         return dict.fromkeys((name for name in self if name in OF_AN_AXIS), self._axes)
 
+    @cached_property
+    def _folders(self) -> UnitFolders:
+        url = self.summary.get("store")
+        return UnitPlace(self.path, b"") if url is None else UnitStore(url, str(self.summary["id"]))
+
     @property
     def written(self) -> list[str]:
         """The files in the fleet's folder, in words."""
         names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
         pages = len(self.summary["pages"])
-        made = sum(1 for _ in (self.path / UNITS).glob("*/certificate.html"))
-        more = [f"pages of {pages:,} in units/NAME/page/"] * bool(pages) + [f"{made:,} certificates"] * bool(made)
-        return [*names, "units/", *more]
+        made, root = len(self._folders.names("certificate.html")), self._folders.root
+        more = [f"pages of {pages:,} in {root}/NAME/page/"] * bool(pages) + [f"{made:,} certificates"] * bool(made)
+        return [*names, f"{root}/", *more]
 
     @property
     def exit_status(self) -> int:
@@ -96,7 +103,7 @@ class FleetResult(Result):
 
     def record(self, unit: str) -> UnitRecord:
         """Return the record of a unit; raises ConfigError where there is none of that name."""
-        record = record_of(self.path / UNITS / unit)
+        record = self._folders.record(unit)
         if record is None:
             raise ConfigError(f"unit {unit}: is not in {self.path}; `unit` names those that are")
         return record

@@ -16,31 +16,37 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
+from uuid import uuid4
 
-from pydantic import ValidationError
-
-from driftlab.family.partitions import SIZE, Engine, Partitions, UnitOfLot, serial
+from driftlab.family.partitions import SIZE, Engine, Partitions, Scratch, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
-from driftlab.family.unit_information import UnitInformation
+from driftlab.production.unit_folders import (
+    MARK,
+    NEW,
+    PAGE,
+    RECORD,
+    SCRATCH,
+    UnitFolders,
+    UnitPlace,
+    content_of,
+    digests,
+    write_whole,
+)
 from driftlab.production.unit_records import UnitRecords
+from driftlab.production.unit_store import opened
 from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
 from driftlab.storage.json import plain
-from driftlab.storage.ownership import OWN, check_folder, foreign, free, is_as
-from fusion_core.budget import PIECE, read_whole
-from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
+from driftlab.storage.ownership import check_folder, foreign, free, is_as
+from fusion_core.errors import ConfigError, Unwritable, quote
 
-INSIDE = ("page", "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
+TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
+OF_ALL = (TABLE, FAMILY, REPORT)
 LONGEST = 1 << 20  # bytes of a line
-SCRATCH = ".family.new"  # folder in which workers keep what the family's passes need
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
-PAGE = "page"  # folder of a unit's pages
-NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
 
 
 class FleetFolder:
@@ -51,11 +57,13 @@ class FleetFolder:
     path : Path
     mark : dict
         The content of `fleet.json`.
+    units : UnitFolders
+        Those of the units: in the folder, or behind the URL `store`.
     stamps : dict of str to (str, str)
         Key and stamp of the units that were done here, by name.
     """
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, store: str | None = None) -> None:
         self.out, self.path = out, Path(os.path.realpath(out))
         self._read_mark()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -64,10 +72,17 @@ class FleetFolder:
         try:
             self.lock.sign()
             self._read_mark()  # as whoever had the lock has left it
+            url = self._url(store)
             if not self.mark:
-                self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False})
-            (self.path / UNITS).mkdir(exist_ok=True)
-            self._finish()
+                more = {} if url is None else {"store": url, "id": uuid4().hex}
+                self.write_mark({"schema": 1, "program": "driftlab fleet", "complete": False, **more})
+            remove(self.path / SCRATCH)
+            self.place = UnitPlace(self.path, (self.path / LOCK).read_bytes())
+            self.units: UnitFolders = self.place
+            if url is None:
+                self.place.finish()
+            else:
+                self.units = opened(url, self.mark["id"])
             self.stamps = dict(_stamps(self.path / STAMPS))
             self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")
@@ -93,27 +108,24 @@ class FleetFolder:
         changed = foreign(self.path, MARK, {MARK, *({*OF_ALL} & names)}) if self.mark else []
         check_folder(f"--out {self.out}", changed if self.mark.get("complete") or MARK in changed else [])
 
-    def unit(self, name: str) -> Path:
-        """Return the folder of a unit."""
-        return self.path / UNITS / name
-
-    def record(self, name: str) -> UnitRecord | None:
-        """Return the record of a unit; None where there is none that can be read."""
-        return record_of(self.unit(name))
+    def _url(self, store: str | None) -> str | None:
+        """Return where the folders of units are, if not here; raises ConfigError where they were put elsewhere."""
+        known = self.mark.get("store")
+        if self.mark and store not in (None, known):
+            raise ConfigError(
+                f"--store {quote(store or '', 200)}: the units of {self.out} are in {known or 'the folder itself'}; "
+                "leave --store out, or name another folder with --out"
+            )
+        return known or store
 
     def brief(self, name: str) -> UnitRecord | None:
         """Return the record of a unit in brief, of which the file is read once; None where it cannot be read."""
         if name not in self.records:
-            record = self.record(name)
+            record = self.units.record(name)
             if record is None:
                 return None
             self.records[name] = record
         return self.records[name]
-
-    @property
-    def place(self) -> UnitPlace:
-        """The place of the units, for whoever puts some there for this command."""
-        return UnitPlace(self.path, (self.path / LOCK).read_bytes())
 
     def begin(self) -> None:
         """Note that what was made of all units will not be of these any more."""
@@ -123,7 +135,7 @@ class FleetFolder:
     def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
         """Put a unit in its place, for the one that was there; what others put there is taken along."""
         self.begin()
-        self.noted(self.place.put(record, files), stamp)
+        self.noted(self.units.put(record, files), stamp)
 
     def noted(self, record: UnitRecord, stamp: str) -> None:
         """Note a unit that was put in its place."""
@@ -135,43 +147,39 @@ class FleetFolder:
 
         The map there stays, though it was fitted again for them: they name that one, and so does the record.
         """
-        record, place = self.record(unit), self.unit(unit) / PAGE
+        record = self.units.record(unit)
         pages = {name: text for name, text in files.items() if name.startswith(f"{PAGE}/")}
         if pages and record is not None:
             for name in files.keys() & record.written.keys() - pages.keys():
-                made, known = _digests(files)[name].encode(), record.written[name].encode()
+                made, known = digests(files)[name].encode(), record.written[name].encode()
                 pages = {page: text.replace(made, known) for page, text in pages.items()}
-            self.note(record.model_copy(update={"written": record.written | _digests(pages)}))
-            if os.path.lexists(place):  # somebody's
-                os.rename(place, free(place))
-            named = {Path(name).name: pages[name] for name in pages}
-            os.rename(_made(self.path / UNITS / f".{unit}.{PAGE}{NEW}", named), place)
+            self.note(record.model_copy(update={"written": record.written | digests(pages)}))
+            self.units.put_page(unit, pages)
 
     def put_certificate(self, unit: str, content: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
         """Put a certificate among the files of a unit, in the place of an earlier one of other results.
 
         One that was edited is put aside; one of the same results stays, and so does its date of issue.
         """
-        record, place = self.record(unit), self.unit(unit)
+        record = self.units.record(unit)
         assert record is not None
-        as_written = [is_as(place / name, record.written.get(name, "")) for name in files]
-        before = [ownership.document(place / name) for name in files if name.endswith(".json")]
-        if all(as_written) and all(one.get("identification") == content["identification"] for one in before):
+        (name,) = (name for name in files if name.endswith(".json"))
+        with self.units.file(unit, name) as path:
+            before = ownership.document(path).get("identification")
+        if before == content["identification"] and all(
+            self.units.is_as(unit, name, record.written.get(name, "")) for name in files
+        ):
             return
-        for name, own in zip(files, as_written, strict=True):
-            if own:
-                remove(place / name)
-            elif os.path.lexists(place / name):
-                os.rename(place / name, free(place / name))
-        self.note(
-            record.model_copy(update={"written": record.written | _digests(files)})
-        )  # known before they are there
         for name in files:
-            self.write(f"{UNITS}/{unit}/{name}", files[name])
+            self.units.clear(unit, name, record.written.get(name, ""))
+        known = record.written | digests(files)
+        self.note(record.model_copy(update={"written": known}))  # known before they are there
+        for name in files:
+            self.units.write(unit, name, files[name])
 
     def note(self, record: UnitRecord) -> None:
         """Write the record of a unit anew, which is there already; one that was edited is put aside."""
-        self.write(f"{UNITS}/{record.unit}/{RECORD}", _content(record))
+        self.units.write(record.unit, RECORD, content_of(record))
         self.records[record.unit] = record
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
@@ -185,29 +193,13 @@ class FleetFolder:
 
         `name` is relative to the fleet's folder.
         """
-        path = self.path / name
-        new = path.with_name(f".{path.name}{NEW}")
-        new.write_bytes(content)
-        if path.name in (MARK, RECORD) and os.path.lexists(path) and foreign(path.parent, path.name, [path.name]):
-            os.rename(path, free(path))
-        os.replace(new, path)
+        write_whole(self.path / name, content)
 
     def write_mark(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Write `fleet.json` and return its content: it knows itself and the files of all units."""
         self.write(MARK, ownership.signed(plain(dict(content)), MARK, self.written).encode())
         self.mark = {**content, "written": ownership.document(self.path / MARK)["written"]}
         return self.mark
-
-    @contextmanager
-    def scratch(self) -> Iterator[Path]:
-        """Give a folder for files that are needed until the end of the command."""
-        path = self.path / SCRATCH
-        remove(path)
-        path.mkdir(mode=0o700)
-        try:
-            yield path
-        finally:
-            remove(path)
 
     def hidden(self, name: str) -> Path:
         """Return the name of a file of all units until it is published."""
@@ -228,19 +220,6 @@ class FleetFolder:
         for name in names:
             os.replace(self.hidden(name), self.path / name)
 
-    def _finish(self) -> None:
-        """Finish what a command that was killed had begun to replace."""
-        remove(self.path / SCRATCH)
-        for path in sorted(path for path in (self.path / UNITS).iterdir() if path.name[0] == "."):
-            if path.name.endswith(OLD):
-                place = path.with_name(path.name[1:].removesuffix(OLD))
-                if os.path.lexists(place):
-                    _take_along(path, place)
-                else:
-                    os.rename(path, place)
-            elif path.name.endswith(NEW):
-                remove(path)
-
     def close(self) -> None:
         """Give the folder back."""
         try:
@@ -250,77 +229,6 @@ class FleetFolder:
                 self.write(STAMPS, "".join(lines).encode())
         finally:
             self.lock.release()
-
-
-@dataclass(frozen=True)
-class UnitPlace:
-    """The place of the units of a fleet's folder, as long as a command holds that: `signed` is its lock's content."""
-
-    path: Path
-    signed: bytes
-
-    def reached(self) -> bool:
-        """Return True if this process sees the folder, and the command still holds it."""
-        try:
-            return (self.path / LOCK).read_bytes() == self.signed
-        except OSError:
-            return False
-
-    def put(self, record: UnitRecord, files: Mapping[str, bytes]) -> UnitRecord:
-        """Put a unit in its place, for the one that was there; what others put there is taken along.
-
-        Return its record, which knows the files. Whoever else does the same writes beside it, not over it.
-        """
-        record = record.model_copy(update={"written": _digests(files)})
-        place, hidden = self.path / UNITS / record.unit, f".{record.unit}"
-        old = place.with_name(f"{hidden}{OLD}")
-        new = _made(place.with_name(f"{hidden}.{token_hex(6)}{NEW}"), {**files, RECORD: _content(record)})
-        if os.path.lexists(place):
-            _take_along(old, place)  # of one who ended here
-            os.rename(place, old)
-        os.rename(new, place)
-        _take_along(old, place)
-        return record
-
-
-def _made(folder: Path, files: Mapping[str, bytes]) -> Path:
-    """Return a new folder with files in it."""
-    remove(folder)
-    for file, content in files.items():
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file).write_bytes(content)
-    return folder
-
-
-def _content(record: UnitRecord) -> bytes:
-    record = record.model_copy(update={"written": {**record.written, RECORD: OWN}})
-    return ownership.with_own(record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
-
-
-def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
-    return {name: sha256(content).hexdigest() for name, content in files.items()}
-
-
-def _take_along(old: Path, place: Path) -> None:
-    """Remove a unit's folder that was replaced, but for what driftlab did not write so: that goes to the new one."""
-    if not os.path.lexists(old):
-        return
-    if old.is_symlink() or not old.is_dir():  # somebody's
-        os.rename(old, free(place / place.name))
-        return
-    for inside in INSIDE:
-        folder = old / inside
-        if folder.is_dir() and not folder.is_symlink():
-            names = [f"{inside}/{name}" if inside else name for name in os.listdir(folder)]
-            others = [
-                n for n in foreign(old, RECORD, names) if n != FAMILY_MAP or ownership.why_not_own(old / n, COMMAND)
-            ]
-            for name in sorted(names, key=RECORD.__eq__):  # the record, which knows the others, is the last
-                if name in others:
-                    os.rename(old / name, free(place / name.replace("/", "-")))
-                else:
-                    remove(old / name)
-            folder.rmdir()
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
@@ -333,8 +241,10 @@ def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
 
 
 @contextmanager
-def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder]:
+def fleet_folder(out: Path, read: Collection[Path] = (), store: str | None = None) -> Iterator[FleetFolder]:
     """Give the folder of a fleet to grow in; `read` are files that are needed and must not be in it.
+
+    `store` is a URL under which the folders of units are to be, if not in it.
 
     Raises
     ------
@@ -348,7 +258,7 @@ def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder
         if Path(os.path.realpath(path)).is_relative_to(inside):
             raise ConfigError(f"--out {out}: holds {path}, which is used here; name another folder")
     with refusals(f"--out {out}", "name a folder that can be"):
-        held = FleetFolder(out)
+        held = FleetFolder(out, store)
     try:
         yield held
     except BrokenPipeError:
@@ -364,18 +274,11 @@ def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder
         held.close()
 
 
-MARK = "fleet.json"  # mark of a fleet's folder
-TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"  # of all units
-OF_ALL = (TABLE, FAMILY, REPORT)
-UNITS, RECORD = "units", "unit.json"  # folder of the units, and the record in each of theirs
-FAMILY_MAP, COMMAND = "family_map.json", "fleet"  # in the folder of a unit, which knows itself and this command
-
-
 @dataclass(frozen=True)
 class StoredUnits(Sequence[UnitOfLot]):
-    """A partition of units of a fleet's `folder`, by names and lots; each is read when it is asked for."""
+    """A partition of the units in `folders`, by names and lots; each is read when it is asked for."""
 
-    folder: Path
+    folders: UnitFolders
     names: tuple[str, ...]
     lots: tuple[str, ...]
 
@@ -388,28 +291,16 @@ class StoredUnits(Sequence[UnitOfLot]):
 
     def __getitem__(self, k: Any) -> Any:
         """Return the information of a unit's soaks, and its lot; raises UnreadableFile if a file is damaged."""
-        path = self.folder / UNITS / self.names[k] / "unit.npz"
-        try:
-            return UnitInformation.from_bytes(read_whole(path, PIECE)), self.lots[k]
-        except IndexError:
-            raise
-        except Exception:  # of a damaged archive nearly any
-            raise UnreadableFile(
-                f"{path}: is missing or damaged; remove the folder and give the same command again"
-            ) from None
+        return self.folders.information(self.names[k]), self.lots[k]
 
 
 def stored_units(
-    folder: Path, units: Sequence[str], lots: Sequence[str], engine: Engine = serial, scratch: Path | None = None
+    folders: UnitFolders,
+    units: Sequence[str],
+    lots: Sequence[str],
+    engine: Engine = serial,
+    scratch: Scratch | None = None,
 ) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
-    """Return units of a fleet's folder by names and lots; workers keep files in `scratch`."""
+    """Return units in folders by names and lots; workers keep files in `scratch`."""
     cuts = [slice(k, k + SIZE) for k in range(0, len(units), SIZE)]
-    return Partitions([StoredUnits(folder, tuple(units[k]), tuple(lots[k])) for k in cuts], engine, scratch)
-
-
-def record_of(folder: Path) -> UnitRecord | None:
-    """Return the record in a unit's folder; None where there is none that can be read."""
-    try:
-        return UnitRecord.model_validate_json(read_whole(folder / RECORD))
-    except (OSError, ValidationError):
-        return None
+    return Partitions([StoredUnits(folders, tuple(units[k]), tuple(lots[k])) for k in cuts], engine, scratch)

@@ -161,6 +161,7 @@ class FleetSummary(BaseModel):
     gauge: Annotated[GaugeStudy | None, Field(exclude=True)] = None
     acknowledgements: list[Acknowledgement] = []
     id: str | None = None
+    store: str | None = None
     replaced: list[str] = []
     kept_without_recordings: list[str] = []
     left: list[str] = []

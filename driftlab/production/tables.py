@@ -8,8 +8,8 @@ d axes, q coefficients, G temperatures.
 
 from __future__ import annotations
 
+import io
 import json
-import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,30 +23,21 @@ from driftlab.config import Config
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
-from driftlab.family.partitions import Partitions, UnitOfLot
+from driftlab.family.partitions import Partitions, Scratch, UnitOfLot
 from driftlab.family.posterior_map import UnitPosterior, informed_where_unknown, posterior_of
 from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import (
-    COMMAND,
-    FAMILY,
-    FAMILY_MAP,
-    NEW,
-    REPORT,
-    TABLE,
-    UNITS,
-    FleetFolder,
-    StoredUnits,
-    record_of,
-)
+from driftlab.production.store import FAMILY, REPORT, TABLE, FleetFolder, StoredUnits
 from driftlab.production.summary import FleetProgress, Stage
+from driftlab.production.unit_folders import COMMAND, FAMILY_MAP, PAGE_FILE, UnitFolders
+from driftlab.production.unit_map import file_content
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow
 from driftlab.spc.yields import reasons
-from driftlab.storage.ownership import free, seal, seal_of, why_not_own
+from driftlab.storage.ownership import seal_of
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile
@@ -70,7 +61,7 @@ def write_fleet(
     pages: Collection[str],
     progress: FleetProgress,
     units: Partitions[Sequence[UnitOfLot]],
-    scratch: Path,
+    scratch: Scratch,
 ) -> None:
     """Write family, table and report, each whole or not at all.
 
@@ -86,7 +77,7 @@ def write_fleet(
         )  # fmt: skip
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
     drawn = _drawn(status, analysis)
-    table = _Table(folder.path, analysis.family, analysis.common.effects, tuple(more))
+    table = _Table(folder.units, scratch, analysis.family, analysis.common.effects, tuple(more))
     stage = Stage("tables and maps", total=len(status.records))
     progress(stage)
     names = status.records.units
@@ -94,16 +85,19 @@ def write_fleet(
     of_units = (
         [of.get(name) for name in names] for of in (analysis.reasons, analysis.common.noise, analysis.common.of_units)
     )
-    paths = [scratch / f"table-{k}" for k, part in enumerate(units.parts) for _ in range(len(part))]
+    parts = [f"table-{k}" for k in range(len(units.parts))]
+    of_part = [name for name, part in zip(parts, units.parts, strict=True) for _ in range(len(part))]
     curves: list[Array] = []
-    for count, own in units.map(table.write, shown, *of_units, paths):
+    for count, own in units.map(table.write, shown, *of_units, of_part):
         curves += own
         stage.done += count
         progress(stage)
-    join_tables(folder.hidden(TABLE), dict.fromkeys(paths), more, {"driftlab": __version__, "SI": status.bias_unit})
+    with scratch.files(parts) as paths:
+        join_tables(folder.hidden(TABLE), paths, more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
-    overview = _overview(title, status, tracked_unit(config.filter), analysis, pages, curves, drawn)
+    links = {name: f"{folder.units.root}/{name}/{PAGE_FILE}" for name in pages}
+    overview = _overview(title, status, tracked_unit(config.filter), analysis, links, curves, drawn)
     write_fleet_report(folder.hidden(REPORT), replace(overview, **beside))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
 
@@ -123,7 +117,8 @@ def _drawn(status: FleetStatus, analysis: FamilyAnalysis) -> list[str]:
 class _Table:
     """Writer of a partition's rows, and of its units' maps with the family."""
 
-    folder: Path
+    folders: UnitFolders
+    scratch: Scratch
     family: Family | None
     effects: Sequence[SharedEffect]
     more: tuple[str, ...]  # names of the manifest's own columns
@@ -135,15 +130,15 @@ class _Table:
         odd: Sequence[Sequence[str] | None],
         noise: Sequence[UnitDensities | None],
         sizes: Sequence[Sequence[OfUnit] | None],
-        paths: Sequence[Path],
+        parts: Sequence[str],
     ) -> tuple[int, list[Array]]:
         """Write rows and maps; return the number of the units, and the curves (d, G) of those that are `shown`."""
         rows, curves = list[Row](), list[Array]()
         for k, name in enumerate(units.names):
-            record = record_of(self.folder / UNITS / name)
+            record = self.folders.record(name)
             if record is None:
                 raise UnreadableFile(
-                    f"{self.folder / UNITS / name}: has no record any more; give the same command again"
+                    f"{self.folders.address}/{name}: has no record any more; give the same command again"
                 )
             if self.family is None or record.state != "done":
                 rows += rows_of(record)
@@ -153,10 +148,12 @@ class _Table:
                 soaked = without_effects(soaked, lot, self.effects, noise[k])
             else:
                 soaked = informed_where_unknown(soaked, self.family, record)
-            part, curve = _posterior_rows(self.folder, posterior_of(self.family, soaked, lot), sizes[k])
+            part, curve = _posterior_rows(self.folders, posterior_of(self.family, soaked, lot), sizes[k])
             rows += rows_of(record, part, odd[k] or ())
             curves += [curve] * bool(shown[k])
-        frame_of(rows, self.more).write_parquet(paths[0])
+        table = io.BytesIO()
+        frame_of(rows, self.more).write_parquet(table)
+        self.scratch.write(parts[0], table.getvalue())
         return len(units), curves
 
 
@@ -165,19 +162,16 @@ def temperatures(family: Family) -> Array:
     return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
 
 
-def _posterior_rows(folder: Path, of_unit: UnitPosterior, size: Sequence[OfUnit] | None) -> tuple[list[Row], Array]:
+def _posterior_rows(
+    folders: UnitFolders, of_unit: UnitPosterior, size: Sequence[OfUnit] | None
+) -> tuple[list[Row], Array]:
     """Write the map of a unit with the family; return the family's part of its rows, and that map's curve (d, G).
 
     `shape_distance` is that of its coefficients from the mean of its lot, in deviations: 1 is usual.
     """
     family, name, lot, posterior = of_unit.family, of_unit.soaked.unit, of_unit.lot, of_unit.posterior
-    path = folder / UNITS / name / FAMILY_MAP
-    new = path.with_name(f".{FAMILY_MAP}{NEW}")
-    of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot}).save(new)
-    seal(new)
-    if why_not_own(path, COMMAND):
-        os.rename(path, free(path))
-    os.replace(new, path)
+    fitted = of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot})
+    folders.write(name, FAMILY_MAP, file_content(fitted, FAMILY_MAP))
     T, before = temperatures(family), family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
     columns = {
@@ -355,7 +349,7 @@ def _overview(
     status: FleetStatus,
     unit: BiasUnit,
     analysis: FamilyAnalysis,
-    pages: Collection[str],
+    links: Mapping[str, str],
     curves: Sequence[Array],
     drawn: Sequence[str],
 ) -> FleetOverview:
@@ -372,7 +366,7 @@ def _overview(
         mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
         odd=analysis.odd,
         effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],
-        links={name: f"{UNITS}/{name}/page/report.html" for name in pages},
+        links=dict(links),
         remarks=analysis.lines,
     )
 

@@ -270,12 +270,12 @@ def pages_of(
     return {f"page/{name}": page.encode() for name, page in pages.items()}
 
 
-def certificate_of(record: UnitRecord, folder: Path, config: Config, sheet: Sheet) -> Certificate:
-    """Return the certificate of a unit that is done, from its record and the map in its folder.
+def certificate_of(record: UnitRecord, path: Path, config: Config, sheet: Sheet) -> Certificate:
+    """Return the certificate of a unit that is done, from its record and the file of its map.
 
     `config` and `sheet` are those of the fleet. Raises MapError where the map is not the one that was written.
     """
-    path, known = folder / record.map_file, record.written.get(record.map_file, "")
+    known = record.written.get(record.map_file, "")
     if not is_as(path, known):
         raise MapError(f"{path}: was changed since `driftlab fleet` wrote it; give --force to make it anew")
     fitted, unit = read_map(path), tracked_unit(config.filter)

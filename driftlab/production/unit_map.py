@@ -43,6 +43,7 @@ from driftlab.production.unit_terms import figures_of_terms
 from driftlab.soak.blocks import means, runs
 from driftlab.spc.charts import LEVEL
 from driftlab.storage.json import plain
+from driftlab.storage.ownership import seal
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import FusionError
@@ -55,9 +56,6 @@ if TYPE_CHECKING:
     from driftlab.family.unit_information import UnitInformation
     from driftlab.family.unit_noise import Densities
     from fusion_core.chunk import Array
-
-
-IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map waits for no disk to be read back
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +108,17 @@ class UnitMap:
 
     def content(self) -> bytes:
         """Return the content of its file."""
-        with tempfile.TemporaryDirectory(prefix="driftlab-", dir=IN_MEMORY) as folder:
-            path = Path(folder) / self.file
-            self.fitted.save(path)
-            return path.read_bytes()
+        return file_content(self.fitted, self.file)
+
+
+def file_content(fitted: FittedMap, name: str) -> bytes:
+    """Return the content of a map's file of some name, with its SHA-256 where it has a place for that."""
+    in_memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # it waits for no disk to be read back
+    with tempfile.TemporaryDirectory(prefix="driftlab-", dir=in_memory) as folder:
+        path = Path(folder, name)
+        fitted.save(path)
+        seal(path)
+        return path.read_bytes()
 
 
 def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus: Sequence[str] = ()) -> UnitMap:

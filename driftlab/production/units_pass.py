@@ -27,9 +27,10 @@ from driftlab.family.partitions import Engine
 from driftlab.family.record import UnitRecord
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
-from driftlab.production.store import PAGE, FleetFolder, UnitPlace
+from driftlab.production.store import FleetFolder
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
 from driftlab.production.unit import STIMULUS, Task, UnitResult, certificate_of, config_of, key_of, work
+from driftlab.production.unit_folders import PAGE_FILE, UnitFolders
 from driftlab.production.unit_records import RecordsOfUnits, UnitRecords
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
@@ -112,11 +113,16 @@ class UnitJobs:
         """The workers of the whole command, from when they are asked for the first time; raises WorkersError."""
         return self._held.enter_context(self.options.crew())
 
-    def engine(self) -> Engine:
-        """Return those who go through the units in the folder: the workers, if they reach it, or some of our own."""
-        if self.workers.all_say(self.folder.place.reached):
-            return self.workers.ordered
-        return self._held.enter_context(Pool(self.options.workers)).ordered
+    def engine(self) -> tuple[Engine, UnitFolders]:
+        """Return those who go through the units, and whose scratch they see.
+
+        The workers, if they reach the units; else some processes of our own.
+        """
+        folder = self.folder
+        if self.workers.all_say(folder.units.reached):
+            here = folder.units is folder.place or self.workers.all_say(folder.place.reached)
+            return self.workers.ordered, folder.place if here else folder.units
+        return self._held.enter_context(Pool(self.options.workers)).ordered, folder.place
 
     def do(self) -> None:
         """Do every unit that is not done, and put it into the folder."""
@@ -128,7 +134,7 @@ class UnitJobs:
         if first is None:
             return
         self.folder.begin()
-        done = partial(work_in_place, self.folder.place)
+        done = partial(work_in_place, self.folder.units)
         for task, result in self.workers.map(done, chain([first], tasks)):
             if isinstance(result, WorkerLost):
                 result = UnitResult(_failed(task, result), {})
@@ -172,7 +178,7 @@ class UnitJobs:
                 self.folder.stamp(entry.unit, record.key, stamps[entry.unit])
                 stage.total -= 1
                 continue
-            if self.folder.unit(entry.unit).exists():
+            if self.folder.units.holds(entry.unit):
                 self.again.append(entry.unit)
             yield task
 
@@ -198,7 +204,7 @@ class UnitJobs:
                 raise RuntimeError(f"unit {entry.unit} has no record")
             given = {"lot": entry.lot, "date": entry.date, "more": dict(entry.more)}
             if given != {name: getattr(record, name) for name in given}:
-                whole = self.folder.record(entry.unit)
+                whole = self.folder.units.record(entry.unit)
                 assert whole is not None
                 self.folder.note(whole.model_copy(update=given))
             key.update(repr((entry.unit, record.key, record.state, given, entry.of_soaks)).encode())
@@ -208,7 +214,7 @@ class UnitJobs:
         return any(pattern == "all" or fnmatchcase(unit, pattern) for pattern in self.options.pages)
 
     def _has_page(self, unit: str) -> bool:
-        return (self.folder.unit(unit) / PAGE).is_dir()
+        return self.folder.units.holds(unit, PAGE_FILE)
 
     def pages_missing(self, known: Collection[str]) -> bool:
         """Return True if a page is asked for that is not there, or that the report does not know of."""
@@ -243,12 +249,13 @@ class UnitJobs:
         stage = Stage("certificates", total=len(units))
         for unit in units:
             self.progress(stage)
-            record = self.folder.record(unit)
+            record = self.folder.units.record(unit)
             assert record is not None
             try:
                 if record.unit in self.without_recordings:
                     raise ConfigError("its recordings are not there, and it may be of another config")
-                signed = certificate_of(record, self.folder.unit(record.unit), config, sheet)
+                with self.folder.units.file(unit, record.map_file) as path:
+                    signed = certificate_of(record, path, config, sheet)
             except FusionError as error:
                 failed.append(f"unit {record.unit} has no certificate: {error}")
                 continue
@@ -259,10 +266,10 @@ class UnitJobs:
         return failed
 
 
-def work_in_place(place: UnitPlace, task: Task) -> UnitRecord | UnitResult:
-    """Do a unit and put it into the folder, where that is reached from here; return its record, else all of it."""
+def work_in_place(folders: UnitFolders, task: Task) -> UnitRecord | UnitResult:
+    """Do a unit and put it into its folder, where that is reached from here; return its record, else all of it."""
     result = work(task)
-    return place.put(result.record, result.files) if place.reached() else result
+    return folders.put(result.record, result.files) if folders.reached() else result
 
 
 def _failed(task: Task, lost: WorkerLost) -> UnitRecord:

@@ -80,7 +80,9 @@ def test_processes_change_nothing(
     with threadpool_limits(1):
         family, values = _found(in_partitions(units, 7))
         with Pool(2) as pool:
-            by_two, theirs = _found(replace(in_partitions(units, 7), engine=pool.ordered, folder=tmp_path))
+            by_two, theirs = _found(
+                replace(in_partitions(units, 7), engine=pool.ordered, scratch=partitions.ScratchFolder(tmp_path))
+            )
     assert by_two.model_dump_json() == family.model_dump_json()
     assert np.array_equal(theirs, values, equal_nan=True)
 

@@ -16,8 +16,9 @@ from clusters import said, scheduler, worker
 from driftlab.config import load_config
 from driftlab.production import fleet as job
 from driftlab.production import units_pass
-from driftlab.production.store import SCRATCH, UnitPlace, fleet_folder
+from driftlab.production.store import fleet_folder
 from driftlab.production.unit import Task, UnitResult
+from driftlab.production.unit_folders import SCRATCH, UnitPlace
 from driftlab.production.units_pass import work_in_place
 
 COUNT = 5
@@ -118,5 +119,5 @@ def test_a_worker_that_does_not_see_the_folder_gives_the_unit_back(line, tmp_pat
             assert set(result.files) == {"unit.npz", "map.json"}
             assert os.listdir(folder.path / "units") == []
         record = work_in_place(folder.place, task)
-        assert record.key == folder.record("0000").key
+        assert record.key == folder.units.record("0000").key
         assert set(record.written) == {"unit.npz", "map.json"}

@@ -29,7 +29,7 @@ def test_a_folder_is_opened_again_whatever_its_units_are_called(name, tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put(UnitRecord(key="k", unit=name, state="failed", error="none"), {"unit.npz": b"1"}, "stamp")
     with fleet_folder(tmp_path / "fleet") as folder:
-        assert (folder.unit(name) / "unit.npz").read_bytes() == b"1"
+        assert (folder.place.unit(name) / "unit.npz").read_bytes() == b"1"
         assert folder.stamps == {name: ("k", "stamp")}
 
 
@@ -41,7 +41,7 @@ def test_what_a_killed_command_left_is_finished(tmp_path):
     (units / "6").rename(units / ".6.old")  # taken away, and nothing put in its place
     (units / ".7.new").mkdir()  # half made
     with fleet_folder(tmp_path / "fleet") as folder:
-        assert (folder.unit("6") / "unit.npz").read_bytes() == b"1"
+        assert (folder.place.unit("6") / "unit.npz").read_bytes() == b"1"
     assert sorted(path.name for path in units.iterdir()) == ["6", "7"]
 
 
@@ -51,10 +51,14 @@ def test_what_others_put_beside_the_files_of_a_unit_stays(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put(record, files, "stamp")
         for name in ("map.png", "page/notes.txt", "explained/mine.py", "mine.txt"):
-            (folder.unit("6") / name).write_text("mine")
+            (folder.place.unit("6") / name).write_text("mine")
         for _ in range(2):
             folder.put(record, {"map.json": b"2"}, "stamp")
-        left = {str(p.relative_to(folder.unit("6"))): p.read_text() for p in folder.unit("6").rglob("*") if p.is_file()}
+        left = {
+            str(p.relative_to(folder.place.unit("6"))): p.read_text()
+            for p in folder.place.unit("6").rglob("*")
+            if p.is_file()
+        }
     mine = dict.fromkeys(("map.png", "page-notes.txt", "explained-mine.py", "mine.txt"), "mine")
     assert {name: text for name, text in left.items() if name != "unit.json"} == {"map.json": "2", **mine}
 
@@ -93,7 +97,7 @@ def test_a_file_of_a_unit_that_was_edited_goes_along_with_the_one_that_is_made_a
 def test_a_record_that_was_edited_is_put_aside_when_the_manifest_says_something_else(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
-        path = folder.unit("6") / "unit.json"
+        path = folder.place.unit("6") / "unit.json"
         path.write_text(path.read_text().replace('"none"', '"edited"'))
         for lot in "ab":
             folder.note(UnitRecord(unit="6", lot=lot, **FAILED))
@@ -107,7 +111,7 @@ def test_what_others_call_as_a_folder_of_pages_stays(tmp_path):
     record = UnitRecord(unit="6", **FAILED)
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put(record, {"explained/loop.json": b"1"}, "stamp")
-        unit = folder.unit("6")
+        unit = folder.place.unit("6")
         (unit / "page").write_text("mine")
         (unit / "explained" / "page").mkdir()
         (unit / "explained" / "page" / "mine.txt").write_text("mine")
@@ -151,7 +155,7 @@ def test_a_certificate_that_a_kill_stops_is_replaced_by_the_next(tmp_path, monke
                 folder.put_certificate("6", *sheet("b"))
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put_certificate("6", *sheet("c"))
-        names = {path.name: path for path in folder.unit("6").iterdir()}
+        names = {path.name: path for path in folder.place.unit("6").iterdir()}
         assert names.keys() == {"unit.json", "certificate.html", "certificate.json"}
         assert names["certificate.html"].read_text() == "c"
 
@@ -234,17 +238,17 @@ def test_a_link_in_the_place_of_a_unit_goes_along_each_time_that_the_unit_is_mad
     (tmp_path / "moved").mkdir()
     with fleet_folder(tmp_path / "fleet") as folder:
         for _ in range(2):
-            folder.unit("6").symlink_to(tmp_path / "moved")
+            folder.place.unit("6").symlink_to(tmp_path / "moved")
             folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
-            assert (folder.unit("6") / "6").is_symlink()
-            remove(folder.unit("6"))
+            assert (folder.place.unit("6") / "6").is_symlink()
+            remove(folder.place.unit("6"))
 
 
 def test_a_unit_called_new_is_found_again_after_a_kill(tmp_path):
     with fleet_folder(tmp_path / "fleet") as folder:
         folder.put(UnitRecord(unit="6", **FAILED), {"map.json": b"6"}, "stamp")
         folder.put(UnitRecord(unit="6.new", **FAILED), {"map.json": b"6.new"}, "stamp")
-        folder.unit("6.new").rename(folder.unit(".6.new.old"))
+        folder.place.unit("6.new").rename(folder.place.unit(".6.new.old"))
     with fleet_folder(tmp_path / "fleet") as folder:
-        assert (folder.unit("6.new") / "map.json").read_bytes() == b"6.new"
-        assert (folder.unit("6") / "map.json").read_bytes() == b"6"
+        assert (folder.place.unit("6.new") / "map.json").read_bytes() == b"6.new"
+        assert (folder.place.unit("6") / "map.json").read_bytes() == b"6"

@@ -6,9 +6,11 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from driftlab.family.partitions import ScratchFolder
 from driftlab.family.record import Figure, UnitRecord
 from driftlab.production.store import StoredUnits
 from driftlab.production.tables import COLUMNS, _Table, all_columns, frame_of, join_tables, rows_of
+from driftlab.production.unit_folders import UnitPlace
 from fusion_core.errors import UnreadableFile
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "output_files.md").read_text()
@@ -92,6 +94,7 @@ def test_the_schema_is_the_same_whatever_is_in_it(written):
 
 
 def test_a_unit_whose_record_is_gone_is_named(tmp_path):
-    units = StoredUnits(tmp_path, ("0007",), ("",))
+    folders = UnitPlace(tmp_path, b"")
+    units = StoredUnits(folders, ("0007",), ("",))
     with pytest.raises(UnreadableFile, match=r"units/0007: has no record any more; give the same command again"):
-        _Table(tmp_path, None, (), ()).write(units, [False], [None], [None], [None], [tmp_path / "part"])
+        _Table(folders, ScratchFolder(tmp_path), None, (), ()).write(units, [False], [None], [None], [None], ["part"])

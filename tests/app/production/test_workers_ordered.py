@@ -9,11 +9,13 @@ import unit_work
 from families_at_rest import effect_of
 
 from driftlab.family.basis import STEP
+from driftlab.family.partitions import ScratchFolder
 from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import _bare
-from driftlab.production.store import UNITS, stored_units
+from driftlab.production.store import stored_units
+from driftlab.production.unit_folders import UnitPlace
 from driftlab.production.workers import Pool
 from driftlab.soak.blocks import SoakRows
 from fusion_core.errors import DataError, UnreadableFile
@@ -33,7 +35,7 @@ def kept(tmp_path_factory):
         soaked = UnitInformation.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
         (folder / UNITS / soaked.unit).mkdir(parents=True)
         (folder / UNITS / soaked.unit / "unit.npz").write_bytes(soaked.to_bytes())
-    return stored_units(folder, [f"{k:02d}" for k in range(COUNT)], [f"L{k % 2}" for k in range(COUNT)])
+    return stored_units(UnitPlace(folder, b""), [f"{k:02d}" for k in range(COUNT)], [f"L{k % 2}" for k in range(COUNT)])
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +82,8 @@ def test_units_that_are_kept_are_those_without_the_effects_and_come_again(kept, 
     )  # fmt: skip
     common = SharedEffects(verdict="explained", effects=(shared,), tried=1, units=COUNT, searched=COUNT)
     expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept.read()]
-    for engine, folder in ((map, None), (hands, tmp_path)):
-        units = replace(kept, engine=engine, folder=folder).keep("apart", partial(_bare, [shared]), [None] * COUNT)
+    for engine, scratch in ((map, None), (hands, ScratchFolder(tmp_path))):
+        units = replace(kept, engine=engine, scratch=scratch).keep("apart", partial(_bare, [shared]), [None] * COUNT)
         assert len(units) == COUNT
         for _ in range(2):
             found = list(units.read())
@@ -94,7 +96,7 @@ def test_units_that_are_kept_are_those_without_the_effects_and_come_again(kept, 
 
 
 def test_a_file_that_is_damaged_is_named_wherever_it_is_read(kept, hands):
-    path = kept.parts[0].folder / UNITS / "07" / "unit.npz"
+    path = kept.parts[0].folders.unit("07") / "unit.npz"
     content = path.read_bytes()
     path.write_bytes(content[:1000])
     try:
