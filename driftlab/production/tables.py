@@ -31,7 +31,7 @@ from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
 from driftlab.production.store import FAMILY, REPORT, TABLE, FleetFolder, StoredUnits
 from driftlab.production.summary import FleetProgress, Stage
-from driftlab.production.unit_folders import COMMAND, FAMILY_MAP, PAGE_FILE, UnitFolders
+from driftlab.production.unit_folders import COMMAND, FAMILY_MAP, UnitFolders
 from driftlab.production.unit_map import file_content
 from driftlab.production.units_pass import FleetStatus
 from driftlab.reports.fleet import write_fleet_report
@@ -96,7 +96,7 @@ def write_fleet(
         join_tables(folder.hidden(TABLE), paths, more, {"driftlab": __version__, "SI": status.bias_unit})
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
-    links = {name: f"{folder.units.root}/{name}/{PAGE_FILE}" for name in pages}
+    links = {name: f"{folder.units.root}/{name}/page/report.html" for name in pages}
     overview = _overview(title, status, tracked_unit(config.filter), analysis, links, curves, drawn)
     write_fleet_report(folder.hidden(REPORT), replace(overview, **beside))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])

@@ -112,8 +112,11 @@ def work(task: Task) -> UnitResult:
 
 
 def _message(error: Exception, recordings: Recordings) -> str:
-    """Return an error's text, which may name copies that are soon gone, with the URLs in their place."""
-    text = str(error) if isinstance(error, FusionError) else describe_error(error)
+    return _with_urls(str(error) if isinstance(error, FusionError) else describe_error(error), recordings)
+
+
+def _with_urls(text: str, recordings: Recordings) -> str:
+    """Return a text, which may name copies that are soon gone, with the URLs in their place."""
     for name in (name for names in recordings.values() for name in names if isinstance(name, CopyName)):
         text = text.replace(str(part_of(name)[0]), name.url)
     return text
@@ -180,6 +183,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if len(soaks) > 1:
         names = dict(zip(task.recordings[CALIBRATION], soaks, strict=True))
         repeats, notes = repeated(config, names, recordings.get(HOLDOUT, ()))
+        notes = [_with_urls(note, recordings) for note in notes]
     record: dict[str, Any] = {
         "state": "done",
         "channel": fitted.record.channel,
@@ -198,7 +202,12 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "map_file": unit.file,
         "verdict": unit.sentences(),
         "limits": run.limits,
-        "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes, *notes],
+        "notes": [
+            *faults.lines(),
+            *_excess_walk(soaked, densities),
+            *run.notes,
+            *(_with_urls(note, recordings) for note in notes),
+        ],
         "plugins": participants(unit.config),
     }
     if task.page:

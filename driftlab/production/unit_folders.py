@@ -30,7 +30,7 @@ from fusion_core.errors import UnreadableFile
 MARK = "fleet.json"  # of a fleet's folder
 UNITS, RECORD, INFORMATION = "units", "unit.json", "unit.npz"  # folder of the units, and files in each of theirs
 FAMILY_MAP, COMMAND = "family_map.json", "fleet"  # in the folder of a unit, which knows itself and this command
-PAGE, PAGE_FILE = "page", "page/report.html"  # folder of a unit's pages, and the one that is always there
+PAGE, PAGE_FILE = "page", "page/map.report.html"  # folder of a unit's pages, and the one that is always there
 INSIDE = (PAGE, "explained", "")  # folders of a unit in which driftlab writes; the one with the record is the last
 SCRATCH = ".family.new"  # what workers keep for the passes of a family
 NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
@@ -111,8 +111,8 @@ class UnitFolders(ABC):
             return UnitInformation.from_bytes(self.read(unit, INFORMATION))
         except Exception:  # of a damaged archive nearly any
             raise UnreadableFile(
-                f"{self.address}/{unit}/{INFORMATION}: is missing or damaged; remove the folder and give the same command "
-                "again"
+                f"{self.address}/{unit}/{INFORMATION}: is missing or damaged; remove the folder and give the same "
+                "command again"
             ) from None
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from driftlab.family.record import UnitRecord
 from driftlab.production.remote import is_url, system_of
-from driftlab.production.unit_folders import PAGE, RECORD, SCRATCH, UNITS, UnitFolders, content_of, digests
+from driftlab.production.unit_folders import PAGE_FILE, RECORD, SCRATCH, UNITS, UnitFolders, content_of, digests
 from fusion_core.errors import ConfigError, FusionError, Unwritable, describe_error, quote
 
 HELD = "driftlab.json"  # says which fleet a store is of
@@ -168,7 +168,7 @@ class UnitStore(UnitFolders):
 
     def put_page(self, unit: str, pages: Mapping[str, bytes]) -> None:
         """Write the pages of a unit."""
-        for name in sorted(pages, key=f"{PAGE}/report.html".__eq__):  # which says that they are there
+        for name in sorted(pages, key=PAGE_FILE.__eq__):  # which says that they are there
             self.write(unit, name, pages[name])
 
     @contextmanager

@@ -111,7 +111,7 @@ def test_another_s_place_is_refused(bucket):
 
 def in_store(bucket, place):
     """Return the objects of a fleet as files in a folder."""
-    folder = Path("copy")
+    folder = Path(f"copy-{place}")
     for name in bucket.find(f"line/{place}/units"):
         path = folder / name.removeprefix(f"line/{place}/")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,10 @@ def test_a_fleet_there_is_as_in_a_folder(line, bucket, monkeypatch):
     ]  # fmt: skip
     assert result.record("0001").state == "done"
     found, expected = fleets.contents(in_store(bucket, "c")), fleets.contents(line / "here")
-    assert found == {name: content for name, content in expected.items() if name.startswith("units/")}
+    expected = {name: content for name, content in expected.items() if name.startswith("units/")}
+    assert found.keys() == expected.keys()
+    # a certificate is identified by its map, which says when it was fitted
+    assert [name for name in found if found[name] != expected[name] and "certificate" not in name] == []
     tables = [pl.read_parquet(f"{name}/units.parquet").drop("seconds") for name in ("there", "here")]
     assert tables[0].equals(tables[1])
     assert Path("there/family.json").exists() == Path("here/family.json").exists()

@@ -15,7 +15,7 @@ from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import _bare
 from driftlab.production.store import stored_units
-from driftlab.production.unit_folders import UnitPlace
+from driftlab.production.unit_folders import UNITS, UnitPlace
 from driftlab.production.workers import Pool
 from driftlab.soak.blocks import SoakRows
 from fusion_core.errors import DataError, UnreadableFile
