@@ -16,59 +16,40 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from common import Row, show
-from fleet_units import config_text
+from fleet_units import PER_LOT, config_text, date_of_light, key_of_light, put_lot
 
 from driftlab.config import load_config
-from driftlab.family.basis import STEP
-from driftlab.family.record import Figure, UnitRecord
-from driftlab.family.unit_information import UnitInformation
 from driftlab.production.fleet import fleet
+from driftlab.production.manifest import read_manifest
 from driftlab.production.store import fleet_folder
-from driftlab.soak.blocks import SoakRows
+from driftlab.production.unit import Task
+from driftlab.production.units_pass import stamp_of, versions_of
+from driftlab.production.workers import Pool
 
-AXES = ("x", "y", "z")
-DEG_H = np.pi / 180 / 3600
-FIGURES = {"residual": 1.0, "noise": 2.0, "walk": 0.02, "swing": 30.0, "coast": 4.0, "hysteresis": 0.5}
-PER_LOT = 500  # units
 BUDGET = 1.0  # kB a unit in the driver
 
 
-def put_units(out: Path, count: int) -> Path:
-    """Put light units into a fleet's folder; return their manifest."""
-    rng, rows = np.random.default_rng(0), 40
-    t = np.arange(rows) * 90.0
-    T = 20.0 - 20.0 * np.cos(2 * np.pi * t / t[-1])
-    shapes = np.cos(np.outer(np.arange(4), np.pi * T / 40.0))
-    white, walk, span = np.full(3, 2.0 * DEG_H), np.full(3, 0.02 * DEG_H), np.full(rows, 90.0)
-    lines = ["unit,path,lot,date"]
-    with fleet_folder(out) as folder:
-        place = folder.place
-        for k in range(count):
-            name, lot = f"{k:07d}", f"L{k // PER_LOT}"
-            curve = DEG_H * (np.array([20.0, 10.0, 5.0, 2.0]) * rng.normal(size=(3, 4))) @ shapes
-            noise = np.cumsum(walk[:, None] * np.sqrt(90.0) * rng.normal(size=(3, rows)), axis=1)
-            bias = curve + noise + white[:, None] / np.sqrt(90.0) * rng.normal(size=(3, rows))
-            soaked = UnitInformation.of(name, AXES, [SoakRows(t, T, bias.T, span, {})], white, walk, STEP)
-            record = UnitRecord(
-                key=f"{k:064x}", unit=name, lot=lot, date=f"2026-01-{1 + k % 28:02d}", state="done", channel="gyro",
-                bias_unit="rad/s", axes=AXES, domain=(0.0, 40.0), hours=1.0, samples=rows, map_file="map.json",
-                figures={name: _figure(size * DEG_H, rng) for name, size in FIGURES.items()}, seconds=0.3,
-                limits=[{"name": "noise", "verdict": "pass"}],
-            )  # fmt: skip
-            place.put(record, {"unit.npz": soaked.to_bytes()})
-            lines.append(f"{name},{name}.h5,{lot},{record.date}")
-    manifest = out.with_suffix(".csv")
-    manifest.write_text("\n".join(lines))
+def put_units(out: Path, count: int, workers: int) -> Path:
+    """Put light units into a fleet's folder, with recordings that are empty; return their manifest."""
+    config, manifest = load_config(out.parent / "family.yaml"), out.with_suffix(".csv")
+    lots = [range(first, min(first + PER_LOT, count)) for first in range(0, count, PER_LOT)]
+    lines = [f"{k:07d},{out.name}-soaks/{k:07d}.h5,L{k // PER_LOT},{date_of_light(k)}" for of in lots for k in of]
+    manifest.write_text("\n".join(["unit,path,lot,date", *lines]))
+    soaks = out.with_name(f"{out.name}-soaks")
+    soaks.mkdir()
+    with fleet_folder(out) as folder, Pool(workers) as pool:
+        for _ in pool.ordered(partial(put_lot, folder.place, soaks), lots):
+            pass
+        versions, yaml = versions_of(config), config.as_yaml()
+        for k, entry in enumerate(read_manifest(str(manifest)).units):
+            task = Task(**vars(entry), config=yaml, folder=os.getcwd())
+            folder.stamp(entry.unit, key_of_light(k), stamp_of(task, versions))
     return manifest
-
-
-def _figure(size: float, rng: np.random.Generator) -> Figure:
-    return Figure(value=tuple((size * np.exp(0.1 * rng.normal(size=3))).tolist()), sigma=(0.05 * size,) * 3)
 
 
 def driven(config: Path, manifest: Path, out: Path, workers: int) -> None:
@@ -107,9 +88,9 @@ def _others() -> list[tuple[float, float]]:
 def measured(folder: Path, count: int, workers: int) -> dict[str, object]:
     """Return the result of `driven` of so many units, in a process group of its own."""
     out = folder / f"fleet-{count}"
-    manifest = put_units(out, count)
     config = folder / "family.yaml"
     config.write_text(config_text())
+    manifest = put_units(out, count, workers)
     command = [sys.executable, __file__, "--driven", *map(str, (config, manifest, out, workers))]
     said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, start_new_session=True).stdout
     return dict(json.loads(said.splitlines()[-1]))

@@ -9,15 +9,27 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from driftlab.family.basis import STEP
+from driftlab.family.record import Figure, UnitRecord
+from driftlab.family.unit_information import UnitInformation
+from driftlab.production.store import UnitPlace
 from driftlab.production.unit import Task, UnitResult, key_of, work
 from driftlab.production.workers import Workers
+from driftlab.soak.blocks import SoakRows
 
 RESULT = os.urandom(100_000)
+
+
+AXES = ("x", "y", "z")
+DEG_H = np.pi / 180 / 3600
+FIGURES = {"residual": 1.0, "noise": 2.0, "walk": 0.02, "swing": 30.0, "coast": 4.0, "hysteresis": 0.5}
+PER_LOT = 500  # units
 
 
 def burn(seconds: float) -> bytes:
@@ -122,3 +134,38 @@ def shifted(done: UnitResult, task: Task, rng: np.random.Generator) -> UnitResul
 
 
 __all__ = ["Light", "Workers", "burn", "cluster", "config_text", "cpu", "shifted", "work", "write_units"]
+
+
+def put_lot(place: UnitPlace, soaks: Path, units: range) -> None:
+    """Put the light units of a lot into the place of a fleet's, as a worker puts them."""
+    rng, rows = np.random.default_rng(units.start), 40
+    t = np.arange(rows) * 90.0
+    T = 20.0 - 20.0 * np.cos(2 * np.pi * t / t[-1])
+    shapes = np.cos(np.outer(np.arange(4), np.pi * T / 40.0))
+    white, walk, span = np.full(3, 2.0 * DEG_H), np.full(3, 0.02 * DEG_H), np.full(rows, 90.0)
+    for k in units:
+        name = f"{k:07d}"
+        (soaks / f"{name}.h5").touch()
+        curve = DEG_H * (np.array([20.0, 10.0, 5.0, 2.0]) * rng.normal(size=(3, 4))) @ shapes
+        noise = np.cumsum(walk[:, None] * np.sqrt(90.0) * rng.normal(size=(3, rows)), axis=1)
+        bias = curve + noise + white[:, None] / np.sqrt(90.0) * rng.normal(size=(3, rows))
+        soaked = UnitInformation.of(name, AXES, [SoakRows(t, T, bias.T, span, {})], white, walk, STEP)
+        record = UnitRecord(
+            key=key_of_light(k), unit=name, lot=f"L{k // PER_LOT}", date=date_of_light(k), state="done", channel="gyro",
+            bias_unit="rad/s", axes=AXES, domain=(0.0, 40.0), hours=1.0, samples=rows, map_file="map.json",
+            figures={name: _figure(size * DEG_H, rng) for name, size in FIGURES.items()}, seconds=0.3,
+            limits=[{"name": "noise", "verdict": "pass"}],
+        )  # fmt: skip
+        place.put(record, {"unit.npz": soaked.to_bytes()})
+
+
+def key_of_light(k: int) -> str:
+    return sha256(str(k).encode()).hexdigest()
+
+
+def date_of_light(k: int) -> str:
+    return f"2026-01-{1 + k % 28:02d}"
+
+
+def _figure(size: float, rng: np.random.Generator) -> Figure:
+    return Figure(value=tuple((size * np.exp(0.1 * rng.normal(size=3))).tolist()), sigma=(0.05 * size,) * 3)
