@@ -198,7 +198,8 @@ class ControlChart:
         return {
             "quantity": self.quantity, "axis": self.axis, "unit": self.unit, "units": len(self.at),
             "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre,
-            "low": float(np.median(low)), "high": float(np.median(high)), "beyond": int(np.sum(self.beyond)), "ewma_beyond": int(np.sum(self.drifting)),
+            "low": float(np.median(low)), "high": float(np.median(high)), "beyond": int(np.sum(self.beyond)),
+            "ewma_beyond": int(np.sum(self.drifting)),
             "moving_range": {"usual": D2, "limit": D4, "beyond": int(np.sum(self.ranges > D4))},
             "autocorrelation": self.phi, "changes": changes, "trend": None if self.trend is None else vars(self.trend),
             "lots": [lot.as_json() for lot in self.lots if lot.name],
