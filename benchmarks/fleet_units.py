@@ -6,12 +6,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,8 +17,6 @@ from driftlab.family.basis import STEP
 from driftlab.family.record import Figure, UnitRecord
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.store import UnitPlace
-from driftlab.production.unit import Task, UnitResult, key_of, work
-from driftlab.production.workers import Workers
 from driftlab.soak.blocks import SoakRows
 
 RESULT = os.urandom(100_000)
@@ -91,49 +87,6 @@ def write_units(folder: Path, count: int, hours: float = 2.0) -> list[Path]:
 def config_text() -> str:
     """Return the config of that family."""
     return (Path(__file__).parents[1] / "examples" / "06_family" / "family.yaml").read_text()
-
-
-@dataclass
-class Light(ExitStack):
-    """Workers that compute nothing: a unit's result is one of a few real ones, its map shifted by a draw, renamed."""
-
-    real: list[UnitResult]
-    spent: ClassVar[float] = 0.0  # s of the processor, which are no driver's
-
-    def __post_init__(self) -> None:
-        super().__init__()
-
-    def map(self, function: object, items: Iterable[Task]) -> Iterator[tuple[Task, UnitResult]]:
-        """Yield each task with its result."""
-        rng = np.random.default_rng(0)
-        for k, task in enumerate(items):
-            begun = time.process_time()
-            done = shifted(self.real[k % len(self.real)], task, rng)
-            Light.spent += time.process_time() - begun
-            yield task, done
-
-
-def shifted(done: UnitResult, task: Task, rng: np.random.Generator) -> UnitResult:
-    """Return a real result as that of another unit: other coefficients, other figures, the same information."""
-    from driftlab.family.unit_information import UnitInformation
-
-    soaked = UnitInformation.from_bytes(done.files["unit.npz"])
-    scale = float(np.std(np.concatenate([rows.bias for rows in soaked.recordings], axis=0)))
-    smooth = np.cos(np.outer(np.arange(4), np.linspace(0, np.pi, soaked.knots.q)))
-    c = 0.3 * scale * rng.normal(size=(len(soaked.axes), 4)) @ smooth
-    rows = tuple(replace(r, bias=r.bias + soaked.knots.values(r.T) @ c.T) for r in soaked.recordings)
-    h = soaked.h + np.einsum("dij,dj->di", soaked.J, c)
-    other = replace(soaked, unit=task.unit, h=h, recordings=rows)
-    figures = {
-        name: figure.model_copy(update={"value": tuple(v and v * np.exp(0.05 * rng.normal()) for v in figure.value)})
-        for name, figure in done.record.figures.items()
-    }
-    told = {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "key": key_of(task)}
-    record = done.record.model_copy(update={**told, "figures": figures})
-    return UnitResult(record, {**done.files, "unit.npz": other.to_bytes()})
-
-
-__all__ = ["Light", "Workers", "burn", "cluster", "config_text", "cpu", "shifted", "work", "write_units"]
 
 
 def put_lot(place: UnitPlace, soaks: Path, units: range) -> None:
