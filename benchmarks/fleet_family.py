@@ -3,7 +3,8 @@
     python benchmarks/fleet_family.py [--units 2000 10000] [--workers 2] [--folder DIR]
 
 Light units have soaks of forty rows, of which the sums are real: their folders are put into a fleet as a worker puts
-them, and `driftlab fleet` finds all of them done. So what is measured is all but the units' own work.
+them, and `driftlab fleet` finds all of them done. So what is measured is all but the units' own work. Fleets in DIR
+stay there, and are taken by the next call.
 """
 
 from __future__ import annotations
@@ -16,75 +17,62 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from common import Row, show
-from fleet_units import config_text
+from fleet_units import PER_LOT, config_text, date_of_light, key_of_light, put_lot
 
 from driftlab.config import load_config
-from driftlab.family.basis import STEP
-from driftlab.family.record import Figure, UnitRecord
-from driftlab.family.unit_information import UnitInformation
 from driftlab.production.fleet import fleet
+from driftlab.production.manifest import read_manifest
 from driftlab.production.store import fleet_folder
-from driftlab.soak.blocks import SoakRows
+from driftlab.production.unit import Task
+from driftlab.production.units_pass import stamp_of, versions_of
+from driftlab.production.workers import Pool
 
-AXES = ("x", "y", "z")
-DEG_H = np.pi / 180 / 3600
-FIGURES = {"residual": 1.0, "noise": 2.0, "walk": 0.02, "swing": 30.0, "coast": 4.0, "hysteresis": 0.5}
-PER_LOT = 500  # units
 BUDGET = 1.0  # kB a unit in the driver
 
 
-def put_units(out: Path, count: int) -> Path:
-    """Put light units into a fleet's folder; return their manifest."""
-    rng, rows = np.random.default_rng(0), 40
-    t = np.arange(rows) * 90.0
-    T = 20.0 - 20.0 * np.cos(2 * np.pi * t / t[-1])
-    shapes = np.cos(np.outer(np.arange(4), np.pi * T / 40.0))
-    white, walk, span = np.full(3, 2.0 * DEG_H), np.full(3, 0.02 * DEG_H), np.full(rows, 90.0)
-    lines = ["unit,path,lot,date"]
-    with fleet_folder(out) as folder:
-        place = folder.place
-        for k in range(count):
-            name, lot = f"{k:07d}", f"L{k // PER_LOT}"
-            curve = DEG_H * (np.array([20.0, 10.0, 5.0, 2.0]) * rng.normal(size=(3, 4))) @ shapes
-            noise = np.cumsum(walk[:, None] * np.sqrt(90.0) * rng.normal(size=(3, rows)), axis=1)
-            bias = curve + noise + white[:, None] / np.sqrt(90.0) * rng.normal(size=(3, rows))
-            soaked = UnitInformation.of(name, AXES, [SoakRows(t, T, bias.T, span, {})], white, walk, STEP)
-            record = UnitRecord(
-                key=f"{k:064x}", unit=name, lot=lot, date=f"2026-01-{1 + k % 28:02d}", state="done", channel="gyro",
-                bias_unit="rad/s", axes=AXES, domain=(0.0, 40.0), hours=1.0, samples=rows, map_file="map.json",
-                figures={name: _figure(size * DEG_H, rng) for name, size in FIGURES.items()}, seconds=0.3,
-                limits=[{"name": "noise", "verdict": "pass"}],
-            )  # fmt: skip
-            place.put(record, {"unit.npz": soaked.to_bytes()})
-            lines.append(f"{name},{name}.h5,{lot},{record.date}")
-    manifest = out.with_suffix(".csv")
-    manifest.write_text("\n".join(lines))
+def put_units(out: Path, count: int, workers: int) -> Path:
+    """Put light units into a fleet's folder, with recordings that are empty; return their manifest."""
+    config, manifest = load_config(out.parent / "family.yaml"), out.with_suffix(".csv")
+    lots = [range(first, min(first + PER_LOT, count)) for first in range(0, count, PER_LOT)]
+    lines = [f"{k:07d},{out.name}-soaks/{k:07d}.h5,L{k // PER_LOT},{date_of_light(k)}" for of in lots for k in of]
+    manifest.write_text("\n".join(["unit,path,lot,date", *lines]))
+    soaks = out.with_name(f"{out.name}-soaks")
+    soaks.mkdir()
+    with fleet_folder(out) as folder, Pool(workers) as pool:
+        for _ in pool.ordered(partial(put_lot, folder.place, soaks), lots):
+            pass
+        versions, yaml = versions_of(config), config.as_yaml()
+        for k, entry in enumerate(read_manifest(str(manifest)).units):
+            task = Task(**vars(entry), config=yaml, folder=os.getcwd())
+            folder.stamp(entry.unit, key_of_light(k), stamp_of(task, versions))
     return manifest
 
 
-def _figure(size: float, rng: np.random.Generator) -> Figure:
-    return Figure(value=tuple((size * np.exp(0.1 * rng.normal(size=3))).tolist()), sigma=(0.05 * size,) * 3)
-
-
-def driven(config: Path, manifest: Path, out: Path, workers: int) -> None:
-    """Do the family of a fleet; print its processor by stage, the driver's and the workers', and peaks of memory."""
-    marks, peaks = list[tuple[str, float, float]](), [0.0]
+def driven(config: Path, manifest: Path, out: Path, workers: int, rules: str) -> None:
+    """Do a fleet; print by stage its time and its processor, the driver's and the workers', and peaks of memory, MB."""
+    marks, peaks = list[tuple[str, float, float, float]](), [0.0]
 
     def note(stage: object) -> None:
         name = str(getattr(stage, "name", ""))
+        if marks and marks[-1][0] == name:
+            return
         others = _others()
         peaks[0] = max([peaks[0], *(peak for _, peak in others)])
-        if not marks or marks[-1][0] != name:
-            marks.append((name, time.process_time(), sum(used for used, _ in others)))
+        marks.append((name, time.perf_counter(), time.process_time(), sum(used for used, _ in others)))
 
-    fleet(load_config(config), str(manifest), out, workers=workers, progress=note)
-    marks.append(("end", time.process_time(), marks[-1][2]))
-    stages = {name: [later[1] - own, later[2] - theirs] for (name, own, theirs), later in pairwise(marks)}
+    fleet(load_config(config), str(manifest), out, workers=workers, rules=rules or None, progress=note)
+    marks.append(("end", time.perf_counter(), time.process_time(), marks[-1][3]))
+    stages = {
+        name: [after - before for before, after in zip(began, ended, strict=True)]
+        for (name, *began), (_, *ended) in pairwise(marks)
+    }
     driver = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({"stages": stages, "driver_MB": driver, "worker_MB": peaks[0]}))
 
@@ -104,15 +92,20 @@ def _others() -> list[tuple[float, float]]:
     return found
 
 
-def measured(folder: Path, count: int, workers: int) -> dict[str, object]:
-    """Return the result of `driven` of so many units, in a process group of its own."""
-    out = folder / f"fleet-{count}"
-    manifest = put_units(out, count)
-    config = folder / "family.yaml"
-    config.write_text(config_text())
-    command = [sys.executable, __file__, "--driven", *map(str, (config, manifest, out, workers))]
+def measured(manifest: Path, out: Path, workers: int, rules: str = "") -> dict[str, Any]:
+    """Return the result of `driven` in a process group of its own; the config is beside the manifest."""
+    given = (manifest.with_name("family.yaml"), manifest, out, workers, rules)
+    command = [sys.executable, str(Path(__file__)), "--driven", *map(str, given)]
     said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, start_new_session=True).stdout
     return dict(json.loads(said.splitlines()[-1]))
+
+
+def light(folder: Path, count: int, workers: int) -> dict[str, Any]:
+    """Return what the family of so many light units takes; a fleet of them that is in the folder is taken."""
+    (folder / "family.yaml").write_text(config_text())
+    out = folder / f"fleet-{count}"
+    manifest = out.with_suffix(".csv") if out.exists() else put_units(out, count, workers)
+    return measured(manifest, out, workers)
 
 
 def main() -> None:
@@ -120,29 +113,30 @@ def main() -> None:
     ask.add_argument("--units", type=int, nargs=2, default=(2_000, 10_000))
     ask.add_argument("--workers", type=int, default=2)
     ask.add_argument("--folder", type=Path)
-    ask.add_argument("--driven", nargs=4, help=argparse.SUPPRESS)
+    ask.add_argument("--driven", nargs=5, help=argparse.SUPPRESS)
     given = ask.parse_args()
     if given.driven:
-        config, manifest, out, workers = given.driven
-        driven(Path(config), Path(manifest), Path(out), int(workers))
+        config, manifest, out, workers, rules = given.driven
+        driven(Path(config), Path(manifest), Path(out), int(workers), rules)
         return
-    with tempfile.TemporaryDirectory(dir=given.folder) as name:
-        few, many = (measured(Path(name), count, given.workers) for count in given.units)
-    n, rows = given.units[1], []
-    each = {}
-    for stage, (own, theirs) in many["stages"].items():  # type: ignore[attr-defined]
-        before = few["stages"].get(stage, (0.0, 0.0))  # type: ignore[attr-defined]
-        each[stage] = [(b - a) / (n - given.units[0]) for a, b in zip(before, (own, theirs), strict=True)]
-        rows.append(Row(f"{stage}, {n:,} units", f"driver {own:.1f} s, workers {theirs:.1f} s of the processor"))
-    grows = (many["driver_MB"] - few["driver_MB"]) * 1024 / (n - given.units[0])  # type: ignore[operator]
+    with ExitStack() as held:
+        folder = given.folder or Path(held.enter_context(tempfile.TemporaryDirectory()))
+        few, many = (light(folder, count, given.workers) for count in given.units)
+    n, rows, each = given.units[1], list[Row](), list[list[float]]()
+    for stage, (took, own, theirs) in many["stages"].items():
+        before = few["stages"].get(stage, (0.0, 0.0, 0.0))
+        each.append([(b - a) / (n - given.units[0]) for a, b in zip(before[1:], (own, theirs), strict=True)])
+        used = f"driver {own:.1f} s, workers {theirs:.1f} s of the processor, {took:.0f} s in all"
+        rows.append(Row(f"{stage}, {n:,} units", used))
+    grows = (many["driver_MB"] - few["driver_MB"]) * 1024 / (n - given.units[0])
     rows += [
         Row("driver, peak memory", f"{few['driver_MB']:.0f} and {many['driver_MB']:.0f} MB"),
         Row("driver, a unit more", f"{grows:.2f} kB", f"at most {BUDGET:g} kB", bool(grows <= BUDGET)),
         Row("a worker, peak memory", f"{few['worker_MB']:.0f} and {many['worker_MB']:.0f} MB"),
     ]
     show(f"Fleets: the family of light units, {given.workers} workers", rows)
-    total = [sum(column) * 1e6 / 3600 for column in zip(*each.values(), strict=True)]
-    base = few["driver_MB"] - grows * given.units[0] / 1024  # type: ignore[operator]
+    total = [sum(column) * 1e6 / 3600 for column in zip(*each, strict=True)]
+    base = few["driver_MB"] - grows * given.units[0] / 1024
     show("Fleets: the family of a million on paper", [
         Row("driver, processor", f"{total[0]:.1f} h"), Row("workers, processor", f"{total[1]:.1f} h"),
         Row("driver, memory", f"{(base + grows * 1e6 / 1024) / 1024:.1f} GB", "at most 1 GB"),

@@ -6,18 +6,26 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
-from driftlab.production.unit import Task, UnitResult, key_of, work
-from driftlab.production.workers import Workers
+from driftlab.family.basis import STEP
+from driftlab.family.record import Figure, UnitRecord
+from driftlab.family.unit_information import UnitInformation
+from driftlab.production.store import UnitPlace
+from driftlab.soak.blocks import SoakRows
 
 RESULT = os.urandom(100_000)
+
+
+AXES = ("x", "y", "z")
+DEG_H = np.pi / 180 / 3600
+FIGURES = {"residual": 1.0, "noise": 2.0, "walk": 0.02, "swing": 30.0, "coast": 4.0, "hysteresis": 0.5}
+PER_LOT = 500  # units
 
 
 def burn(seconds: float) -> bytes:
@@ -81,44 +89,36 @@ def config_text() -> str:
     return (Path(__file__).parents[1] / "examples" / "06_family" / "family.yaml").read_text()
 
 
-@dataclass
-class Light(ExitStack):
-    """Workers that compute nothing: a unit's result is one of a few real ones, its map shifted by a draw, renamed."""
-
-    real: list[UnitResult]
-    spent: ClassVar[float] = 0.0  # s of the processor, which are no driver's
-
-    def __post_init__(self) -> None:
-        super().__init__()
-
-    def map(self, function: object, items: Iterable[Task]) -> Iterator[tuple[Task, UnitResult]]:
-        """Yield each task with its result."""
-        rng = np.random.default_rng(0)
-        for k, task in enumerate(items):
-            begun = time.process_time()
-            done = shifted(self.real[k % len(self.real)], task, rng)
-            Light.spent += time.process_time() - begun
-            yield task, done
-
-
-def shifted(done: UnitResult, task: Task, rng: np.random.Generator) -> UnitResult:
-    """Return a real result as that of another unit: other coefficients, other figures, the same information."""
-    from driftlab.family.unit_information import UnitInformation
-
-    soaked = UnitInformation.from_bytes(done.files["unit.npz"])
-    scale = float(np.std(np.concatenate([rows.bias for rows in soaked.recordings], axis=0)))
-    smooth = np.cos(np.outer(np.arange(4), np.linspace(0, np.pi, soaked.knots.q)))
-    c = 0.3 * scale * rng.normal(size=(len(soaked.axes), 4)) @ smooth
-    rows = tuple(replace(r, bias=r.bias + soaked.knots.values(r.T) @ c.T) for r in soaked.recordings)
-    h = soaked.h + np.einsum("dij,dj->di", soaked.J, c)
-    other = replace(soaked, unit=task.unit, h=h, recordings=rows)
-    figures = {
-        name: figure.model_copy(update={"value": tuple(v and v * np.exp(0.05 * rng.normal()) for v in figure.value)})
-        for name, figure in done.record.figures.items()
-    }
-    told = {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "key": key_of(task)}
-    record = done.record.model_copy(update={**told, "figures": figures})
-    return UnitResult(record, {**done.files, "unit.npz": other.to_bytes()})
+def put_lot(place: UnitPlace, soaks: Path, units: range) -> None:
+    """Put the light units of a lot into the place of a fleet's, as a worker puts them."""
+    rng, rows = np.random.default_rng(units.start), 40
+    t = np.arange(rows) * 90.0
+    T = 20.0 - 20.0 * np.cos(2 * np.pi * t / t[-1])
+    shapes = np.cos(np.outer(np.arange(4), np.pi * T / 40.0))
+    white, walk, span = np.full(3, 2.0 * DEG_H), np.full(3, 0.02 * DEG_H), np.full(rows, 90.0)
+    for k in units:
+        name = f"{k:07d}"
+        (soaks / f"{name}.h5").touch()
+        curve = DEG_H * (np.array([20.0, 10.0, 5.0, 2.0]) * rng.normal(size=(3, 4))) @ shapes
+        noise = np.cumsum(walk[:, None] * np.sqrt(90.0) * rng.normal(size=(3, rows)), axis=1)
+        bias = curve + noise + white[:, None] / np.sqrt(90.0) * rng.normal(size=(3, rows))
+        soaked = UnitInformation.of(name, AXES, [SoakRows(t, T, bias.T, span, {})], white, walk, STEP)
+        record = UnitRecord(
+            key=key_of_light(k), unit=name, lot=f"L{k // PER_LOT}", date=date_of_light(k), state="done", channel="gyro",
+            bias_unit="rad/s", axes=AXES, domain=(0.0, 40.0), hours=1.0, samples=rows, map_file="map.json",
+            figures={name: _figure(size * DEG_H, rng) for name, size in FIGURES.items()}, seconds=0.3,
+            limits=[{"name": "noise", "verdict": "pass"}],
+        )  # fmt: skip
+        place.put(record, {"unit.npz": soaked.to_bytes()})
 
 
-__all__ = ["Light", "Workers", "burn", "cluster", "config_text", "cpu", "shifted", "work", "write_units"]
+def key_of_light(k: int) -> str:
+    return sha256(str(k).encode()).hexdigest()
+
+
+def date_of_light(k: int) -> str:
+    return f"2026-01-{1 + k % 28:02d}"
+
+
+def _figure(size: float, rng: np.random.Generator) -> Figure:
+    return Figure(value=tuple((size * np.exp(0.1 * rng.normal(size=3))).tolist()), sigma=(0.05 * size,) * 3)

@@ -19,9 +19,10 @@ known family. n units, d axes, q coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from sys import intern
 
 import numpy as np
 import numpy.typing as npt
@@ -169,9 +170,11 @@ class Tests:
     Attributes
     ----------
     what : list of (str, int)
-        One of CURVES or FIGURES, and the axis, of each of the m tests.
-    p, values : (n, m) arrays
-        NaN where there is no test; values in SI, of the statistics of curves in deviations.
+        One of CURVES or FIGURES, and the axis, of each of the m tests: of the curves, and of figures that occur.
+    p : (n, m) array
+        NaN where there is no test.
+    values : (n, m) array
+        In SI, of the statistics of curves in deviations; single precision.
     laws : TailLaws
     of_lots : list of str
         The units' lots.
@@ -183,7 +186,7 @@ class Tests:
     names: list[str]
     what: list[tuple[str, int]]
     p: Array
-    values: Array
+    values: npt.NDArray[np.float32]
     laws: TailLaws
     of_lots: list[str]
     lots: list[tuple[str, int, str, float]]
@@ -199,30 +202,39 @@ def tests_of(
     for own, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
         curves[len(names) : len(names) + len(own)] = table
         names += own
-        lots += of_lots
-    figures, places = np.full((len(names), 2, len(FIGURES), d), np.nan), {name: k for k, name in enumerate(names)}
-    for record in records:
-        if record.state == "done" and record.unit in places:
-            figures[places[record.unit]] = record.table(FIGURES, d)
-    values = [*curves.swapaxes(0, 1), *figures[:, 0].swapaxes(0, 1)]
+        lots += map(intern, of_lots)
+    figures = _figures(records, {name: k for k, name in enumerate(names)}, d)
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}
-    p, odd_lots = [], []
-    for name, own in zip(CURVES, values, strict=False):
+    tests = [(name, axis) for name in (*CURVES, *figures) for axis in range(d)]
+    p, values, odd_lots = np.empty((len(names), len(tests))), np.empty((len(names), len(tests)), np.float32), []
+    for k, name in enumerate(CURVES):
+        own = curves[:, k]
         law = TailLaw.of(own) if laws is None else laws.curves.get(name)
         of_curves |= {} if law is None else {name: law}
-        p.append(_chance(law, own, name))
-    for k, name in enumerate(FIGURES):
-        usual, off = figure_law(name, figures[:, :, k], lots) if laws is None else (laws.figures.get(name), [{}] * d)
+        p[:, k * d : (k + 1) * d], values[:, k * d : (k + 1) * d] = _chance(law, own, name), own
+    for k, name in enumerate([*figures], len(CURVES)):
+        of_axes = figures.pop(name)
+        usual, off = figure_law(name, of_axes, lots) if laws is None else (laws.figures.get(name), [{}] * d)
         if usual is not None:
             of_figures[name] = usual
             odd_lots += [(name, axis, *lot) for axis in range(d) for lot in _times(name, usual, axis, off[axis])]
-        p.append(_of_figure(usual, name, figures[:, :, k], lots, off))
-    tests = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
-    return Tests(
-        names, tests, np.concatenate(p, axis=1), np.concatenate(values, axis=1),
-        TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots,
-    )  # fmt: skip
+        p[:, k * d : (k + 1) * d] = _of_figure(usual, name, of_axes, lots, off)
+        values[:, k * d : (k + 1) * d] = of_axes[:, 0]
+    return Tests(names, tests, p, values, TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots)
+
+
+def _figures(records: Iterable[UnitRecord], places: Mapping[str, int], d: int) -> dict[str, Array]:
+    """Return value and sigma (n, 2, d) of each of FIGURES that a unit has, by the places of the units."""
+    found: dict[str, Array] = {}
+    for record in records:
+        names = [name for name in FIGURES if name in record.figures]
+        if record.state == "done" and record.unit in places and names:
+            for name, own in zip(names, record.table(names, d).swapaxes(0, 1), strict=True):
+                if name not in found:
+                    found[name] = np.full((len(places), 2, d), np.nan)
+                found[name][places[record.unit]] = own
+    return {name: found[name] for name in FIGURES if name in found}
 
 
 def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[list[str], list[str], Array]:

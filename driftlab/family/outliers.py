@@ -48,6 +48,7 @@ from driftlab.units import BiasUnit, axis_name, default_unit
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
+AT_ONCE = 10_000  # units of which copies are made
 FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name not in ("soaks", *TERM_FIGURES))),
     "hysteresis": ("walk", "residual", "coast"),
@@ -187,10 +188,14 @@ def _level(p: Array, false: float, n: int) -> float:
 
 def simes(p: Array) -> Array:
     """Return the p-value (n,) of all tests of a unit together, of p (n, m)."""
-    ordered, m = np.sort(p, axis=1), np.sum(np.isfinite(p), axis=1)
-    scaled = ordered * np.where(m > 0, m, np.nan)[:, None] / np.arange(1, p.shape[1] + 1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.fmin.reduce(scaled, axis=1))
+    of_unit = np.empty(len(p))
+    for first in range(0, len(p), AT_ONCE):
+        some = p[first : first + AT_ONCE]
+        ordered, m = np.sort(some, axis=1), np.sum(np.isfinite(some), axis=1)
+        scaled = ordered * np.where(m > 0, m, np.nan)[:, None] / np.arange(1, p.shape[1] + 1)
+        with np.errstate(invalid="ignore"):
+            of_unit[first : first + AT_ONCE] = np.fmin.reduce(scaled, axis=1)
+    return of_unit
 
 
 class _Words:

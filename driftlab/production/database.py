@@ -144,16 +144,18 @@ def _replace(connection: Connection, name: str, fleet: str, columns: Columns, ro
     from sqlalchemy.schema import CreateColumn
 
     types = {"number": sql.Double, "count": sql.BigInteger, "flag": sql.Boolean}
-    names = _apart(["fleet", *columns])
+    names, there = _apart(["fleet", *columns]), dict[str, str]()
+    if sql.inspect(connection).has_table(name):
+        empty = sql.select(sql.text("*")).select_from(sql.table(name)).where(sql.false())
+        there = {str(key).casefold(): str(key) for key in connection.execute(empty).keys()}  # noqa: SIM118 - no mapping
+    names = {key: there.get(own.casefold(), own) for key, own in names.items()}  # as the table spells it
     fields = [sql.Column(own, types.get(columns.get(key, ""), sql.Text)()) for key, own in names.items()]
     table = sql.Table(name, sql.MetaData(), *fields)
     table.create(connection, checkfirst=True)
-    empty = sql.select(sql.text("*")).select_from(sql.table(name)).where(sql.false())
-    there = {str(key).casefold() for key in connection.execute(empty).keys()}  # noqa: SIM118 - of a result, no mapping
     quoted = connection.dialect.identifier_preparer.format_table(table)
-    for own in (own for own in fields if own.name.casefold() not in there):
+    for own in (own for own in fields if there and own.name.casefold() not in there):
         kind = CreateColumn(own).compile(dialect=connection.dialect)
-        connection.execute(sql.text(f"ALTER TABLE {quoted} ADD COLUMN {kind!s}".replace(":", "\\:")))
+        connection.exec_driver_sql(f"ALTER TABLE {quoted} ADD COLUMN {kind!s}")  # compiled: as it is
     connection.execute(table.delete().where(table.c.fleet == fleet))
     left = iter(rows)
     while some := list(islice(left, AT_ONCE)):

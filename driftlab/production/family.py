@@ -96,9 +96,9 @@ def analyse(
         (family, common), why = _read(known, units, status) if records else (None, NOTHING), ""
         apart = units.keep("apart", partial(_bare, common.effects), [None] * len(units))
     progress(Stage("what the line did"))
-    levels = {} if family is None else _levels(family, apart)
+    levels = None if family is None else _levels(family, apart)
     before = None if known is None or family is None else _baseline(family)
-    line = line_of(records, config.limits, unit=unit, levels=levels or None, baseline=before, rules=rules)
+    line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules)
     if family is None:
         return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
     progress(Stage("units that stand out"))
@@ -176,14 +176,13 @@ def _read(path: Path, units: Partitions[Sequence[UnitOfLot]], status: FleetStatu
     return family, common
 
 
-def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:
-    """Return the mean bias (d,) of each unit over the family's range, which no figure has, and a lot may differ in."""
-    means = in_partitions(units).map(partial(_means, family, _mean_over_range(family)))
-    return {name: mean for own in means for name, mean in own}
+def _levels(family: Family, units: FamilyUnits) -> Array:
+    """Return the mean bias (n, d) of units over the family's range, which no figure has, and a lot may differ in."""
+    return np.concatenate([*in_partitions(units).map(partial(_means, family, _mean_over_range(family)))])
 
 
-def _means(family: Family, B: Array, units: Sequence[UnitOfLot]) -> list[tuple[str, Array]]:
-    return [(soaked.unit, family.posterior(soaked, lot).c @ B) for soaked, lot in units]
+def _means(family: Family, B: Array, units: Sequence[UnitOfLot]) -> Array:
+    return np.array([family.posterior(soaked, lot).c @ B for soaked, lot in units])
 
 
 def _level_law(family: Family) -> list[InControl]:

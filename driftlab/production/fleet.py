@@ -176,7 +176,7 @@ def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifes
     _check_stimulus(config, manifest)
     options.check_pages(manifest)
     options.check_columns(manifest)
-    author = checked(options.notes, options.operator, [entry.unit for entry in manifest.units])
+    author = checked(options.notes, options.operator, manifest.names)
     return manifest, replace(options, operator=author)
 
 
@@ -348,7 +348,7 @@ class _Command:
     def _mark(self, **more: Any) -> dict[str, Any]:
         """Write `fleet.json`, and return its content."""
         jobs, folder, status = self.jobs, self.jobs.folder, self.status
-        names = {entry.unit for entry in jobs.manifest.units}
+        names = set(jobs.manifest.names)
         left = [unit for unit in folder.units.names() if unit not in names]
         counts = {"units": len(names), "done": len(status.done), "failed": len(status.failed)}
         summary = FleetSummary(

@@ -18,12 +18,18 @@ import csv
 import errno
 import glob
 import io
+import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
+from typing import overload
+
+import numpy as np
 
 from driftlab.production.remote import is_url, system_of
 from fusion_core.budget import COUNT, PIECE, TEXT, read_whole, size_of
@@ -57,12 +63,41 @@ class ManifestEntry:
     of_soaks: tuple[Mapping[str, str], ...] = ()  # the same of each soak, where it has several
 
 
+class ManifestUnits(Sequence[ManifestEntry]):
+    """Units of a manifest as a string each in one buffer: as objects a million of them would take a gigabyte."""
+
+    def __init__(self, entries: Iterable[ManifestEntry]) -> None:
+        self._texts, self._ends = bytearray(), array("Q", [0])
+        for entry in entries:
+            self._texts += json.dumps([*vars(entry).values()], separators=(",", ":")).encode()
+            self._ends.append(len(self._texts))
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    @overload
+    def __getitem__(self, k: int) -> ManifestEntry: ...
+    @overload
+    def __getitem__(self, k: slice) -> tuple[ManifestEntry, ...]: ...
+    def __getitem__(self, k: int | slice) -> ManifestEntry | tuple[ManifestEntry, ...]:
+        if isinstance(k, slice):
+            return tuple(map(self.__getitem__, range(len(self))[k]))
+        place = range(len(self))[k]
+        unit, lot, date, recordings, more, soaks = json.loads(self._texts[self._ends[place] : self._ends[place + 1]])
+        return ManifestEntry(unit, lot, date, {role: tuple(p) for role, p in recordings.items()}, more, tuple(soaks))
+
+
 @dataclass(frozen=True)
 class Manifest:
     """Units in their order, with paths from where we are; `name` is that of the manifest, or the pattern."""
 
-    units: tuple[ManifestEntry, ...]
+    units: Sequence[ManifestEntry]
     name: str
+
+    @cached_property
+    def names(self) -> list[str]:
+        """The names of the units."""
+        return [entry.unit for entry in self.units]
 
 
 def read_manifest(given: str) -> Manifest:
@@ -77,7 +112,7 @@ def read_manifest(given: str) -> Manifest:
     if pattern or not given.lower().endswith((".csv", ".tsv")):
         return _of_pattern(given)
     folder = given.rpartition("/")[0] if is_url(given) else os.path.dirname(given)
-    return Manifest(tuple(_entries(read_text(given), given, folder)), given)
+    return Manifest(_entries(read_text(given), given, folder), given)
 
 
 def _placed(folder: str, path: str) -> str:
@@ -107,7 +142,7 @@ def _of_pattern(pattern: str) -> Manifest:
     entries = (
         ManifestEntry(name, recordings={"calibration": (path,)}) for name, path in zip(names, paths, strict=True)
     )
-    return Manifest(tuple(entries), pattern)
+    return Manifest(ManifestUnits(entries), pattern)
 
 
 def _wildcards(pattern: str, path: str) -> tuple[str, ...]:
@@ -133,26 +168,56 @@ def _name_mistake(name: str) -> str:
     return f"has more than {LONGEST} bytes" if len(name.encode()) > LONGEST else ""
 
 
-def _entries(text: str, name: str, folder: str) -> list[ManifestEntry]:
+def _entries(text: str, name: str, folder: str) -> ManifestUnits:
     """Return the units of a manifest; raises ConfigError with a line for each of its first mistakes."""
-    wrong = _Mistakes(name)
-    units: dict[str, list[tuple[int, dict[str, str]]]] = {}
-    paths: dict[str, tuple[int, str, str]] = {}
-    for number, row in list(_rows(text, name, wrong)):
-        for what in _mistakes_of(row):
+    wrong, columns, units = _Mistakes(name), list[str](), dict[str, int]()
+    rows, starts, numbers, of_units, paths = bytearray(), array("Q", [0]), array("Q"), array("I"), array("q")
+
+    def row(k: int) -> dict[str, str]:
+        return dict(zip(columns, json.loads(rows[starts[k] : starts[k + 1]]), strict=True))
+
+    for number, cells in _rows(text, name, wrong):
+        for what in _mistakes_of(cells):
             wrong.add(number, what)
-        if (role := ROLES.get(row["role"].lower())) is None:
-            continue
-        unit, path = row["unit"], row["path"]
-        before = paths.setdefault(path if is_url(path) else os.path.normpath(path), (number, unit, role))
-        if before[0] != number and not (before[1] == unit and {before[2], role} == {"calibration", "train"}):
-            wrong.add(number, f"path {quote(path, 200)} is in line {before[0]} already; name each recording once")
-        units.setdefault(unit, []).append((number, row))
-    entries = [_entry(unit, rows, folder, wrong) for unit, rows in units.items()]
+        if cells["role"].lower() in ROLES:
+            columns = columns or [*cells]
+            rows += json.dumps([*cells.values()]).encode()
+            starts.append(len(rows))
+            numbers.append(number)
+            paths.append(hash(_file(cells["path"])))
+            of_units.append(units.setdefault(cells["unit"], len(units)))
+    for k, before in _again(paths):
+        one, other = row(before), row(k)
+        roles = {ROLES[of["role"].lower()] for of in (one, other)}
+        if _file(one["path"]) == _file(other["path"]) and not (
+            one["unit"] == other["unit"] and roles == {"calibration", "train"}
+        ):
+            path = quote(other["path"], 200)
+            wrong.add(numbers[k], f"path {path} is in line {numbers[before]} already; name each recording once")
+    order = np.argsort(np.frombuffer(of_units, dtype=np.uint32), kind="stable")
+    cuts = np.searchsorted(np.frombuffer(of_units, dtype=np.uint32)[order], np.arange(len(units) + 1))
+    entries = ManifestUnits(
+        _entry(unit, [(numbers[k], row(k)) for k in order[cuts[u] : cuts[u + 1]].tolist()], folder, wrong)
+        for unit, u in units.items()
+    )
     wrong.raise_any()
-    if not entries:
+    if not len(entries):
         raise ConfigError(f"--units {name}: has no unit; write a line a recording below the header")
     return entries
+
+
+def _file(path: str) -> str:
+    return path if is_url(path) else os.path.normpath(path)
+
+
+def _again(paths: array[int]) -> Iterator[tuple[int, int]]:
+    """Yield places of hashes that were there before, and where they were first."""
+    hashes = np.frombuffer(paths, dtype=np.int64)
+    order = np.argsort(hashes, kind="stable")
+    same = np.flatnonzero(np.diff(hashes[order]) == 0)
+    first: dict[int, int] = {}
+    for k in same.tolist():
+        yield int(order[k + 1]), first.setdefault(int(hashes[order[k]]), int(order[k]))
 
 
 def _rows(text: str, name: str, wrong: _Mistakes) -> Iterator[tuple[int, dict[str, str]]]:

@@ -59,8 +59,6 @@ class FleetFolder:
         The content of `fleet.json`.
     units : UnitFolders
         Those of the units: in the folder, or behind the URL `store`.
-    stamps : dict of str to (str, str)
-        Key and stamp of the units that were done here, by name.
     """
 
     def __init__(self, out: Path, store: str | None = None) -> None:
@@ -83,7 +81,7 @@ class FleetFolder:
                 self.place.finish()
             else:
                 self.units = opened(url, self.mark["id"])
-            self.stamps = dict(_stamps(self.path / STAMPS))
+            self._shorten()
             self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")
         except BaseException:
@@ -182,9 +180,21 @@ class FleetFolder:
         self.units.write(record.unit, RECORD, content_of(record))
         self.records[record.unit] = record
 
+    def stamps(self) -> dict[str, str]:
+        """Return the stamps of the units that were done here, by name."""
+        return {unit: stamp for unit, _, stamp in _stamps(self.path / STAMPS)}
+
+    def _shorten(self) -> None:
+        """Write the notes on stamps anew without those that later ones replace, where these are half of them."""
+        last, count = dict[str, int](), 0
+        for count, (unit, _, _) in enumerate(_stamps(self.path / STAMPS), 1):
+            last[unit] = count
+        if len(last) * 2 < count:
+            notes = (note for k, note in enumerate(_stamps(self.path / STAMPS), 1) if last[note[0]] == k)
+            self.write(STAMPS, "".join(json.dumps(note) + "\n" for note in notes).encode())
+
     def stamp(self, unit: str, key: str, stamp: str) -> None:
         """Note the state of a unit's recordings: as long as it stays, their contents need not be read."""
-        self.stamps[unit] = key, stamp
         self._journal.write(json.dumps([unit, key, stamp]).encode() + b"\n")
         self._journal.flush()
 
@@ -224,20 +234,17 @@ class FleetFolder:
         """Give the folder back."""
         try:
             self._journal.close()
-            if len(self.stamps) * 2 < sum(1 for _ in _stamps(self.path / STAMPS)):
-                lines = (json.dumps([unit, *known]) + "\n" for unit, known in self.stamps.items())
-                self.write(STAMPS, "".join(lines).encode())
         finally:
             self.lock.release()
 
 
-def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
+def _stamps(path: Path) -> Iterator[tuple[str, str, str]]:
     """Yield name, key and stamp of each unit, the last note last; a line that was broken off is none."""
     with suppress(FileNotFoundError), path.open("rb") as file:
         while line := file.readline(LONGEST):
             with suppress(ValueError, RecursionError):
                 unit, key, stamp = json.loads(line)
-                yield unit, (key, stamp)
+                yield unit, key, stamp
 
 
 @contextmanager

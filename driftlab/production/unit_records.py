@@ -1,13 +1,14 @@
 """Records of a fleet's units in memory: of each what the line, the tests and the page of all units need.
 
 The whole record of a unit is in its `unit.json`; a hundred thousand of these would take gigabytes. Here a unit is its
-key, its numbers in one array, and texts that it has in common with others.
+row of columns, with texts that it has in common with others.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -15,50 +16,58 @@ from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, 
 
 HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
 NUMBERS = 5  # before the figures: domain, hours, samples, seconds
+HEX = frozenset("0123456789abcdef")
 OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
 
 
-class _Brief(NamedTuple):
-    key: str
-    state: Literal["done", "failed"]
-    error: str
-    common: tuple[Any, ...]  # lot, date, other columns, channel, bias_unit, axes, driftlab, limits
-    numbers: bytes
-    repeats: tuple[RepeatedSoak, ...]  # of the few units that were soaked again
-
-
 class UnitRecords:
-    """Records by the names of their units; each is made anew when it is asked for, without the rest of its file."""
+    """Records by the names of their units; each is made anew when it is asked for, without the rest of its file.
+
+    They are rows of columns: of each row its numbers, the values of its figures and their deviations in single
+    precision, and what few rows have alone, as an error.
+    """
 
     def __init__(self) -> None:
-        self._briefs: dict[str, _Brief] = {}
-        self._common: dict[Any, Any] = {}
+        self._rows: dict[str, int] = {}
+        self._keys = bytearray()  # 32 bytes a row
+        self._codes = array("I")  # of what rows have in common with others
+        self._common, self._texts, self._known = list[tuple[Any, ...]](), dict[Any, Any](), dict[tuple[Any, ...], int]()
+        self._numbers, self._sigmas = array("d"), array("f")
+        self._starts = array("Q"), array("Q")  # of numbers and sigmas
+        self._alone: dict[int, tuple[str, str, tuple[RepeatedSoak, ...]]] = {}  # key, error, repeats
 
     def __contains__(self, unit: str) -> bool:
-        return unit in self._briefs
+        return unit in self._rows
 
     def __setitem__(self, unit: str, record: UnitRecord) -> None:
+        row, d = len(self._codes), len(record.axes)
         limits = tuple(tuple((name, row[name]) for name in OF_LIMITS if name in row) for row in record.limits)
-        texts = (record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit, record.axes,
-                 record.driftlab, limits)  # fmt: skip
-        common = tuple(self._common.setdefault(text, text) for text in texts)
-        numbers = [*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds]
-        names = HELD if TERM_FIGURES[0] in record.figures else HELD[: -len(TERM_FIGURES)]  # of few fleets
-        figures = record.table(names, len(record.axes))
-        self._briefs[unit] = _Brief(
-            record.key, record.state, record.error, self._common.setdefault(common, common),
-            np.concatenate([np.array(numbers, dtype=np.float64), figures.ravel()]).tobytes(), tuple(record.repeats),
-        )  # fmt: skip
+        names = tuple(name for name in HELD if name in record.figures)
+        common = (record.state, record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit,
+                  record.axes, record.driftlab, limits, names)  # fmt: skip
+        values, sigmas = record.table(names, d)
+        hashed = len(record.key) == 64 and set(record.key) <= HEX
+        if record.error or record.repeats or not hashed:
+            self._alone[row] = record.key, record.error, tuple(record.repeats)
+        self._rows[unit] = row
+        self._keys += bytes.fromhex(record.key) if hashed else bytes(32)
+        self._codes.append(self._code(tuple(self._texts.setdefault(text, text) for text in common)))
+        for starts, column in zip(self._starts, (self._numbers, self._sigmas), strict=True):
+            starts.append(len(column))
+        self._numbers.extend([*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds])
+        self._numbers.extend(values.ravel().tolist())
+        self._sigmas.extend(sigmas.ravel().tolist())
 
     def __getitem__(self, unit: str) -> UnitRecord:
-        key, state, error, common, content, repeats = self._briefs[unit]
-        lot, date, more, channel, bias_unit, axes, driftlab, limits = common
-        low, high, hours, samples, seconds, *rest = np.frombuffer(content).tolist()
-        cells, d = [None if value != value else value for value in rest], len(axes)
+        row = self._rows[unit]
+        state, lot, date, more, channel, bias_unit, axes, driftlab, limits, names = self._common[self._codes[row]]
+        key, error, repeats = self._alone.get(row) or (self._keys[32 * row : 32 * row + 32].hex(), "", ())
+        start, own, d = self._starts[0][row], self._starts[1][row], len(axes)
+        low, high, hours, samples, seconds = self._numbers[start : start + NUMBERS]
         figures = {}
-        names = HELD[: len(cells) // max(2 * d, 1)]
         for k, name in enumerate(names):
-            value, sigma = (tuple(cells[(part * len(names) + k) * d :][:d]) for part in (0, 1))
+            columns = ((self._numbers, start + NUMBERS + k * d), (self._sigmas, own + k * d))
+            value, sigma = (tuple(None if v != v else v for v in part[at : at + d]) for part, at in columns)
             figures[name] = Figure.model_construct(value=value, sigma=sigma)
         return UnitRecord.model_construct(
             key=key, unit=unit, lot=lot, date=date, more=dict(more), state=state, error=error, channel=channel,
@@ -73,7 +82,14 @@ class UnitRecords:
 
     def state(self, unit: str) -> str:
         """Return the state of a unit: `done` or `failed`."""
-        return self._briefs[unit].state
+        return str(self._common[self._codes[self._rows[unit]]][0])
+
+    def _code(self, common: tuple[Any, ...]) -> int:
+        """Return the number of what a row has in common with others."""
+        if common not in self._known:
+            self._known[common] = len(self._common)
+            self._common.append(common)
+        return self._known[common]
 
 
 class RecordsOfUnits(Sequence[UnitRecord]):

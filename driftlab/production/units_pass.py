@@ -68,7 +68,7 @@ class FleetOptions:
 
     def check_pages(self, manifest: Manifest) -> None:
         """Raise ConfigError where pages are asked for of units that there are not."""
-        names = [entry.unit for entry in manifest.units]
+        names = manifest.names
         for pattern in self.pages:
             if pattern != "all" and not matching(names, pattern):
                 raise ConfigError(
@@ -154,7 +154,7 @@ class UnitJobs:
 
         Raises ConfigError where the recordings of most are not there: each takes its time, and there may be any number.
         """
-        folder, units, lost, first = self.folder, self.manifest.units, 0, ""
+        folder, units, lost, first, stamps = self.folder, self.manifest.units, 0, "", self.folder.stamps()
         for entry in units:
             task = self._task(entry)
             stamp, record = stamp_of(task, self.versions), folder.brief(entry.unit)
@@ -165,7 +165,7 @@ class UnitJobs:
                     f"--units {self.manifest.name}: the recordings of {lost:,} of {len(units):,} units are not there, "
                     f"the first is {first}; at most {MISSING:,} may be missing beside as many as are there, name those"
                 )
-            as_it_was = bool(stamp) and folder.stamps.get(entry.unit, ("", ""))[1] == stamp
+            as_it_was = bool(stamp) and stamps.get(entry.unit) == stamp
             if self.options.force or not as_it_was or record is None:
                 yield entry.unit, stamp
 
@@ -208,7 +208,7 @@ class UnitJobs:
                 assert whole is not None
                 self.folder.note(whole.model_copy(update=given))
             key.update(repr((entry.unit, record.key, record.state, given, entry.of_soaks)).encode())
-        return FleetStatus(self.folder.records.of([entry.unit for entry in self.manifest.units]), key.hexdigest())
+        return FleetStatus(self.folder.records.of(self.manifest.names), key.hexdigest())
 
     def _wants_page(self, unit: str) -> bool:
         return any(pattern == "all" or fnmatchcase(unit, pattern) for pattern in self.options.pages)

@@ -96,14 +96,14 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     low, high = without_spikes(value, MANY)
     cut = np.flatnonzero((chart.value < low) | (chart.value > high))
     wide = not len(cut) and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
-    drawn_at = np.clip(chart.value, low, high)
+    drawn_at, (ewma, *ewma_limits) = np.clip(chart.value, low, high), chart.ewma
     lines = [
         *_usual(chart, shown),
         Line(place[drawn], shown(drawn_at[drawn]), "unit", "data", style="points"),
         Line(place[out], shown(drawn_at[out]), "beyond three sigma", "alarm", style="points"),
-        Line(place[drawn], shown(chart.ewma[drawn]), "EWMA", "estimate"),
-        *_limits(place, few, (chart.low, chart.high), shown, ewma=False),
-        *_limits(place, few, (chart.ewma_low, chart.ewma_high), shown, ewma=True),
+        Line(place[drawn], shown(ewma[drawn]), "EWMA", "estimate"),
+        *_limits(place, few, chart.limits, shown, ewma=False),
+        *_limits(place, few, (ewma_limits[0], ewma_limits[1]), shown, ewma=True),
     ]
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
     span = None if wide else _span(chart, (low, high), unit.factor)
@@ -137,7 +137,7 @@ def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tupl
 
     A unit that is measured badly has limits so wide that nothing else could be distinguished.
     """
-    all_of = np.concatenate([ends, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]])
+    all_of = np.concatenate([ends, *chart.ewma[1:], [np.median(limit) for limit in chart.limits]])
     low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room

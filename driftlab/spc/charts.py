@@ -20,14 +20,14 @@ m values of a chart, n values in general.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.baseline import Baseline, ScaleName
+from driftlab.family.baseline import Baseline, FrozenLimits, ScaleName
 from driftlab.family.record import PER
 from driftlab.spc.capability import D2, Capability
 from driftlab.spc.subgroups import LotPoint
@@ -93,27 +93,21 @@ class ControlChart:
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
         Middle of a line in control, SI.
-    low, high : (m,) arrays
-        Shewhart's limits.
-    ewma, ewma_low, ewma_high : (m,) arrays
-        The EWMA and its limits, as values of a unit whose own deviation is the middle one.
-    beyond, drifting : (m,) bool arrays
-        Alarms of either chart.
+    own : (m,) array
+        Deviations of the units' measurements in the scale, single precision.
     changes : tuple of Change
     lots : tuple of Lot
         In the order of their first units.
-    z : (m,) array
-        Deviations from the centre, in sigmas.
     law : InControl
         Of the values in the scale: the limits stand on it.
     trend : Trend or None
         Where a straight line fits better than steps; then there are no changes.
-    patterns : mapping of str to (m,) bool array
-        Alarms of the run rules that were asked for, by rule.
+    rules : mapping of str to callable
+        Run rules that were asked for, of `z`.
     phi : float
         Autocorrelation of neighbouring units about the line's course, 0 where it may be chance.
-    of_family : bool
-        Whether centre and limits are those of a family that was known.
+    frozen : FrozenLimits or None
+        Of a family that was known, on which centre and limits then stand.
     """
 
     quantity: str
@@ -125,21 +119,66 @@ class ControlChart:
     normal: float
     basis: tuple[int, int]
     centre: float
-    low: Array
-    high: Array
-    ewma: Array
-    ewma_low: Array
-    ewma_high: Array
-    beyond: NDArray[np.bool_]
-    drifting: NDArray[np.bool_]
+    own: NDArray[np.float32]
     changes: tuple[StepChange, ...]
     lots: tuple[LotPoint, ...]
-    z: Array
     law: InControl
     trend: Trend | None = None
-    patterns: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]] = field(default_factory=dict)
     phi: float = 0.0
-    of_family: bool = False
+    frozen: FrozenLimits | None = None
+
+    # what follows of the above is computed where it is asked for: of a million units it would be gigabytes
+
+    @property
+    def of_family(self) -> bool:
+        """True if centre and limits are those of a family that was known."""
+        return self.frozen is not None
+
+    @property
+    def sigma(self) -> Array:
+        """Deviations (m,) in control, in the scale."""
+        return np.maximum(self.law.sigma(self.own.astype(np.float64)), 1e-100)  # of values that do not vary
+
+    @property
+    def z(self) -> Array:
+        """Deviations (m,) from the centre, in sigmas."""
+        z = (self.scale.to(self.value) - self.law.centre) / self.sigma
+        return z if self.frozen is None else self.frozen.scores(z)
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Shewhart's limits (m,), SI."""
+        three, sigma = np.full(len(self.at), SIGMAS), self.sigma
+        return self._back(-three, sigma), self._back(three, sigma)
+
+    @property
+    def ewma(self) -> tuple[Array, Array, Array]:
+        """The EWMA and its limits (m,), as values (SI) of a unit whose own deviation is the middle one."""
+        reach, middle = ewma_limit(len(self.at)), float(np.median(self.sigma))
+        w, low, high = (self._back(of, middle) for of in (ewma(self.z), -reach, reach))
+        return w, low, high
+
+    @property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Alarms (m,) of Shewhart's chart."""
+        return np.abs(self.z) > SIGMAS
+
+    @property
+    def drifting(self) -> NDArray[np.bool_]:
+        """Alarms (m,) of the EWMA."""
+        return np.abs(ewma(self.z)) > ewma_limit(len(self.at))
+
+    @property
+    def patterns(self) -> dict[str, NDArray[np.bool_]]:
+        """Alarms (m,) of the run rules that were asked for, by rule."""
+        z = self.z
+        return {rule: alarms(z) for rule, alarms in self.rules.items()}
+
+    def _back(self, z: Array, sigma: Array | float) -> Array:
+        """Return values (m,), SI, that deviate by z sigmas."""
+        off = z if self.frozen is None else self.frozen.deviations(z)
+        return self.scale.back(self.law.centre + sigma * off)
 
     @property
     def ranges(self) -> Array:
@@ -148,7 +187,7 @@ class ControlChart:
 
     def as_json(self, line: LineReport) -> dict[str, Any]:
         """Return limits, alarms, changes and lots as `fleet.json` has them; in SI, ranges in sigmas."""
-        names, usual = line.units, (float(np.median(self.low)), float(np.median(self.high)))
+        names, (low, high) = line.units, self.limits
         changes = [
             {
                 "unit": names[step.at], "unit_95": [names[step.low], names[step.high]], "before": step.before,
@@ -158,8 +197,9 @@ class ControlChart:
         ]  # fmt: skip
         return {
             "quantity": self.quantity, "axis": self.axis, "unit": self.unit, "units": len(self.at),
-            "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre, "low": usual[0],
-            "high": usual[1], "beyond": int(np.sum(self.beyond)), "ewma_beyond": int(np.sum(self.drifting)),
+            "scale": self.scale.name, "frozen": self.of_family, "centre": self.centre,
+            "low": float(np.median(low)), "high": float(np.median(high)), "beyond": int(np.sum(self.beyond)),
+            "ewma_beyond": int(np.sum(self.drifting)),
             "moving_range": {"usual": D2, "limit": D4, "beyond": int(np.sum(self.ranges > D4))},
             "autocorrelation": self.phi, "changes": changes, "trend": None if self.trend is None else vars(self.trend),
             "lots": [lot.as_json() for lot in self.lots if lot.name],
@@ -202,8 +242,8 @@ class LineReport:
     Attributes
     ----------
     units, lots, dates : tuple of str
-    domains : tuple of (low, high) or None
-        Temperatures that each unit was soaked over, degC.
+    domains : (n, 2) array
+        Temperatures that each unit was soaked over, from and to, degC; NaN where not known.
     order : str
         Basis of the order, in a sentence.
     axes : tuple of str
@@ -225,7 +265,7 @@ class LineReport:
     units: tuple[str, ...] = ()
     lots: tuple[str, ...] = ()
     dates: tuple[str, ...] = ()
-    domains: tuple[tuple[float, float] | None, ...] = ()
+    domains: Array = field(default_factory=lambda: np.zeros((0, 2)))
     order: str = ""
     axes: tuple[str, ...] = ()
     unit: BiasUnit = RATE

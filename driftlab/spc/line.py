@@ -30,7 +30,6 @@ from driftlab.spc.change_points import Course, LevelStep, course_of
 from driftlab.spc.charts import (
     LEVEL,
     MIN_UNITS,
-    SIGMAS,
     ChartScale,
     ControlChart,
     InControl,
@@ -38,8 +37,6 @@ from driftlab.spc.charts import (
     StepChange,
     Trend,
     TSquaredChart,
-    ewma,
-    ewma_limit,
     far_out,
     in_control,
     normality,
@@ -58,7 +55,7 @@ OF_THE_RANGE = ("swing", "coast")  # figures that a soak over a part of the rang
 
 def line_of(
     records: Iterable[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
-    levels: Mapping[str, Array] | None = None, baseline: Baseline | None = None, rules: str | None = None,
+    levels: Array | None = None, baseline: Baseline | None = None, rules: str | None = None,
 ) -> LineReport:  # fmt: skip
     """Return the report of a line.
 
@@ -70,21 +67,24 @@ def line_of(
         Of the config.
     unit : BiasUnit, optional
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
-    levels : mapping of str to (d,) array, optional
-        By unit: the mean of its map (SI) over the family's range.
+    levels : (n, d) array, optional
+        Of the n units that are done, in the order of their records: the mean of the map (SI) over the family's range.
     baseline : Baseline, optional
         Frozen laws, on which the limits of their quantities then stand, also of one unit.
     rules : str, optional
         Run rules beside three sigma, one of `driftlab.spc.run_rules.RULES`.
     """
-    line, table = _ordered(records, levels or {}, unit)
+    line, table = _ordered(records, levels, unit)
     line = replace(line, baseline=baseline)
     if baseline is not None:
-        part = np.array([not baseline.covered(domain) for domain in line.domains], dtype=bool)
+        part = np.array(
+            [not baseline.covered(None if low != low else (low, high)) for low, high in line.domains.tolist()],
+            dtype=bool,
+        )
         for name in OF_THE_RANGE:
             table[name][:, part] = np.nan
         line = replace(line, partial=int(np.sum(part)))
-    names = (*FIGURES, *((LEVEL,) if levels else ()))
+    names = (*FIGURES, *(() if levels is None else (LEVEL,)))
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     for (name, axis), limits_of in known.items():
         if limits_of.scale == "log" and axis in line.axes and name in table:  # nothing shows: there is no logarithm
@@ -95,8 +95,9 @@ def line_of(
         for name in names for k, axis in enumerate(line.axes)
     }  # fmt: skip
     alpha = FALSE / max(sum(enough.values()), 1)
+    of_rules, everywhere = RULES.get(rules or "", {}), np.arange(len(line.units))
     controls = tuple(
-        _control(line, name, k, table[name][:, :, k], alpha, known.get((name, axis)), RULES.get(rules or "", {}))
+        _control(line, name, k, table[name][:, :, k], alpha, known.get((name, axis)), of_rules, everywhere)
         for name in names for k, axis in enumerate(line.axes) if enough[name, axis]
     )  # fmt: skip
     too_few = tuple(f"{axis} {name}" for (name, axis), many in enough.items() if not many)
@@ -107,11 +108,12 @@ def line_of(
 
 def _control(
     line: LineReport, name: str, k: int, figures: Array, alpha: float, known: FrozenLimits | None,
-    rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]],
+    rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]], everywhere: NDArray[np.intp],
 ) -> ControlChart:  # fmt: skip
     """Return the chart of values and deviations (2, n) of a quantity of axis k."""
     values, sigmas = figures
     at = np.flatnonzero(np.isfinite(values))
+    at = everywhere if len(at) == len(everywhere) else at  # charts of all units have the same places
     value, lots = values[at], np.array(line.lots, dtype=np.str_)[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
@@ -124,26 +126,16 @@ def _control(
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop]) if frozen is None else frozen
-    sigma = np.maximum(law.sigma(own), 1e-100)  # of values that do not vary
-    z = (x - law.centre) / sigma
-    z = z if known is None else known.scores(z)
-    w, reach, middle = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
+    single = own.astype(np.float32)
+    sigma = np.maximum(law.sigma(single.astype(np.float64)), 1e-100)  # of values that do not vary
     flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
-
-    def back(z: Array, sigma: Array | float) -> Array:
-        return scale.back(law.centre + sigma * (z if known is None else known.deviations(z)))
-
-    three = np.full(len(z), SIGMAS)
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
-        centre=float(scale.back(np.array(law.centre))), low=back(-three, sigma), high=back(three, sigma),
-        ewma=back(w, middle), ewma_low=back(-reach, middle), ewma_high=back(reach, middle),
-        beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
+        centre=float(scale.back(np.array(law.centre))), own=single,
         changes=_changes(level_steps, stretches, x, sigma, scale, at),
         lots=_lots(lots, x, sigma, law, scale, known=known is not None),
-        trend=trend, z=z, law=law, phi=course.phi, patterns={rule: alarms(z) for rule, alarms in rules.items()},
-        of_family=known is not None,
+        trend=trend, law=law, rules=rules, phi=course.phi, frozen=known,
     )  # fmt: skip
 
 
@@ -212,8 +204,8 @@ def _moved(chart: ControlChart) -> float:
 
 def _domain(line: LineReport) -> tuple[float, float] | None:
     """Return the temperatures, degC, between which most units were soaked."""
-    known = [domain for domain in line.domains if domain is not None]
-    if not known:
+    known = line.domains[np.isfinite(line.domains[:, 0])]
+    if not len(known):
         return None
     low, high = np.median(known, axis=0).tolist()
     return low, high
@@ -305,49 +297,49 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
 
 
 def _ordered(
-    records: Iterable[UnitRecord], levels: Mapping[str, Array], unit: BiasUnit | None
+    records: Iterable[UnitRecord], levels: Array | None, unit: BiasUnit | None
 ) -> tuple[LineReport, dict[str, Array]]:
     """Return the units that are done, in order, and by quantity values and deviations (2, n, d), NaN if not known.
 
-    `levels` (d,) by unit become the quantity `level`.
+    `levels` (n, d) become the quantity `level`.
     """
     axes: tuple[str, ...] = ()
     si = ""
-    names, domains, rows = [], [], array("d")
+    columns: tuple[list[str], ...] = ([], [], [])
+    domains, rows = array("d"), array("d")
     for record in records:
         if record.state == "done":
             axes, si = axes or record.axes, si or record.bias_unit
-            names.append((record.unit, record.lot, record.date))
-            domains.append(record.domain)
+            for column, text in zip(columns, (record.unit, record.lot, record.date), strict=True):
+                column.append(text)
+            domains.extend(record.domain or (np.nan, np.nan))
             rows.frombytes(record.table(FIGURES, len(axes)).tobytes())
-    place, order = _places([date for _, _, date in names])
-    n, d = len(names), len(axes)
-    units, lots, dates = (tuple(names[j][k] for j in place) for k in range(3))
+    place, order = _places(columns[2])
+    n, d = len(place), len(axes)
+    units, lots, dates = (tuple(column[k] for k in place) for column in columns)
     figures = np.frombuffer(rows).reshape(n, 2, len(FIGURES), d)[place]
     level = np.full((2, n, d), np.nan)
-    for k, name in enumerate(units):
-        level[0, k] = levels.get(name, np.nan)
+    if levels is not None:
+        level[0] = levels[place]
     table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
     unit = default_unit(si) if unit is None else unit
-    spans = tuple(domains[j] for j in place)
+    spans = np.frombuffer(domains).reshape(n, 2)[place]
     line = LineReport(units=units, lots=lots, dates=dates, domains=spans, order=order, axes=axes, unit=unit)
     return line, table
 
 
-def _places(dates: list[str]) -> tuple[list[int], str]:
+def _places(dates: list[str]) -> tuple[NDArray[np.intp], str]:
     """Return the places of units in their order, and its basis."""
-    when = [_time(date) for date in dates]
-    known = sum(time is not None for time in when)
-    if known == 0:
-        return list(range(len(dates))), "in the order of the manifest, which has no dates"
-    last, sorting = min(time for time in when if time is not None), []
-    for k, time in enumerate(when):
-        last = last if time is None else time
-        sorting.append((last, k))
+    when = np.array([np.nan if (time := _time(date)) is None else time for date in dates])
+    known = np.flatnonzero(np.isfinite(when))
+    if not len(known):
+        return np.arange(len(dates)), "in the order of the manifest, which has no dates"
+    before = np.searchsorted(known, np.arange(len(dates)), "right")  # units with a date, up to each
+    when = np.append(np.min(when[known]), when[known])[before]
     basis = "in the order of their dates"
-    if known < len(dates):
-        basis += f"; {len(dates) - known} without a date follow the unit that is before them in the manifest"
-    return [k for _, k in sorted(sorting)], basis
+    if len(known) < len(dates):
+        basis += f"; {len(dates) - len(known)} without a date follow the unit that is before them in the manifest"
+    return np.argsort(when, kind="stable"), basis
 
 
 def _time(date: str) -> float | None:

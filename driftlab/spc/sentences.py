@@ -30,7 +30,7 @@ def sentences(line: LineReport) -> list[str]:
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
         within = "within these" if judged else "in"
         lines = [f"{off} change of the line {within} {len(line.units):,} units, {line.order}."]
-    if any(chart.patterns for chart in line.controls):
+    if any(chart.rules for chart in line.controls):
         places = sorted({int(k) for c in line.controls for f in c.patterns.values() for k in c.at[_beginnings(f)]})
         which = f"at {len(places):,} units: {_names(line, places)}" if places else "at no unit"
         lines.append(f"Run rules begin to alarm {which}.")
@@ -70,9 +70,9 @@ def alarms(line: LineReport) -> dict[int, list[Alarm]]:
             text = f"{about}, limit {joint.limit[k]:.3g} (of it {most})"
             found.setdefault(int(joint.at[k]), []).append(Alarm(about, text))
     for chart in line.controls:
-        unit = line.shown(chart.quantity)
+        unit, limits = line.shown(chart.quantity), chart.limits
         for k in np.flatnonzero(chart.beyond & chart.of_family).tolist():
-            value, low, high = (values[k] * unit.factor for values in (chart.value, chart.low, chart.high))
+            value, low, high = (values[k] * unit.factor for values in (chart.value, *limits))
             low = low if chart.quantity == "level" else max(low, 0.0)
             about = f"{_called(chart)} {value:.3g} {unit.shown}"
             alarm = Alarm(about, f"{about}, limits {low:.3g} to {high:.3g}")

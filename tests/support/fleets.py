@@ -6,7 +6,11 @@ import re
 from pathlib import Path
 
 import family
+import pytest
 
+from driftlab.config import load_config
+from driftlab.production import fleet as job
+from driftlab.production import units_pass
 from driftlab.production.unit import Task
 from driftlab.production.workers import WorkerLost, Workers
 
@@ -66,3 +70,13 @@ def contents(fleet):
             del content["seconds"], content["written"]
         found[name] = content
     return found
+
+
+def made_once(folder, count):
+    """Write a fleet's recordings, of which the last cannot be read, and in `made` what one process makes of them."""
+    write_fleet(folder, count, broken=[count - 1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(units_pass, "Pool", lambda workers: Here())
+        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
+    return folder

@@ -15,8 +15,7 @@ LEVEL = [InControl(0.0, 60 * DEG_H)] * 3
 
 
 def levels(records, seed):
-    rng = np.random.default_rng(seed)
-    return {one.unit: rng.normal(size=3) * 60 * DEG_H for one in records}
+    return np.random.default_rng(seed).normal(size=(len(records), 3)) * 60 * DEG_H
 
 
 def frozen(count, seed, **more):

@@ -7,6 +7,7 @@ import sys
 import duckdb
 import polars as pl
 import pytest
+import sqlalchemy
 from lines import DEG_H, line
 
 from driftlab.errors import ConfigError, Unwritable
@@ -115,6 +116,26 @@ def test_columns_of_another_manifest_are_added(place, tmp_path):
     assert ask('SELECT count(*) FROM driftlab_units WHERE "operator [100 %s]" IS NOT NULL') == [(6,)]
     assert ask("SELECT DISTINCT chamber FROM driftlab_units WHERE fleet = 'Chamber'") == [(NASTY,)]
     assert ask("SELECT DISTINCT \"LOT_\" FROM driftlab_units WHERE fleet = 'LOT'") == [(NASTY,)]
+
+
+def test_a_column_is_spelt_as_the_table_has_it(place, tmp_path):
+    """Databases that tell capitals apart, as PostgreSQL, would else have no such column."""
+    url, ask = place
+    put(url, "a", tables(tmp_path, records(2)))
+    written = []
+
+    def note(connection, cursor, statement, *others):
+        written.append(statement)
+
+    sqlalchemy.event.listen(sqlalchemy.Engine, "before_cursor_execute", note)
+    try:
+        put(url, "b", tables(tmp_path, records(2, "CHAMBER")))
+    finally:
+        sqlalchemy.event.remove(sqlalchemy.Engine, "before_cursor_execute", note)
+    (insert,) = [text for text in written if text.startswith("INSERT INTO driftlab_units")]
+    assert "chamber" in insert
+    assert "CHAMBER" not in "".join(written)
+    assert ask("SELECT DISTINCT chamber FROM driftlab_units WHERE fleet = 'b'") == [(NASTY,)]
 
 
 @pytest.mark.parametrize(

@@ -24,14 +24,7 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A fleet's recordings, of which one cannot be read, and what was made of them once."""
-    folder = tmp_path_factory.mktemp("fleet")
-    fleets.write_fleet(folder, COUNT, broken=[3])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr(units_pass, "Pool", lambda workers: fleets.Here())
-        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
-    return folder
+    return fleets.made_once(tmp_path_factory.mktemp("fleet"), COUNT)
 
 
 @pytest.fixture

@@ -27,14 +27,7 @@ COMMAND = "import driftlab.production.fleet as job; job.ALONE = 0; from driftlab
 
 @pytest.fixture(scope="module")
 def line(tmp_path_factory):
-    """A fleet's recordings, and what one process makes of them, in `whole`."""
-    folder = tmp_path_factory.mktemp("line")
-    fleets.write_fleet(folder, COUNT, broken=[4])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr(units_pass, "Pool", lambda workers: fleets.Here())
-        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("whole"))
-    return folder
+    return fleets.made_once(tmp_path_factory.mktemp("line"), COUNT)
 
 
 @pytest.fixture
@@ -47,8 +40,8 @@ def cluster(tmp_path):
 
 
 def assert_same(line, out):
-    assert fleets.contents(line / out) == fleets.contents(line / "whole")
-    tables = [pl.read_parquet(line / name / "units.parquet").drop("seconds") for name in (out, "whole")]
+    assert fleets.contents(line / out) == fleets.contents(line / "made")
+    tables = [pl.read_parquet(line / name / "units.parquet").drop("seconds") for name in (out, "made")]
     assert tables[0].equals(tables[1])
     assert [path.name for path in (line / out).rglob(".*")] == []
 

@@ -30,7 +30,17 @@ def test_a_folder_is_opened_again_whatever_its_units_are_called(name, tmp_path):
         folder.put(UnitRecord(key="k", unit=name, state="failed", error="none"), {"unit.npz": b"1"}, "stamp")
     with fleet_folder(tmp_path / "fleet") as folder:
         assert (folder.place.unit(name) / "unit.npz").read_bytes() == b"1"
-        assert folder.stamps == {name: ("k", "stamp")}
+        assert folder.stamps() == {name: "stamp"}
+
+
+def test_notes_on_stamps_that_later_ones_replace_do_not_pile_up(tmp_path):
+    with fleet_folder(tmp_path / "fleet") as folder:
+        for k in range(5):
+            folder.stamp("6", "k", f"stamp {k}")
+            folder.stamp("7", "k", "as it was")
+    with fleet_folder(tmp_path / "fleet") as folder:
+        assert (folder.path / "inputs.ndjson").read_text().count("\n") == 2
+        assert folder.stamps() == {"6": "stamp 4", "7": "as it was"}
 
 
 def test_what_a_killed_command_left_is_finished(tmp_path):

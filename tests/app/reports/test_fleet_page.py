@@ -325,10 +325,10 @@ def test_half_of_the_units_are_in_the_narrow_band():
 def test_a_badly_measured_unit_does_not_squeeze_the_chart_of_the_others():
     found = line_of(line(60), LIMITS)
     control = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
-    wide = replace(control, high=control.high * np.where(control.at == 30, 10.0, 1.0))
+    wide = replace(control, own=np.where(control.at == 30, 10 * control.sigma, control.own))
     (chart,) = control_charts(replace(found, controls=(wide,)))
     low, high = chart.panels[0].span
-    usual = [np.median(control.low), np.median(control.high), *control.value, *control.ewma_low, *control.ewma_high]
+    usual = [*map(np.median, control.limits), *control.value, *np.concatenate(control.ewma[1:])]
     reach = (min(usual) / DEG_H, max(usual) / DEG_H)
     assert low < reach[0] < reach[1] < high
     assert high - low < 1.2 * (reach[1] - reach[0])

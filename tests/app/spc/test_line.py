@@ -177,9 +177,7 @@ def test_the_change_is_said_with_its_unit_date_and_lot():
 def test_the_level_of_the_map_is_watched_where_it_is_given():
     rng = np.random.default_rng(0)
     records = line(120)
-    levels = {
-        one.unit: (rng.normal(size=3) * 60 - np.array([200, 0, 0]) * (k >= 70)) * DEG_H for k, one in enumerate(records)
-    }
+    levels = (rng.normal(size=(120, 3)) * 60 - np.array([200, 0, 0]) * (np.arange(120)[:, None] >= 70)) * DEG_H
     found = line_of(records, None, levels=levels)
     (change,) = next(c for c in found.controls if (c.quantity, c.axis) == ("level", "x")).changes
     assert change.at == pytest.approx(70, abs=10)
@@ -192,14 +190,14 @@ def test_levels_are_charted_about_a_family_that_is_known(count):
     """A line that has moved since shows at once, also by few units; by its own units it would be in control."""
     rng, law = np.random.default_rng(1), Baseline.of_levels(30, AXES, [(0.0, 60 * DEG_H)] * 3)
     records = line(count)
-    levels = {one.unit: (rng.normal(size=3) * 20 + [240, 0, 0]) * DEG_H for one in records}
+    levels = (rng.normal(size=(count, 3)) * 20 + [240, 0, 0]) * DEG_H
     found = line_of(records, None, levels=levels, baseline=law)
     charts = {c.axis: c for c in found.controls if c.quantity == "level"}
     assert all(chart.of_family for chart in charts.values())
     assert np.mean(charts["x"].beyond) > 0.7
     assert charts["x"].drifting[-1] or count == 1
     assert not np.any(charts["y"].beyond)
-    assert charts["x"].high == pytest.approx(180 * DEG_H)
+    assert charts["x"].limits[1] == pytest.approx(180 * DEG_H)
     assert ("Too few units to look for changes of the line." in found.sentences) == (count < 10)
     assert not any(c.of_family for c in found.controls if c.quantity != "level")
 
