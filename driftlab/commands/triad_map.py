@@ -88,7 +88,11 @@ class TriadMapResult(Result):
 
     def lines(self) -> list[str]:
         """Return the frame, what is not observable, and the notes on the recordings."""
-        return [words.frame_line(self.fit), *words.verdict(self.fit), *self.faults.lines()]
+        return [*self.verdict(), *self.faults.lines()]
+
+    def verdict(self) -> list[str]:
+        """Return the frame, the level from one recording to another, and what is not observable, a sentence each."""
+        return [words.frame_line(self.fit), *words.level_lines(self.fit, self.unit), *words.verdict(self.fit)]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit, self.unit)
@@ -165,7 +169,7 @@ def fit_triad_map(
         raise ConfigError(
             "--terms: g_sensitivity without bias is of no use, since the bias of a soak has its part of it; add bias"
         )
-    known = None if "bias" in names else _known_bias(own, settings)
+    known = None if "bias" in names else _known_bias(own)
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
@@ -201,9 +205,10 @@ def _with_stimulus(config: Config, kind: str | None) -> Config:
     return config.model_copy(update={"stimulus": known[kind].model_validate({})})
 
 
-def _known_bias(config: Config, settings: ThermalMap) -> FittedMap:
+def _known_bias(config: Config) -> FittedMap:
     """Return the map of the bias that the config names; raises ConfigError or MapError."""
-    if not settings.has_map or config.filter is None:
+    settings = next((own for own in config.tracked_maps() if own.has_map), None)
+    if settings is None or config.filter is None:
         raise ConfigError(
             "--terms: without bias it is taken from the config's map, and the config names none; add bias, or a map"
         )
@@ -242,7 +247,7 @@ def _map_of(
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what is not observable, and where the map was written."""
     terminal().print(words.table(result.fit, result.unit))
-    say_lines([words.frame_line(result.fit), *words.verdict(result.fit)])
+    say_lines(result.verdict())
     print_verdict(result.limits_verdict, "limits: ")
     say_lines((row.line(result.unit) for row in result.limits), "  ")
     say_lines(result.faults.lines(), "note: ")

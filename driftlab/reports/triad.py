@@ -97,6 +97,13 @@ def frame_line(fit: TriadFit) -> str:
     return "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)"
 
 
+def level_lines(fit: TriadFit, unit: BiasUnit) -> list[str]:
+    """Return how far the level of the bias differs between recordings, in a sentence; none where they are too few."""
+    size = fit.level * unit.factor
+    line = f"level of the bias: it differs by {size:.2g} {unit.shown} from one recording to another (one sigma)"
+    return [f"{line}, and the map holds the mean"] if fit.level else []
+
+
 def result(fit: TriadFit, unit: BiasUnit, channel: str) -> str:
     """Return the number of terms that are known, and how well, in a sentence."""
     M, (low, high) = [*SCALE, *CROSS], fit.domain

@@ -3,9 +3,11 @@
 Gauss-Newton steps on penalised least squares, with the noise that the residuals show::
 
     x = argmin  (z - A x)' V^-1 (z - A x)  +  x' P x,      A = J B(T)
-    V = diag(s_g^2) + q sum_i J_i J_i' min(t, t')
+    V = diag(s_g^2) + sum_i J_i J_i' (q min(t, t') + l^2),    q within a clock, l within a recording
 
-s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes.
+s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes; l is how far its
+level differs from one recording to another, each of them a power-up, zero of a single one. A clock goes on from one
+recording to another that begins after its end, else time begins anew.
 
 The curve of each term is chosen step by step, by the largest fall of::
 
@@ -13,9 +15,11 @@ The curve of each term is chosen step by step, by the largest fall of::
 
 with p the effective number of coefficients: the price of a coefficient among q terms that could have had it (extended
 Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
-noise and walk are means over their restricted likelihood; the prior of the density of the walk is half-Cauchy (Gelman,
-Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. A term that the
-equations do not show is zero, and its usual size counts in the error of the others.
+noise, walk and level are means over their restricted likelihood. The prior of the density of the walk is half-Cauchy
+(Gelman, Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. That of
+log l is flat up to a usual level, so that one of few recordings has Student's law, and falls by 1 / l beyond, or no
+bias would be seen to follow the temperature where each recording is at another. A term that the equations do not show
+is zero, and its usual size counts in the error of the others.
 
 What was decided counts in the error too. A term that stays constant may move by b, sigma s, all the same; it does with
 the probability that follows from the two models' evidence (Schwarz, Annals of Statistics 6 (1978) 461)::
@@ -31,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +54,7 @@ from driftlab.triad.model import (
     polynomial,
 )
 from fusion_core.chunk import Array
-from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
+from fusion_core.contracts import CurveError, Equations, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
 from fusion_core.errors import SingularFit
 
 STEPS = 30
@@ -60,6 +65,8 @@ PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
+LEVELS = tuple(10.0 ** (k / 2) for k in range(-6, 13))  # and of the level from one recording to another
+LEVEL = 0.01  # of a usual bias: that level, of a usual unit
 SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 AHEAD = 2  # curves that are looked at beyond that of a term, to either side
 TINY = 1e-30
@@ -89,6 +96,8 @@ class TriadFit:
         Deviation of an equation in each group.
     columns : tuple of int
         How many of the columns of the root are of each of SOURCES.
+    level : float
+        Deviation of the level of the bias from one recording to another; 0 where fewer than three would tell it.
     """
 
     stimulus: TriadInput
@@ -102,6 +111,7 @@ class TriadFit:
     root: Array
     noise: tuple[float, ...]
     columns: tuple[int, ...]
+    level: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -258,8 +268,8 @@ class _Search:
         self.observable = free.copy()
         self.chosen = [0] * len(free)
         self.x: list[Array] = [np.zeros(1) for _ in free]
-        self.s, self.walk, self.declared = np.ones(2), 0.0, declared
-        self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of these terms
+        self.s, self.walk, self.level, self.declared = np.ones(2), 0.0, 0.0, declared
+        self.by_walk: list[tuple[float, Array]] = []  # how likely walk and level are, and the change by them
         self.linearise()
 
     def check(self) -> None:
@@ -283,19 +293,37 @@ class _Search:
         self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
         self._J = e.J / sigma[:, None]
         self._columns: dict[tuple[int, int], Array] = {}
-        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk)) if self.walk else None
+        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk else None
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
 
     def _walked(self) -> Array:
         """Return the covariance (m, m) of the equations over their white noise that a walk of density one leaves."""
-        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
-        return np.asarray((J @ J.T) * np.minimum.outer(t, t))
+        J, clock = self._J[:, list(BIAS)], _clocks(self.e)
+        first = np.array([self.e.t[clock == k].min() for k in range(clock.max() + 1)])
+        t = self.e.t - first[clock]
+        return np.asarray((J @ J.T) * np.minimum.outer(t, t) * np.equal.outer(clock, clock))
 
-    def _covariance_of_noise(self, walk: float) -> Array:
-        """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
-        walked = self._walked()
-        return np.asarray(np.eye(len(walked)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
+    def _levels(self) -> Array:
+        """Return the derivative (m, 3 R) of the equations by the levels of R recordings, at most of length one."""
+        J, recordings = self._J[:, list(BIAS)], np.unique(_recordings(self.e))
+        own = np.equal.outer(_recordings(self.e), recordings) * (len(recordings) > 1)
+        return np.asarray((own[:, :, None] * J[:, None]).reshape(len(J), -1) / self._size())
+
+    def _size(self) -> float:
+        """Return the largest derivative of an equation over its white noise by the bias."""
+        return float(np.max(np.linalg.norm(self._J[:, list(BIAS)], axis=1))) + TINY
+
+    def _level(self) -> float:
+        """Return the deviation of the levels of three recordings or more, in the unit of the bias."""
+        return float(np.sqrt(self.level)) / self._size() if len(np.unique(_recordings(self.e))) > 2 else 0.0
+
+    def _covariance_of_noise(self, walk: float, level: float = 0.0) -> Array:
+        """Return the covariance (m, m) of the equations over their white noise: one, walk and levels of the bias."""
+        walked, L = self._walked(), self._levels()
+        return np.asarray(
+            np.eye(len(walked)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked + level * L @ L.T
+        )
 
     def column(self, j: int, curve: TermCurve) -> Array:
         """Return the whitened columns (m, q) of a term's curve."""
@@ -358,29 +386,38 @@ class _Search:
         return settled
 
     def measure_walk(self) -> None:
-        """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        """Find walk and levels of the bias beside the white noise, by restricted likelihood at these curves.
+
+        The levels are coefficients b ~ N(0, l^2) beside those of the terms (Henderson, Biometrics 31 (1975) 423).
+        """
         if not np.any(self.observable):
             return
-        prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
-        z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
+        prices, squares, solutions, J, L = [], [], [], self._J, self._levels()
         curves = self._curves(self.chosen)
         X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.observable[j]])
         usual = 1.0 if not self.declared else self.declared**2 * float(np.max(np.diag(self._walked()))) + TINY
+        levels, n, m = LEVELS if np.any(L) else LEVELS[:1], X.shape[1], len(X)
         for walk in WALKS:
             root = np.linalg.cholesky(self._covariance_of_noise(walk))
-            A, y = np.linalg.solve(root, X), np.linalg.solve(root, z)
-            N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
-            solutions.append(np.linalg.solve(N, A.T @ y))
-            left = y - A @ solutions[-1]
-            spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
-            squares.append(float(left @ left) / max(len(z) - A.shape[1], 1) + TINY)
-            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(squares[-1])))
-        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS) / (1 + np.array(WALKS) / usual)
+            white = np.linalg.solve(root, np.column_stack([X, L, self.e.left / self.s[self.e.group]]))
+            A, y, spread = white[:, :-1], white[:, -1], 2 * np.sum(np.log(np.diag(root)))
+            N, b = A.T @ A, A.T @ y
+            N[range(n), range(n)] += 1e-12 * np.trace(N[:n, :n])
+            for level in levels:
+                whole = N + np.diag(np.repeat([0.0, 1 / level], [n, L.shape[1]]))
+                solution = np.linalg.solve(whole, b)
+                solutions.append(solution[:n])
+                squares.append(float(y @ y - b @ solution) / max(m - n, 1) + TINY)
+                bent = np.linalg.slogdet(whole)[1] + L.shape[1] * np.log(level)
+                prices.append(float(spread + bent + max(m - n, 1) * np.log(squares[-1])))
+        walks, own = (np.array(v) for v in zip(*product(WALKS, levels), strict=True))
+        likely = np.exp((np.min(prices) - np.array(prices)) / 2)
+        likely *= np.sqrt(walks) / (1 + walks / usual) / np.sqrt(1 + own / (LEVEL * self.usual[0] * self._size()) ** 2)
         likely /= np.sum(likely)
-        white = float(likely @ squares)
-        self.walk = float(likely @ (np.array(squares) * WALKS)) / white
+        white_noise = float(likely @ squares)
+        self.walk, self.level = (float(likely @ (np.array(squares) * size)) / white_noise for size in (walks, own))
         self.by_walk = list(zip(likely.tolist(), solutions, strict=True))
-        self.s = self.s * np.sqrt(white)
+        self.s = self.s * np.sqrt(white_noise)
 
     def _take(self, solution: Array) -> None:
         sizes = [curve.q for curve in self._curves(self.chosen)]
@@ -479,7 +516,7 @@ class _Search:
         columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.observable.copy(), hidden, design, root,
-            tuple(self.s.tolist()), columns,
+            tuple(self.s.tolist()), columns, self._level(),
         )  # fmt: skip
 
     def _scatter_over_walks(self, starts: Array) -> Array:
@@ -491,3 +528,14 @@ class _Search:
             mean = sum((p * x for p, x in self.by_walk), np.zeros(len(places)))
             modes[places.astype(np.int64)] = np.stack([np.sqrt(p) * (x - mean) for p, x in self.by_walk], axis=1)
         return modes
+
+
+def _recordings(e: Equations) -> NDArray[np.int64]:
+    return np.zeros(len(e.t), dtype=np.int64) if e.recording is None else e.recording
+
+
+def _clocks(e: Equations) -> NDArray[np.int64]:
+    """Return the number of the clock of each equation: it goes on in a recording after the end of the one before."""
+    names, own = np.unique(_recordings(e), return_inverse=True)
+    first, last = (np.array([end(e.t[own == k]) for k in range(len(names))]) for end in (np.min, np.max))
+    return np.asarray(np.cumsum(np.concatenate([[0], first[1:] <= last[:-1]])))[own]
