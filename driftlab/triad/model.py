@@ -68,7 +68,10 @@ def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCur
         If the kind is a network, whose coefficients no information matrix holds.
     """
     if isinstance(settings, NetworkMap):
-        raise ConfigError(f"--kind {settings.kind}: is not linear in its coefficients; take spline or polynomial")
+        raise ConfigError(
+            f"--kind {settings.kind}: is not linear in its coefficients, by which terms have their joint covariance; "
+            "give --kind spline; a network may hold the bias alone, with --terms scale,misalignment --kind spline"
+        )
     if domain[1] - domain[0] < NARROW:
         return [polynomial(0, domain)]
     most = getattr(settings, "order", ORDERS)

@@ -132,22 +132,26 @@ def test_a_run_takes_scale_and_misalignment_off(folder, bias):
     assert np.ptp(along) < 5e-3
 
 
-def test_without_the_bias_that_of_the_configs_map_stays(folder):
-    (folder / "both.yaml").write_text(GYRO.replace("gyro.json", "known.json"))
+@pytest.mark.parametrize(("kind", "suffix", "more"), [("polynomial", "json", []), ("onnx_network", "onnx", ["spline"])])
+def test_without_the_bias_that_of_the_configs_map_stays(folder, kind, suffix, more):
+    with_map = GYRO.replace("kind: polynomial, path: gyro.json", f"kind: {kind}, path: known.{suffix}")
+    (folder / "both.yaml").write_text(with_map)
     T = np.linspace(-20, 60, 300)
-    known = driftlab.fit_map(GYRO.replace("stimulus", "#"), {
+    known = driftlab.fit_map(with_map.replace("stimulus", "#"), {
         "time": (np.arange(300.0), "s"), "temperature": (T, "degC"),
         "gyro": (np.random.default_rng(0).normal(0, 1e-6, (300, 3)) + np.outer(T, [1e-6, 2e-6, 3e-6]), "rad/s"),
-    }, out=folder / "known.json").map  # fmt: skip
-    result = run("fit-map", "both.yaml", "--terms", "scale,misalignment", "--out", "whole.json", cwd=folder)
+    }, out=folder / f"known.{suffix}").map  # fmt: skip
+    more = ["--kind", *more] if more else []
+    asked = ["fit-map", "both.yaml", *more, "--terms"]
+    result = run(*asked, "scale,misalignment", "--out", f"whole.{suffix}", cwd=folder)
     assert result.returncode == 0, result.stderr
     from driftlab.storage.map_file import read_map
 
-    whole = read_map(folder / "whole.json")
+    whole = read_map(folder / f"whole.{suffix}")
     T = np.linspace(*known.domain, 20)
     np.testing.assert_array_equal(whole.bias(T), known.bias(T))
     assert whole.record.matrix.at(np.array([20.0]))[0] == pytest.approx(matrix_of(20.0), abs=1e-4)
-    alone = run("fit-map", "both.yaml", "--terms", "scale", "--out", "scale.json", cwd=folder)
+    alone = run(*asked, "scale", "--out", f"scale.{suffix}", cwd=folder)
     assert "misalignment" not in alone.stdout.partition("frame")[0]
 
 
