@@ -315,7 +315,7 @@ def test_a_mat_file_holds_all_terms_and_gives_them_back(folder):
         (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
         (
             ["--terms", TERMS, "--compare"],
-            "--terms: tries the curves of one kind; leave --select, --compare and --family out",
+            "--terms: tries the curves of one kind, of no lot; leave --select, --compare and --lot out",
         ),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),
