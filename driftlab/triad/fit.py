@@ -27,7 +27,9 @@ the probability that follows from the two models' evidence (Schwarz, Annals of S
     p = 1 / (1 + sqrt(m) exp(-b^2 / 2 s^2)),    E[b^2] = p (s^2 + b^2)
 
 and the scatter of the terms over the walks that are likely is a part of their error. As many equations as there are
-leave the size of the noise unsure: the error is that of Student's t. m equations, n coefficients, q terms: 12, or 21.
+leave the size of the noise unsure: the error is that of Student's t. Terms of M may have a law of their coefficients,
+as of a family: it takes the place of P, once the noise is found without it. m equations, n coefficients, q terms: 12,
+or 21.
 """
 
 from __future__ import annotations
@@ -102,7 +104,7 @@ class TriadFit:
         Deviation of the level of the bias from one recording to another; 0 where fewer than three would tell it.
     parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
         Terms of M as a family takes them, Chebyshev coefficients over the domain with their covariance; None where the
-        temperatures or the equations are too few.
+        temperatures or the equations are too few, or a family is their prior.
     distance : (float, int), or None
         Chi-square of the stimulus against the prior, and its degrees of freedom; None without a prior.
     """
@@ -559,7 +561,7 @@ class _Search:
         columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.observable.copy(), hidden, design, root,
-            tuple(self.s.tolist()), columns, self._level(), None if np.any(lawful) else self._parabolas(domain), self._distance(),
+            tuple(self.s.tolist()), columns, self._level(), self._parabolas(domain), self._distance(),
         )  # fmt: skip
 
     def _parabolas(self, domain: tuple[float, float]) -> tuple[Array, Array] | None:
@@ -568,7 +570,7 @@ class _Search:
         curves[part] = [polynomial(PARABOLA, domain)] * len(curves[part])
         N, A = self._system(curves, self.free)
         freedom = len(self.z) - len(N)
-        if freedom < 3 or domain[1] - domain[0] < NARROW:
+        if freedom < 3 or domain[1] - domain[0] < NARROW or np.any(_laws(self._curves(self.chosen))):
             return None
         C, at = np.linalg.inv(N), sum(curve.q for curve in curves[: len(BIAS)])
         own = [slice(at + k, at + k + PARABOLA + 1) for k in range(0, len(curves[part]) * (PARABOLA + 1), PARABOLA + 1)]
