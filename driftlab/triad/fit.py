@@ -71,6 +71,7 @@ LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
 LEVELS = tuple(10.0 ** (k / 2) for k in range(-6, 13))  # and of the level from one recording to another
 LEVEL = 0.01  # of a usual bias: that level, of a usual unit
+TOLD = 3  # levels beyond the coefficients of the bias, from which their deviation is known
 SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 AHEAD = 2  # curves that are looked at beyond that of a term, to either side
 TINY = 1e-30
@@ -101,7 +102,7 @@ class TriadFit:
     columns : tuple of int
         How many of the columns of the root are of each of SOURCES.
     level : float
-        Deviation of the level of the bias from one recording to another; 0 where fewer than three would tell it.
+        Deviation of the level of the bias from one recording to another; 0 where the recordings are too few to tell it.
     parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
         Terms of M as a family takes them, Chebyshev coefficients over the domain with their covariance; None where the
         temperatures or the equations are too few, or a family is their prior.
@@ -338,8 +339,10 @@ class _Search:
         return float(np.max(np.linalg.norm(self._J[:, list(BIAS)], axis=1))) + TINY
 
     def _level(self) -> float:
-        """Return the deviation of the levels of three recordings or more, in the unit of the bias."""
-        return float(np.sqrt(self.level)) / self._size() if len(np.unique(_recordings(self.e))) > 2 else 0.0
+        """Return the deviation of the levels, in the unit of the bias; 0 where the curves of the bias leave too few."""
+        taken = sum(curve.q for curve in self._curves(self.chosen)[: len(BIAS)])
+        told = len(BIAS) * len(np.unique(_recordings(self.e))) - taken >= TOLD
+        return float(np.sqrt(self.level)) / self._size() if told else 0.0
 
     def _covariance_of_noise(self, walk: float, level: float = 0.0) -> Array:
         """Return the covariance (m, m) of the equations over their white noise: one, walk and levels of the bias."""

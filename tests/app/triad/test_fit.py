@@ -97,7 +97,7 @@ def test_a_clock_goes_on_where_a_recording_begins_after_the_end_of_the_one_befor
     one, on = (fit_triad(replace(own, recordings=names), POLYNOMIAL, 0.02, walk=1e-4) for names in (None, parts))
     sigma = [fit.sigma(AT)[2, :3].mean() for fit in (one, on)]
     assert sigma[1] > 0.9 * sigma[0]
-    assert one.level == on.level == 0.0  # of two recordings it is not told
+    assert one.level == on.level == 0.0  # the bias has as many coefficients as the recordings have levels
 
 
 ALL = np.ones(21, dtype=bool)
