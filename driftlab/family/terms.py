@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from driftlab.family.partitions import InMemory, Partitions
 from driftlab.family.record import Covariances, Numbers, TermParabolas, UnitRecord
-from driftlab.family.reml import OfAxes, fit_axis
+from driftlab.family.reml import WEIGHT, OfAxes, fit_axis
 from driftlab.triad.model import PARABOLA, TermPrior
 from fusion_core.chunk import Array
 from fusion_core.thermal.map_file import expect_covariance
@@ -56,9 +56,10 @@ class TermsLaw(BaseModel):
         return self
 
     def prior(self) -> TermPrior:
-        """Return the law of the terms of one more unit."""
-        B = np.linalg.inv(chebyshev.chebvander(ENDS, PARABOLA))
-        return TermPrior(self.T, self.mu @ B.T, B @ (self.Sigma + self.mu_covariance) @ B.T)
+        """Return the law of the terms of one more unit: Student's, since so many units leave Sigma unsure."""
+        B, freedom = np.linalg.inv(chebyshev.chebvander(ENDS, PARABOLA)), self.units + WEIGHT - PARABOLA
+        covariance = self.Sigma * freedom / (freedom - 2) + self.mu_covariance
+        return TermPrior(self.T, self.mu @ B.T, B @ covariance @ B.T)
 
 
 def fit_terms(records: Iterable[UnitRecord]) -> TermsLaw | None:
