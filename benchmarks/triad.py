@@ -1,6 +1,8 @@
 """Scale factor and misalignment of a triad over temperature, against units that are simulated by code of their own.
 
 python benchmarks/triad.py sigma    # how many of 50 turntables and tumbles are within their sigma
+python benchmarks/triad.py several  # the same with a recording each temperature, the level of the bias another in each
+python benchmarks/triad.py family   # the same of units that are turned at one temperature, with their family
 python benchmarks/triad.py warm_up  # the angle that a rotating unit is off after a warm-up, by what its map holds
 python benchmarks/triad.py imucal   # sessions by Ferraris beside imucal, and a recording turned by hand (DRIFTLAB_DATA)
 """
@@ -31,6 +33,8 @@ from turned_units import (
     turntable,
 )
 
+from driftlab.family.record import TermParabolas, UnitRecord
+from driftlab.family.terms import fit_terms
 from driftlab.triad.fit import fit_triad
 from fusion_core.contracts import KnownRates, ThermalMap
 from fusion_core.host.registry import registry
@@ -69,9 +73,77 @@ def tumbled(seed):
     return driftlab.fit_map(config, data, terms=TERMS)
 
 
+def by_recordings(seed, made, turn_on, channel, unit):
+    """Return a recording each temperature, the level of the bias another in each, and the tables of the segments."""
+    parts = [made(100 * seed + k, [T]) for k, T in enumerate(TEMPERATURES)]
+    levels = np.random.default_rng(seed).normal(0, turn_on, (len(parts), 3))
+    data = [{"time": (t, "s"), channel: (y + level, unit), "temperature": (T, "degC")}
+            for (t, y, T, *_), level in zip(parts, levels, strict=True)]  # fmt: skip
+    return data, [part[3] for part in parts if len(part) > 3]
+
+
+def turned_again(seed, turn_on=1e-4):
+    """Return the map that fit-map makes of a turntable's recordings, each from a power-up at another temperature."""
+    data, tables = by_recordings(seed, turntable, turn_on, "gyro", "rad/s")
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{k}.csv" for k in range(len(tables))]
+        for path, table in zip(paths, tables, strict=True):
+            path.write_text(table)
+        stimulus = {"kind": "rate_table", "segments": [*map(str, paths)]}
+        return driftlab.fit_map({"filter": {"gyro": GYRO}, "stimulus": stimulus}, data, terms=TERMS)
+
+
+def tumbled_again(seed, turn_on=2e-3):
+    """Return the map that fit-map makes of tumbles, each from a power-up at another temperature."""
+    data, _ = by_recordings(seed, tumble, turn_on, "accel", "m/s^2")
+    rng = np.random.default_rng(seed)
+    data = [{**one, "gyro": (rng.normal(0, 1e-3, one["accel"][0].shape), "rad/s")} for one in data]
+    config = {
+        "filter": {"track": "accel", "gyro": GYRO, "accel": {**ACCEL, "calibration": {"kind": "polynomial"}}},
+        "stimulus": {"kind": "tumble", "gravity": f"{GRAVITY} m/s^2"},
+    }
+    return driftlab.fit_map(config, data, terms=TERMS)
+
+
 def with_strain(seed):
     """Return the map with g-sensitivity that fit-map makes of a vertical turntable, each axis up and down."""
     return turned(seed, terms=f"{TERMS},g_sensitivity", made=strained)
+
+
+def several():
+    """Print these shares of a recording each temperature."""
+    count({"turntable, recording by recording": (turned_again, lambda M: M, np.deg2rad(1.0)),
+           "tumble, recording by recording": (tumbled_again, sensor_frame, 0.3)})  # fmt: skip
+
+
+def own_matrix(seed):
+    """M over temperature of a unit of a family: parabolas of 1000, 400 and 100 ppm beside those of all."""
+    own = np.random.default_rng([909, seed]).normal(size=(3, 3, 3)) * [1e-3, 4e-4, 1e-4]
+    return lambda T: matrix_of(T) + own @ (((T - 20.0) / 35.0) ** np.arange(3))
+
+
+def family(units=40):
+    """Print the errors of units that were turned at one temperature, with and without a family of others."""
+    kind, ends = registry().classes(ThermalMap)["polynomial"].model_validate({}), [-15.0, 20.0, 55.0]
+    records = []
+    for seed in range(units):
+        fit = turned(seed, ends, matrix=own_matrix(seed), hold=8.0).fit
+        terms = dict(zip(("c", "covariance"), fit.parabolas, strict=True))
+        records.append(UnitRecord(key="", unit=str(seed), state="done", parabolas=TermParabolas(T=fit.domain, **terms)))
+    prior, at = fit_terms(records).prior(), np.array(ends)
+    for T in (20.0, 55.0):
+        errors, z = [], []
+        for seed in range(1000, 1000 + units):
+            true = np.array([own_matrix(seed)(one).ravel() for one in at])
+            stimulus = turned(seed, [T], matrix=own_matrix(seed), hold=8.0).fit.stimulus
+            made = [fit_triad(stimulus, kind, np.deg2rad(1.0), walk=1e-6, prior=law) for law in (prior, None)]
+            errors.append([fit.terms.at(at)[:, 3:12] - true for fit in made])
+            z.append(np.abs(errors[-1][0] / made[0].sigma(at)[:, 3:12]))
+        rms = 1e6 * np.sqrt(np.mean(np.square(errors), axis=(0, 3)))
+        print(
+            f"turned at {T:g} °C, M at {at} °C: rms {np.round(rms[0])} ppm with the family, {np.round(rms[1])} alone; "
+            f"{units} units within one sigma {np.mean(np.less(z, 1)):.1%}, within 1.96 {np.mean(np.less(z, 1.96)):.1%}"
+        )
 
 
 def sigma():
@@ -79,6 +151,11 @@ def sigma():
     rate = np.deg2rad(1.0)
     cases = {"turntable": (turned, lambda M: M, rate), "tumble": (tumbled, sensor_frame, 0.3),
              "turntable up and down, with g-sensitivity": (with_strain, lambda M: M, rate)}  # fmt: skip
+    count(cases)
+
+
+def count(cases):
+    """Print the shares of cases: how each is fitted, the frame of M, and the size of the bias."""
     for name, (fitted, frame, size) in cases.items():
         truth = np.array([np.concatenate([bias_of(T, size), frame(matrix_of(T)).ravel()]) for T in AT])
         if fitted is with_strain:
@@ -180,4 +257,5 @@ def measured_by_hand():
 
 
 if __name__ == "__main__":
-    {"sigma": sigma, "warm_up": warm_up, "imucal": imucal}[sys.argv[1]]()
+    one = {"sigma": sigma, "several": several, "family": family, "warm_up": warm_up, "imucal": imucal}
+    one[sys.argv[1]]()

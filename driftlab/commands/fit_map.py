@@ -189,7 +189,7 @@ def fit_map(
         Folder for report.html and what --select shows; default: beside the map.
         It needs `out`.
     family : path, optional
-        Of a fleet: then a part of the range is soak enough.
+        Of a fleet: then a part of the range is soak or stimulus enough.
         Its `family.json`.
     lot : str, optional
         Of the unit, where --family knows lots.
@@ -225,11 +225,13 @@ def fit_map(
     understood = config_of(config).tracking(channel)
     recordings = [] if data is None else recordings_of(data, units, "data")
     place, folder, known = (None if path is None else Path(path) for path in (out, report, family))
-    _check_family(known, lot, bool(kind or neurons or compare or report or certificate))
+    _check_family(known, lot, terms is None and bool(kind or neurons or compare or report or certificate))
     if certificate and place is None:
         raise ConfigError("--certificate: is a file beside the map; give --out, the map's file")
-    if _asks_for_triad(terms, stimulus, bool(neurons or compare or known)):
-        return fit_triad_map(understood, recordings, str(terms), stimulus, kind, place, folder, certificate=certificate)
+    if _asks_for_triad(terms, stimulus, bool(neurons or compare or lot)):
+        return fit_triad_map(
+            understood, recordings, str(terms), stimulus, kind, place, folder, certificate=certificate, family=known
+        )
     if known is not None:
         return fit_family_map(understood, recordings, known, lot or "", place, progress)
     for option, value in (("--kind", kind), ("--select", neurons)):
@@ -328,7 +330,7 @@ def _asks_for_triad(terms: str | None, stimulus: str | None, others: bool) -> bo
     if terms is None and stimulus is not None:
         raise ConfigError("--stimulus: is that of --terms; say which to fit, e.g. --terms bias,scale,misalignment")
     if terms is not None and others:
-        raise ConfigError("--terms: tries the curves of one kind; leave --select, --compare and --family out")
+        raise ConfigError("--terms: tries the curves of one kind, of no lot; leave --select, --compare and --lot out")
     return terms is not None
 
 
@@ -339,7 +341,7 @@ def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str
         (kind, arguments.get("report"), compare, options["select"], options["enforce_limits"], arguments["certificate"])
     )
     out = arguments.get("out")
-    _check_family(arguments.get("family"), arguments.get("lot"), more)
+    _check_family(arguments.get("family"), arguments.get("lot"), more and not arguments.get("terms"))
     if arguments.get("family") is None:
         if options["select"]:
             arguments["neurons"] = range(1, options["neurons_max"] + 1)

@@ -17,6 +17,8 @@ from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
+from driftlab.family.file import load_family
+from driftlab.family.terms import TermsLaw
 from driftlab.filtering.setup import check_map
 from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
 from driftlab.reports import triad as words
@@ -66,8 +68,10 @@ class TriadMapResult(Result):
         faults: Faults,
         *,
         levelled: bool = True,
+        law: TermsLaw | None = None,
     ) -> None:
         self.config, self.recordings, self.levelled = config, list(recordings) or None, levelled
+        self.law = law
         self.fit, self.map, self.faults = fit, fitted, faults
         self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
         self.measured = of_map(fitted, self.unit)
@@ -88,7 +92,13 @@ class TriadMapResult(Result):
 
     def lines(self) -> list[str]:
         """Return the frame, what is not observable, and the notes on the recordings."""
-        return [words.frame_line(self.fit), *words.verdict(self.fit), *self.faults.lines()]
+        return [*self.verdict(), *self.faults.lines()]
+
+    def verdict(self) -> list[str]:
+        """Return the frame, how far levels differ, the family, and what is not observable, a sentence each."""
+        of_family = [] if self.law is None else [words.family_line(self.fit, self.law.units)]
+        levels = words.level_lines(self.fit, self.unit)
+        return [words.frame_line(self.fit), *levels, *of_family, *words.verdict(self.fit)]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit, self.unit)
@@ -138,6 +148,7 @@ def fit_triad_map(
     report: Path | None = None,
     *,
     certificate: bool = False,
+    family: Path | None = None,
 ) -> TriadMapResult:
     """Return the map of a triad that a stimulus gives; with `out`, write it there, and its page beside or in `report`.
 
@@ -149,6 +160,8 @@ def fit_triad_map(
         Kind of the stimulus, instead of the config's.
     kind : str, optional
         Kind of the curves, instead of the config's; else spline.
+    family : Path, optional
+        `family.json` of a fleet whose units had a stimulus; M is over its range then.
 
     Raises
     ------
@@ -159,13 +172,14 @@ def fit_triad_map(
     own, faults = _with_stimulus(config, stimulus), Faults()
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
-        read = own.files_to_fit() if "bias" in names else own.files()
+        read = [*(own.files_to_fit() if "bias" in names else own.files()), *([] if family is None else [family])]
         check_all(out, report, [*read, *paths_of(recordings)], names_of(certificate=certificate), "fit-map")
     if "g_sensitivity" in names and "bias" not in names:
         raise ConfigError(
             "--terms: g_sensitivity without bias is of no use, since the bias of a soak has its part of it; add bias"
         )
-    known = None if "bias" in names else _known_bias(own, settings)
+    law = None if family is None else _law_of(family, own, names)
+    known = None if "bias" in names else _known_bias(own)
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
@@ -175,10 +189,10 @@ def fit_triad_map(
     walk = (gathered.sensor.bias.as_random_walk() or {}).get("walk")
     fit = fit_triad(
         gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,
-        None if walk is None else float(np.max(walk)),
+        None if walk is None else float(np.max(walk)), None if law is None else law.prior(),
     )  # fmt: skip
     fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
-    result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, levelled=known is None)
+    result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, levelled=known is None, law=law)
     if out is not None:
         result.save(out, report=report, certificate=certificate)
     return result
@@ -201,9 +215,27 @@ def _with_stimulus(config: Config, kind: str | None) -> Config:
     return config.model_copy(update={"stimulus": known[kind].model_validate({})})
 
 
-def _known_bias(config: Config, settings: ThermalMap) -> FittedMap:
+def _law_of(family: Path, config: Config, names: Collection[str]) -> TermsLaw:
+    """Return the law of the terms that a family has; raises ConfigError or MapError where it does not go with them."""
+    if set(names) != {"scale", "misalignment"} or config.filter is None:
+        raise ConfigError(
+            "--family with --terms: tells scale and misalignment over its range, where a short stimulus does not tell "
+            "the bias; give --terms scale,misalignment, and name a map of the bias in the config (fit-map --family)"
+        )
+    tracked = config.filter.tracked
+    law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes)).terms
+    if law is None:
+        raise ConfigError(
+            f"--family {family}: has no terms of scale and misalignment; name one of which five units or more had "
+            "recordings of the role stimulus over temperature"
+        )
+    return law
+
+
+def _known_bias(config: Config) -> FittedMap:
     """Return the map of the bias that the config names; raises ConfigError or MapError."""
-    if not settings.has_map or config.filter is None:
+    settings = next((own for own in config.tracked_maps() if own.has_map), None)
+    if settings is None or config.filter is None:
         raise ConfigError(
             "--terms: without bias it is taken from the config's map, and the config names none; add bias, or a map"
         )
@@ -242,7 +274,7 @@ def _map_of(
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what is not observable, and where the map was written."""
     terminal().print(words.table(result.fit, result.unit))
-    say_lines([words.frame_line(result.fit), *words.verdict(result.fit)])
+    say_lines(result.verdict())
     print_verdict(result.limits_verdict, "limits: ")
     say_lines((row.line(result.unit) for row in result.limits), "  ")
     say_lines(result.faults.lines(), "note: ")

@@ -222,13 +222,13 @@ def vehicle(
     site = {name: value for name, value in (("latitude", latitude), ("heading", heading)) if value is not None}
 
     found = sensors_of(product, names, site)
-    sensors = tuple(_checked(exporter, _fitted(product, one, found, site, kind, progress)) for one in found)
+    sensors = [_fitted(product, one, found, site, kind, progress) for one in found]
     if out is None:
         with tempfile.TemporaryDirectory(prefix="driftlab-") as temporary:
-            return VehicleResult(product, sensors, *_exported(exporter, sensors, Path(temporary)))
+            return _exported(product, exporter, sensors, Path(temporary))
     with output_folder(Path(out), COMMAND, paths_of(names)) as folder:
-        result = VehicleResult(product, sensors, *_exported(exporter, sensors, folder))
-        for one in sensors:
+        result = _exported(product, exporter, sensors, folder)
+        for one in result.sensors:
             if one.result is not None:
                 save(one.result.map, folder / one.file, COMMAND)
         write_json(folder / "vehicle.json", result.summary)
@@ -258,27 +258,31 @@ def _fitted(
     return VehicleSensor(**vars(sensor), result=result)
 
 
-def _checked(exporter: Exporter, sensor: VehicleSensor) -> VehicleSensor:
-    """Return the sensor, with the reason where the firmware could not use its map, or had better not."""
-    if sensor.result is None:
-        return sensor
-    try:
-        with tempfile.TemporaryDirectory(prefix="driftlab-") as temporary:
-            exporter.export(Export((sensor.calibrated(),)), Path(temporary) / COMMAND)
-    except ConfigError as error:
-        return replace(sensor, left_out=str(error))
-    return replace(sensor, left_out=sensor.drifts())
-
-
-def _exported(exporter: Exporter, sensors: Sequence[VehicleSensor], folder: Path) -> tuple[Loss | None, str]:
-    """Write the parameters of all sensors; return what is lost, or why there are none."""
+def _exported(product: str, exporter: Exporter, sensors: Sequence[VehicleSensor], folder: Path) -> VehicleResult:
+    """Write the parameters of all sensors that the firmware can use, each alone where all together are refused."""
+    sensors = tuple(replace(one, left_out=one.left_out or one.drifts()) for one in sensors)
     of_maps = tuple(one.calibrated() for one in sensors if one.result is not None and not one.left_out)
     if not of_maps:
-        return None, "no sensor has a map" + (" that could be used" if any(one.left_out for one in sensors) else "")
+        why = "no sensor has a map" + (" that could be used" if any(one.left_out for one in sensors) else "")
+        return VehicleResult(product, sensors, None, why)
     try:
-        return exporter.export(Export(of_maps), folder / f"{COMMAND}{exporter.suffix}"), ""
+        return VehicleResult(product, sensors, exporter.export(Export(of_maps), folder / f"{COMMAND}{exporter.suffix}"))
     except ConfigError as error:
-        return None, str(error)
+        refused, problem = {one.name: _refused(exporter, one) for one in of_maps}, str(error)
+    if not any(refused.values()):
+        return VehicleResult(product, sensors, None, problem)
+    rest = [replace(one, left_out=one.left_out or refused.get(one.name, "")) for one in sensors]
+    return _exported(product, exporter, rest, folder)
+
+
+def _refused(exporter: Exporter, sensor: Calibrated) -> str:
+    """Return the reason why the firmware could not use a map; empty where it can."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="driftlab-") as temporary:
+            exporter.export(Export((sensor,)), Path(temporary) / COMMAND)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _page(result: VehicleResult, recordings: Sequence[str], folder: Path) -> str:

@@ -7,11 +7,12 @@ the level that it had in the mean over the soak. It is read off the fitted map; 
 
 - *curve* (A): white noise and walk of the soak in the curve, what smoothing takes of it, misfits and holes: the modes
   of the map (`fusion_core.thermal.curve_error`), which know no level;
-- *mean* (A): noise of the level, s / sqrt(n) of n samples with the deviation s about the curve;
+- *mean* (A): noise of the level, s / sqrt(n) of n samples with the deviation s about the curve; a curve that a stimulus
+  shows together with M knows its level, and has none;
 - *memory* (A): half of the difference D between warming and cooling, as probable as a memory is: sqrt(p E[D^2]) / 2,
   where D is largest;
 - *power-ups* (A): the level from one recording to the next, of r >= 3 recordings with the deviation s:
-  s sqrt(1 + 1/r) t(r - 1) / k, so that k = 2 covers as much as Student's law says;
+  s sqrt(1 + 1/r) t(r - 1) / k, so that k = 2 covers as much as Student's law says; of a stimulus that of its fit;
 - *placements* (A): the level of a triad in a field of known length (`driftlab.soak.placements`);
 - *thermometer* (B): |db/dT| U_T / 2 for a thermometer whose expanded uncertainty U_T is given.
 
@@ -82,20 +83,24 @@ def bias_budget(
     thermometer: float | None = None,
     soak: SoakSummary | None = None,
     placements: Placements | None = None,
+    level: float = 0.0,
 ) -> UncertaintyBudget:
     """Return the budget of a fitted map at round temperatures of its domain.
 
     `thermometer` is the expanded uncertainty of the thermometer, K. What a map's file does not keep, the power-ups of
-    a soak of several recordings and placements, is in the budget where it is given.
+    a soak of several recordings and placements, is in the budget where it is given; `level` is how far the level
+    differs from one recording of a stimulus to another, 0 where it is not known.
     """
     T, record = temperatures(*fitted.domain), fitted.record
     bias, shape = fitted.bias(T), (len(T), record.d)
     if record.error is None:
         return UncertaintyBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
     sources, missing = [UncertaintySource("curve", "A", fitted.sigma(T))], []
+    joint = record.matrix is not None and record.matrix.error is not None and record.matrix.error.T == record.error.T
     left = np.zeros(record.d) if record.residual is None else np.asarray(record.residual)
     if record.samples and record.residual is not None:
-        sources.append(UncertaintySource("mean", "A", np.broadcast_to(left / np.sqrt(record.samples), shape)))
+        mean = np.broadcast_to(left / np.sqrt(record.samples), shape)
+        sources += [] if joint else [UncertaintySource("mean", "A", mean)]
     else:
         missing.append("the noise of the level: the map's file does not say its samples")
     half, unknown = _memory(fitted)
@@ -104,10 +109,12 @@ def bias_budget(
     else:
         sources.append(UncertaintySource("memory", "A", np.broadcast_to(half, shape)))
     if placements is not None:
-        level, across = _level(placements)
-        sources.append(UncertaintySource("placements", "A", np.broadcast_to(level, shape)))
+        own, across = _level(placements)
+        sources.append(UncertaintySource("placements", "A", np.broadcast_to(own, shape)))
         missing += across
     ups = None if soak is None or placements is not None else power_ups(fitted, soak)
+    if level:
+        ups = np.full(record.d, level)
     if ups is None:
         missing.append("the level after another power-up: it was not measured (three recordings or more measure it)")
     else:

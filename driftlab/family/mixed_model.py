@@ -44,6 +44,7 @@ from driftlab.family.reml import (
     root_of,
 )
 from driftlab.family.tail_law import TailLaws
+from driftlab.family.terms import TermsLaw
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
 from fusion_core.thermal.fitted_map import COLDEST, HOTTEST
@@ -316,6 +317,8 @@ class Family(BaseModel):
         Laws of the units' curves and figures, by which a new one is judged (`driftlab.family.outliers`).
     baseline : Baseline or None
         Limits of the line's control charts, by which units of later days are judged.
+    terms : TermsLaw or None
+        Law of scale factors and misalignments, of units with a stimulus.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -346,6 +349,7 @@ class Family(BaseModel):
     odd_lots: tuple[Plain, ...] = ()
     laws: TailLaws | None = None
     baseline: Baseline | None = None
+    terms: TermsLaw | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> Family:

@@ -109,6 +109,22 @@ class RepeatedSoak(Figures):
     place: int
 
 
+class TermParabolas(BaseModel):
+    """The nine terms of M of a unit as parabolas over the temperatures T of its stimulus, degC.
+
+    Attributes
+    ----------
+    c, covariance : (9, 3) and (9, 3, 3) arrays
+        Chebyshev coefficients.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    T: tuple[float, float]
+    c: Numbers
+    covariance: RoundedCovariances
+
+
 class UnitRecord(Figures):
     """Record of one unit.
 
@@ -138,6 +154,8 @@ class UnitRecord(Figures):
     figures : dict of str to Figure
         FIGURES by name; `coast_1min`, `coast_5min`, `coast_end` too, and of a unit with a stimulus TERM_FIGURES and
         their changes, None where the stimulus does not tell them.
+    parabolas : TermParabolas or None
+        Terms of M as its family takes them; None without a stimulus over temperature.
     coast_of : str
         Which recording was predicted.
     coast_in_sample : bool
@@ -180,6 +198,7 @@ class UnitRecord(Figures):
     domain: tuple[float, float] | None = None
     hours: float = 0.0
     samples: int = 0
+    parabolas: TermParabolas | None = None
     coast_of: str = ""
     coast_in_sample: bool = False
     repeats: list[RepeatedSoak] = []

@@ -24,6 +24,7 @@ from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot
 from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
+from driftlab.family.terms import fit_terms
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
@@ -107,7 +108,8 @@ def analyse(
     if known is None:
         lots, line = reconcile(outliers.lots, line)
         frozen = baseline_of(line, _level_law(family))
-        family = family.model_copy(update={"laws": outliers.laws, "baseline": frozen})
+        more = {"laws": outliers.laws, "baseline": frozen, "terms": fit_terms(records)}
+        family = family.model_copy(update=more)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),

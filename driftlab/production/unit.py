@@ -193,6 +193,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "hours": sum(float(part.span.sum()) for part in rows) / 3600,
         "samples": len(unit.soak.T),
         "figures": {**figures_of(fitted, soaked, densities), **run.figures, **unit.terms()},
+        "parabolas": unit.parabolas(),
         "coast_of": str(run.name)
         if isinstance(run.name, CopyName) or not run.name
         else os.path.relpath(run.name, task.folder),

@@ -32,7 +32,7 @@ from driftlab.config import Config, with_recording
 from driftlab.evaluation.limits import SIDE
 from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
 from driftlab.evaluation.scores import HORIZONS
-from driftlab.family.record import Figure, RepeatedSoak
+from driftlab.family.record import Figure, RepeatedSoak, TermParabolas
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.unit_noise import soaked_of
 from driftlab.identification.config_edit import host_of, with_tracked
@@ -101,6 +101,14 @@ class UnitMap:
     def terms(self) -> dict[str, Figure]:
         """Return its scale factors and misalignments; empty without a stimulus."""
         return {} if self.triad is None else figures_of_terms(self.triad.fit)
+
+    def parabolas(self) -> TermParabolas | None:
+        """Return them as its family takes them; None without a stimulus over temperature."""
+        fit = None if self.triad is None else self.triad.fit
+        if fit is None or fit.parabolas is None:
+            return None
+        c, covariance = fit.parabolas
+        return TermParabolas(T=fit.domain, c=c, covariance=covariance)
 
     def sentences(self) -> list[str]:
         """Return the verdict on it in sentences, and what its stimulus does not tell."""

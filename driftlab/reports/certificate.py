@@ -177,7 +177,9 @@ class Certificate:
         if self.fitted is None:
             return None
         thermometer = self.texts.temperature_uncertainty
-        return bias_budget(self.fitted, thermometer=thermometer, soak=self.soak, placements=self.placements)
+        level = self.fit.level if self.fit is not None and self.levelled else 0.0
+        soak, placements = self.soak, self.placements
+        return bias_budget(self.fitted, thermometer=thermometer, soak=soak, placements=placements, level=level)
 
     @cached_property
     def si(self) -> str:

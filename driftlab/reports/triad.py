@@ -23,6 +23,7 @@ MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the er
     "m/s^2": ("a change of velocity by 10 m/s", 1e4, "mm/s", "along it", "across it"),
 }
 HOURLY = {"rad/s": (3600 * 180 / np.pi, "deg an hour"), "m/s^2": (1e3, "mm/s a second")}
+FOREIGN = 1e-3  # share of units beyond which one is not of its family
 POOR = 0.1  # of a usual size: a term that is known better is well known
 
 
@@ -95,6 +96,28 @@ def frame_line(fit: TriadFit) -> str:
     if fit.stimulus.sensor_frame:
         return "frame: the sensor's own, z along its z axis and y in the plane of y and z (6 terms of M)"
     return "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)"
+
+
+def level_lines(fit: TriadFit, unit: BiasUnit) -> list[str]:
+    """Return how far the level of the bias differs between recordings, in a sentence; none where they are too few."""
+    size = fit.level * unit.factor
+    line = f"level of the bias: it differs by {size:.2g} {unit.shown} from one recording to another (one sigma)"
+    return [f"{line}, and the map holds the mean"] if fit.level else []
+
+
+def family_line(fit: TriadFit, units: int) -> str:
+    """Return how well a stimulus agrees with the family of so many units, in a sentence."""
+    from scipy.special import chdtrc
+
+    assert fit.distance is not None, "it was fitted with a family"
+    square, count = fit.distance
+    away = f"chi-square of the stimulus {square:.3g}, {count} expected"
+    if float(chdtrc(count, square)) < FOREIGN:
+        return (
+            f"family: this unit is not like its {units} units ({away}); M holds at the temperatures of the stimulus "
+            "alone, turn the unit at others too"
+        )
+    return f"family: {units} units, and this one is like them ({away})"
 
 
 def result(fit: TriadFit, unit: BiasUnit, channel: str) -> str:

@@ -3,9 +3,11 @@
 Gauss-Newton steps on penalised least squares, with the noise that the residuals show::
 
     x = argmin  (z - A x)' V^-1 (z - A x)  +  x' P x,      A = J B(T)
-    V = diag(s_g^2) + q sum_i J_i J_i' min(t, t')
+    V = diag(s_g^2) + sum_i J_i J_i' (q min(t, t') + l^2),    q within a clock, l within a recording
 
-s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes.
+s_g is the white noise of a group of equations, q the walk of the bias over time, i its three axes; l is how far its
+level differs from one recording to another, each of them a power-up, zero of a single one. A clock goes on from one
+recording to another that begins after its end, else time begins anew.
 
 The curve of each term is chosen step by step, by the largest fall of::
 
@@ -13,9 +15,11 @@ The curve of each term is chosen step by step, by the largest fall of::
 
 with p the effective number of coefficients: the price of a coefficient among q terms that could have had it (extended
 Bayesian information criterion, Chen and Chen, Biometrika 95 (2008) 759), and that of a smoothing that is found. White
-noise and walk are means over their restricted likelihood; the prior of the density of the walk is half-Cauchy (Gelman,
-Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. A term that the
-equations do not show is zero, and its usual size counts in the error of the others.
+noise, walk and level are means over their restricted likelihood. The prior of the density of the walk is half-Cauchy
+(Gelman, Bayesian Analysis 1 (2006) 515), its scale the declared density: one that hardly shows may be there. That of
+log l is flat up to a usual level, so that one of few recordings has Student's law, and falls by 1 / l beyond, or no
+bias would be seen to follow the temperature where each recording is at another. A term that the equations do not show
+is zero, and its usual size counts in the error of the others.
 
 What was decided counts in the error too. A term that stays constant may move by b, sigma s, all the same; it does with
 the probability that follows from the two models' evidence (Schwarz, Annals of Statistics 6 (1978) 461)::
@@ -23,7 +27,9 @@ the probability that follows from the two models' evidence (Schwarz, Annals of S
     p = 1 / (1 + sqrt(m) exp(-b^2 / 2 s^2)),    E[b^2] = p (s^2 + b^2)
 
 and the scatter of the terms over the walks that are likely is a part of their error. As many equations as there are
-leave the size of the noise unsure: the error is that of Student's t. m equations, n coefficients, q terms: 12, or 21.
+leave the size of the noise unsure: the error is that of Student's t. Terms of M may have a law of their coefficients,
+as of a family: it takes the place of P, once the noise is found without it. m equations, n coefficients, q terms: 12,
+or 21.
 """
 
 from __future__ import annotations
@@ -31,6 +37,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +47,18 @@ from driftlab.triad.model import (
     GRAVITY,
     GRID,
     NARROW,
+    PARABOLA,
     SCALE,
     SENSITIVITIES,
     TERMS,
     TermCurve,
+    TermPrior,
     TriadTerms,
     curves_of,
     polynomial,
 )
 from fusion_core.chunk import Array
-from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
+from fusion_core.contracts import CurveError, Equations, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
 from fusion_core.errors import SingularFit
 
 STEPS = 30
@@ -60,6 +69,9 @@ PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
+LEVELS = tuple(10.0 ** (k / 2) for k in range(-6, 13))  # and of the level from one recording to another
+LEVEL = 0.01  # of a usual bias: that level, of a usual unit
+TOLD = 3  # levels beyond the coefficients of the bias, from which their deviation is known
 SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 AHEAD = 2  # curves that are looked at beyond that of a term, to either side
 TINY = 1e-30
@@ -89,6 +101,13 @@ class TriadFit:
         Deviation of an equation in each group.
     columns : tuple of int
         How many of the columns of the root are of each of SOURCES.
+    level : float
+        Deviation of the level of the bias from one recording to another; 0 where the recordings are too few to tell it.
+    parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
+        Terms of M as a family takes them, Chebyshev coefficients over the domain with their covariance; None where the
+        temperatures or the equations are too few, or a family is their prior.
+    distance : (float, int), or None
+        Chi-square of the stimulus against the prior, and its degrees of freedom; None without a prior.
     """
 
     stimulus: TriadInput
@@ -102,6 +121,9 @@ class TriadFit:
     root: Array
     noise: tuple[float, ...]
     columns: tuple[int, ...]
+    level: float = 0.0
+    parabolas: tuple[Array, Array] | None = None
+    distance: tuple[float, int] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -193,6 +215,7 @@ def fit_triad(
     bias_size: float,
     wanted: NDArray[np.bool_] | None = None,
     walk: float | None = None,
+    prior: TermPrior | None = None,
 ) -> TriadFit:
     """Fit the terms of a triad to a stimulus.
 
@@ -209,6 +232,8 @@ def fit_triad(
     walk : float, optional
         Declared density of the random walk of the bias, its unit/sqrt(s); without it the scale of the prior is a walk
         that ends as large as the noise of an equation.
+    prior : TermPrior, optional
+        Law of the terms of M, as of a family; they are over its domain then.
 
     Raises
     ------
@@ -222,7 +247,10 @@ def fit_triad(
     wanted = np.ones(len(TERMS), dtype=bool) if wanted is None else wanted
     free = np.concatenate([stimulus.free, np.ones(len(wanted) - len(TERMS), dtype=bool)]) & wanted
     usual = np.array([bias_size] * 3 + [0.01] * 9 + [USUAL_SENSITIVITY] * 9)[: len(free)]
-    search = _Search(stimulus, curves_of(settings, domain), usual, free, walk)
+    curves = [curves_of(settings, domain)] * len(free)
+    if prior is not None:
+        curves[len(BIAS) : len(TERMS)] = [[curve] for curve in prior.curves()]
+    search = _Search(stimulus, curves, usual, free, walk)
     search.check()
     if not search.converge():
         search.drop_unobservable()
@@ -240,7 +268,7 @@ def fit_triad(
             f"the fit does not settle in {STEPS} steps; see that units and scale in the config are about right, and "
             "that the stimulus moves all axes"
         )
-    return search.result(domain)
+    return search.result(domain if prior is None else prior.domain)
 
 
 class _Search:
@@ -249,7 +277,7 @@ class _Search:
     def __init__(
         self,
         stimulus: TriadInput,
-        curves: list[TermCurve],
+        curves: list[list[TermCurve]],
         usual: Array,
         free: NDArray[np.bool_],
         declared: float | None = None,
@@ -257,14 +285,15 @@ class _Search:
         self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
         self.observable = free.copy()
         self.chosen = [0] * len(free)
-        self.x: list[Array] = [np.zeros(1) for _ in free]
-        self.s, self.walk, self.declared = np.ones(2), 0.0, declared
-        self.by_walk: list[tuple[float, Array]] = []  # how likely each walk is, and the coefficients of these terms
+        self.x: list[Array] = [own[0].mean for own in curves]
+        self.s, self.walk, self.level, self.declared = np.ones(2), 0.0, 0.0, declared
+        self.by_walk: list[tuple[float, Array]] = []  # how likely walk and level are, and the change by them
         self.linearise()
 
     def check(self) -> None:
         """Raise SingularFit where there are fewer equations than terms."""
-        equations, count = len(self.e.left), int(np.sum(self.observable))
+        alone = [own[0].precision is None for own in self.curves]
+        equations, count = len(self.e.left), int(np.sum(self.observable & alone))
         if equations <= count:
             raise SingularFit(
                 f"the stimulus has {equations} equations for {count} terms; add placements or segments, more than "
@@ -275,27 +304,52 @@ class _Search:
     def terms(self) -> TriadTerms:
         return TriadTerms(self._curves(self.chosen), self.x)
 
+    @property
+    def _means(self) -> TriadTerms:
+        curves = self._curves(self.chosen)
+        return TriadTerms(curves, [np.broadcast_to(curve.mean, curve.q) for curve in curves])
+
     def linearise(self) -> None:
         """Take the equations about these terms, whiten them, and forget the columns of those before."""
         e = self.stimulus.equations(self.terms.at(self.stimulus.T))
         self.e = e = replace(e, J=np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1]))))  # of terms it knows not of
         sigma = self.s[e.group]
-        self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T))) / sigma  # as without any terms
+        self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T) - self._means.at(e.T))) / sigma  # of no terms
         self._J = e.J / sigma[:, None]
         self._columns: dict[tuple[int, int], Array] = {}
-        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk)) if self.walk else None
+        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk else None
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
 
     def _walked(self) -> Array:
         """Return the covariance (m, m) of the equations over their white noise that a walk of density one leaves."""
-        J, t = self._J[:, list(BIAS)], self.e.t - self.e.t.min()
-        return np.asarray((J @ J.T) * np.minimum.outer(t, t))
+        J, clock = self._J[:, list(BIAS)], _clocks(self.e)
+        first = np.array([self.e.t[clock == k].min() for k in range(clock.max() + 1)])
+        t = self.e.t - first[clock]
+        return np.asarray((J @ J.T) * np.minimum.outer(t, t) * np.equal.outer(clock, clock))
 
-    def _covariance_of_noise(self, walk: float) -> Array:
-        """Return the covariance (m, m) of the equations over their white noise: one, and the walk of the bias."""
-        walked = self._walked()
-        return np.asarray(np.eye(len(walked)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked)
+    def _levels(self) -> Array:
+        """Return the derivative (m, 3 R) of the equations by the levels of R recordings, at most of length one."""
+        J, recordings = self._J[:, list(BIAS)], np.unique(_recordings(self.e))
+        own = np.equal.outer(_recordings(self.e), recordings) * (len(recordings) > 1)
+        return np.asarray((own[:, :, None] * J[:, None]).reshape(len(J), -1) / self._size())
+
+    def _size(self) -> float:
+        """Return the largest derivative of an equation over its white noise by the bias."""
+        return float(np.max(np.linalg.norm(self._J[:, list(BIAS)], axis=1))) + TINY
+
+    def _level(self) -> float:
+        """Return the deviation of the levels, in the unit of the bias; 0 where the curves of the bias leave too few."""
+        taken = sum(curve.q for curve in self._curves(self.chosen)[: len(BIAS)])
+        told = len(BIAS) * len(np.unique(_recordings(self.e))) - taken >= TOLD
+        return float(np.sqrt(self.level)) / self._size() if told else 0.0
+
+    def _covariance_of_noise(self, walk: float, level: float = 0.0) -> Array:
+        """Return the covariance (m, m) of the equations over their white noise: one, walk and levels of the bias."""
+        walked, L = self._walked(), self._levels()
+        return np.asarray(
+            np.eye(len(walked)) + walk / max(float(np.max(np.diag(walked))), TINY) * walked + level * L @ L.T
+        )
 
     def column(self, j: int, curve: TermCurve) -> Array:
         """Return the whitened columns (m, q) of a term's curve."""
@@ -305,15 +359,19 @@ class _Search:
             self._columns[key] = own if self._root is None else np.linalg.solve(self._root, own)
         return self._columns[key]
 
-    def _system(self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE) -> tuple[Array, Array]:
+    def _system(
+        self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE, *, law: bool = True
+    ) -> tuple[Array, Array]:
         """Return N (n, n), with priors and penalties in it, and the whitened design A (m, n) of curves.
 
-        Of terms that are not among `some` (q,) the columns are zero; the prior is `wide` times the usual size.
+        Of terms that are not among `some` (q,) the columns are zero; the prior is `wide` times the usual size, or a
+        `law` that the curve has.
         """
         columns, prior = [], []
         for j, curve in enumerate(curves):
             columns.append(self.column(j, curve) * some[j])
-            prior.append(np.eye(curve.q) / (wide * self.usual[j]) ** 2)
+            own = np.eye(curve.q) / (wide * self.usual[j]) ** 2
+            prior.append(curve.precision.copy() if law and curve.precision is not None else own)
             if np.any(curve.penalty):
                 prior[-1] += curve.penalty * np.sum(columns[-1] ** 2) / curve.q
         A = np.hstack(columns)
@@ -324,18 +382,19 @@ class _Search:
         return np.asarray(N), A
 
     def _curves(self, chosen: Sequence[int]) -> list[TermCurve]:
-        return [self.curves[k] for k in chosen]
+        return [own[k] for own, k in zip(self.curves, chosen, strict=True)]
 
     def converge(self, *, noise: bool = True) -> bool:
         """Go to the optimum of these curves, with the noise that its residuals show; return False if there is none.
 
-        Without `noise` that stays as it is. Where there is no optimum the terms are those of usual units, whose
-        equations show which of them are not observable.
+        Without `noise` that stays as it is. It is found without laws, or a unit that is unlike its family would pass
+        for a noisy one. Where there is no optimum the terms are those of usual units, whose equations show which of
+        them are not observable.
         """
         fall, size = np.inf, 1 / TINY
         for k in range(STEPS):
             self.linearise()
-            N, A = self._system(self._curves(self.chosen), self.observable)
+            N, A = self._system(self._curves(self.chosen), self.observable, law=not noise)
             inverse = np.linalg.inv(N)
             solution = np.asarray(inverse @ (A.T @ self.z))
             self._take(solution)
@@ -352,39 +411,59 @@ class _Search:
         if settled := fall < 1e-2:
             self.linearise()
         else:
-            self.x = [np.zeros(self.curves[k].q) for k in self.chosen]
+            self.x = self._means.coefficients
             self.s = np.full(2, SURE * self.usual[0])
             self.linearise()
         return settled
 
     def measure_walk(self) -> None:
-        """Find the walk of the bias beside the white noise, by restricted maximum likelihood at these curves."""
+        """Find walk and levels of the bias beside the white noise, by restricted likelihood at these curves.
+
+        The levels are coefficients b ~ N(0, l^2) beside those of the terms (Henderson, Biometrics 31 (1975) 423).
+        """
         if not np.any(self.observable):
             return
-        prices, squares, solutions, z, J = [], [], [], self.e.left, self._J
-        z = (z + np.einsum("mj,mj->m", self.e.J, self.terms.at(self.e.T))) / self.s[self.e.group]
+        prices, squares, solutions, J, L = [], [], [], self._J, self._levels()
         curves = self._curves(self.chosen)
-        X = np.hstack([J[:, j, None] * c.values(self.e.T) for j, c in enumerate(curves) if self.observable[j]])
+        seen = [(j, curve) for j, curve in enumerate(curves) if self.observable[j]]
+        X = np.hstack([J[:, j, None] * curve.values(self.e.T) for j, curve in seen])
+        lawful = np.repeat([curve.precision is not None for _, curve in seen], [curve.q for _, curve in seen])
+        weak = lawful / np.repeat([WIDE * self.usual[j] for j, _ in seen], [curve.q for _, curve in seen]) ** 2
+        about = self.e.left / self.s[self.e.group]
+        for j, curve in seen:
+            if curve.precision is not None:
+                about = about + J[:, j] * (curve.values(self.e.T) @ (self.x[j] - curve.mean))
         usual = 1.0 if not self.declared else self.declared**2 * float(np.max(np.diag(self._walked()))) + TINY
+        levels, q, m = LEVELS if np.any(L) else LEVELS[:1], X.shape[1], len(X)
         for walk in WALKS:
             root = np.linalg.cholesky(self._covariance_of_noise(walk))
-            A, y = np.linalg.solve(root, X), np.linalg.solve(root, z)
-            N = A.T @ A + 1e-12 * np.trace(A.T @ A) * np.eye(A.shape[1])
-            solutions.append(np.linalg.solve(N, A.T @ y))
-            left = y - A @ solutions[-1]
-            spread = 2 * np.sum(np.log(np.diag(root))) + np.linalg.slogdet(N)[1]
-            squares.append(float(left @ left) / max(len(z) - A.shape[1], 1) + TINY)
-            prices.append(float(spread + max(len(z) - A.shape[1], 1) * np.log(squares[-1])))
-        likely = np.exp((np.min(prices) - np.array(prices)) / 2) * np.sqrt(WALKS) / (1 + np.array(WALKS) / usual)
+            white = np.linalg.solve(root, np.column_stack([X, L, about]))
+            A, y, spread = white[:, :-1], white[:, -1], 2 * np.sum(np.log(np.diag(root)))
+            N, b = A.T @ A, A.T @ y
+            N[range(q), range(q)] += 1e-12 * np.trace(N[:q, :q])
+            told = N[:q, :q].copy()
+            N[range(q), range(q)] += weak
+            n = int(np.sum(~lawful)) + float(np.diag(np.linalg.solve(N[:q, :q], told)) @ lawful)
+            for level in levels:
+                whole = N + np.diag(np.repeat([0.0, 1 / level], [q, L.shape[1]]))
+                solution = np.linalg.solve(whole, b)
+                solutions.append(solution[:q])
+                squares.append(float(y @ y - b @ solution) / max(m - n, 1) + TINY)
+                bent = np.linalg.slogdet(whole)[1] + L.shape[1] * np.log(level)
+                prices.append(float(spread + bent + max(m - n, 1) * np.log(squares[-1])))
+        walks, own = (np.array(v) for v in zip(*product(WALKS, levels), strict=True))
+        likely = np.exp((np.min(prices) - np.array(prices)) / 2)
+        likely *= np.sqrt(walks) / (1 + walks / usual) / np.sqrt(1 + own / (LEVEL * self.usual[0] * self._size()) ** 2)
         likely /= np.sum(likely)
-        white = float(likely @ squares)
-        self.walk = float(likely @ (np.array(squares) * WALKS)) / white
+        white_noise = float(likely @ squares)
+        self.walk, self.level = (float(likely @ (np.array(squares) * size)) / white_noise for size in (walks, own))
         self.by_walk = list(zip(likely.tolist(), solutions, strict=True))
-        self.s = self.s * np.sqrt(white)
+        self.s = self.s * np.sqrt(white_noise)
 
     def _take(self, solution: Array) -> None:
         sizes = [curve.q for curve in self._curves(self.chosen)]
-        self.x = np.split(solution, np.cumsum(sizes)[:-1])
+        means = np.concatenate(self._means.coefficients)
+        self.x = np.split(solution + means, np.cumsum(sizes)[:-1])
 
     def _covariance(self) -> Array:
         """Return the covariance (q, q) of the terms in the middle, by the columns that are free."""
@@ -406,7 +485,7 @@ class _Search:
             if sigma[worst] <= UNOBSERVABLE:
                 return
             self.observable[worst] = False
-            self.chosen[worst], self.x[worst] = 0, np.zeros(1)
+            self.chosen[worst], self.x[worst] = 0, self.curves[worst][0].mean
 
     def choose(self) -> None:
         """Give each term the curve that pays for its coefficients.
@@ -414,7 +493,8 @@ class _Search:
         Where all terms move, one alone hardly lowers the residual of the others, and does not pay; so the search begins
         with constants, and again with the curve that is best for all.
         """
-        alike = [[k * int(seen) for seen in self.observable] for k in range(len(self.curves))]
+        most = [(len(own) - 1) * int(seen) for own, seen in zip(self.curves, self.observable, strict=True)]
+        alike = [[min(k, own) for own in most] for k in range(max(most) + 1)]
         _, self.chosen = min(map(self._cheapest, (alike[0], min(alike, key=self._price))))
         N, A = self._system(self._curves(self.chosen), self.observable)
         self._take(np.asarray(np.linalg.solve(N, A.T @ self.z)))
@@ -425,7 +505,7 @@ class _Search:
         while True:
             trials = []
             for j in np.flatnonzero(self.observable):
-                for k in range(max(chosen[j] - AHEAD, 0), min(chosen[j] + 1 + AHEAD, len(self.curves))):
+                for k in range(max(chosen[j] - AHEAD, 0), min(chosen[j] + 1 + AHEAD, len(self.curves[j]))):
                     tried = [*chosen[:j], k, *chosen[j + 1 :]]
                     trials.append((self._price(tried), tried))
             least, tried = min(trials, default=(best, chosen))
@@ -438,7 +518,8 @@ class _Search:
         N, A = self._system(curves, self.observable)
         left, shares = self.z - A @ np.linalg.solve(N, A.T @ self.z), np.diag(np.linalg.solve(N, A.T @ A))
         for curve, own in zip(curves, np.split(shares, np.cumsum([curve.q for curve in curves])[:-1]), strict=True):
-            p += float(np.sum(own)) + 1 if np.any(curve.penalty) else curve.q
+            free = curve.precision is None and not np.any(curve.penalty)
+            p += curve.q if free else float(np.sum(own)) + bool(np.any(curve.penalty))
         if p >= m - 1:
             return np.inf
         return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(self.free))))
@@ -472,15 +553,49 @@ class _Search:
         share = 1 / (1 + np.sqrt(len(self.z)) * np.exp(-((b / s) ** 2) / 2))
         others = np.linalg.solve(whole[np.ix_(pinned, pinned)], whole[pinned]).T  # by which the others go with a change
         doubt = others * np.sqrt(share * (s**2 + b**2))
-        freedom = max(len(self.z) - len(N) + len(pinned), 3)
-        inside = np.hstack([np.linalg.inv(np.linalg.cholesky(N)).T, doubt]) * np.sqrt(freedom / (freedom - 2))
+        lawful = np.diag(_laws(design)) > 0
+        free = np.sum(~lawful) - len(pinned) + float(np.diag(whole @ (A.T @ A)) @ lawful)
+        freedom = max(len(self.z) - free, 3.0)
+        student = freedom / (freedom - 2)
+        root = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
+        inside = np.hstack([np.linalg.inv(root).T, doubt * np.sqrt(student)])
         scatter = self._scatter_over_walks(starts)
         root = np.hstack([inside, scatter, length])
         columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.observable.copy(), hidden, design, root,
-            tuple(self.s.tolist()), columns,
+            tuple(self.s.tolist()), columns, self._level(), self._parabolas(domain), self._distance(),
         )  # fmt: skip
+
+    def _parabolas(self, domain: tuple[float, float]) -> tuple[Array, Array] | None:
+        """Return the terms of M as parabolas over the domain, whatever curves they have, and their covariance."""
+        curves, part = self._curves(self.chosen), slice(len(BIAS), len(TERMS))
+        curves[part] = [polynomial(PARABOLA, domain)] * len(curves[part])
+        N, A = self._system(curves, self.free)
+        freedom = len(self.z) - len(N)
+        if freedom < 3 or domain[1] - domain[0] < NARROW or np.any(_laws(self._curves(self.chosen))):
+            return None
+        C, at = np.linalg.inv(N), sum(curve.q for curve in curves[: len(BIAS)])
+        own = [slice(at + k, at + k + PARABOLA + 1) for k in range(0, len(curves[part]) * (PARABOLA + 1), PARABOLA + 1)]
+        c = C @ (A.T @ self.z)
+        return np.stack([c[k] for k in own]), np.stack([C[k, k] for k in own]) * freedom / (freedom - 2)
+
+    def _distance(self) -> tuple[float, int] | None:
+        """Return the chi-square of the terms that have a law against it, in the directions that the equations tell."""
+        curves = self._curves(self.chosen)
+        known = _laws(curves)
+        own = np.flatnonzero(np.diag(known))
+        if not len(own):
+            return None
+        N, A = self._system(curves, self.observable)
+        rest = np.setdiff1d(range(len(N)), own)
+        taken = np.linalg.solve(N[np.ix_(rest, rest)], N[np.ix_(rest, own)]).T
+        b, J = A.T @ self.z, (N - known)[np.ix_(own, own)] - taken @ N[np.ix_(rest, own)]
+        L = np.linalg.inv(np.linalg.cholesky(known[np.ix_(own, own)])).T
+        gain, U = np.linalg.eigh(L.T @ J @ L)
+        seen = gain > 1
+        a = (U.T @ (L.T @ (b[own] - taken @ b[rest])))[seen]
+        return float(np.sum(a**2 / (gain[seen] + gain[seen] ** 2))), int(np.sum(seen))
 
     def _scatter_over_walks(self, starts: Array) -> Array:
         """Return the modes (n, walks) of the coefficients' scatter over the walks that are likely."""
@@ -491,3 +606,24 @@ class _Search:
             mean = sum((p * x for p, x in self.by_walk), np.zeros(len(places)))
             modes[places.astype(np.int64)] = np.stack([np.sqrt(p) * (x - mean) for p, x in self.by_walk], axis=1)
         return modes
+
+
+def _laws(curves: Sequence[TermCurve]) -> Array:
+    """Return the precision (n, n) of the coefficients of curves by their own laws, zero of those that have none."""
+    sizes = [curve.q for curve in curves]
+    known, starts = np.zeros((sum(sizes), sum(sizes))), np.cumsum([0, *sizes])
+    for curve, at in zip(curves, starts, strict=False):
+        if curve.precision is not None:
+            known[at : at + curve.q, at : at + curve.q] = curve.precision
+    return known
+
+
+def _recordings(e: Equations) -> NDArray[np.int64]:
+    return np.zeros(len(e.t), dtype=np.int64) if e.recording is None else e.recording
+
+
+def _clocks(e: Equations) -> NDArray[np.int64]:
+    """Return the number of the clock of each equation: it goes on in a recording after the end of the one before."""
+    names, own = np.unique(_recordings(e), return_inverse=True)
+    first, last = (np.array([end(e.t[own == k]) for k in range(len(names))]) for end in (np.min, np.max))
+    return np.asarray(np.cumsum(np.concatenate([[0], first[1:] <= last[:-1]])))[own]

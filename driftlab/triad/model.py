@@ -12,7 +12,7 @@ smooth as their penalty has them. m equations, q coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -37,11 +37,13 @@ GRID = 25  # temperatures at which the error is kept
 
 @dataclass(frozen=True, eq=False)
 class TermCurve:
-    """One form that a term may have over temperature."""
+    """One form that a term may have over temperature, and the law N(mean, precision^-1) of its coefficients, if any."""
 
     name: str
     values: Callable[[Array], Array]  # of T (m,): (m, q)
     penalty: Array  # (q, q)
+    mean: Array = field(default_factory=lambda: np.zeros(1))  # (q,), or zero
+    precision: Array | None = None  # (q, q)
 
     @property
     def q(self) -> int:
@@ -59,6 +61,31 @@ def polynomial(order: int, domain: tuple[float, float]) -> TermCurve:
     return TermCurve("constant" if order == 0 else f"order {order}", values, np.zeros((order + 1, order + 1)))
 
 
+PARABOLA = 2
+
+
+@dataclass(frozen=True, eq=False)
+class TermPrior:
+    """Law of the 9 terms of M before a stimulus: Chebyshev coefficients of parabolas over a domain.
+
+    Attributes
+    ----------
+    domain : pair of float
+        In degC.
+    mean, covariance : (9, 3) and (9, 3, 3) arrays
+    """
+
+    domain: tuple[float, float]
+    mean: Array
+    covariance: Array
+
+    def curves(self) -> list[TermCurve]:
+        """Return the curve of each term with its law."""
+        values, flat = polynomial(PARABOLA, self.domain).values, np.zeros((PARABOLA + 1, PARABOLA + 1))
+        laws = zip(self.mean, np.linalg.inv(self.covariance), strict=True)
+        return [TermCurve("family", values, flat, mean, precision) for mean, precision in laws]
+
+
 def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCurve]:
     """Return the forms that are tried for each term, the simplest first.
 
@@ -68,7 +95,10 @@ def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCur
         If the kind is a network, whose coefficients no information matrix holds.
     """
     if isinstance(settings, NetworkMap):
-        raise ConfigError(f"--kind {settings.kind}: is not linear in its coefficients; take spline or polynomial")
+        raise ConfigError(
+            f"--kind {settings.kind}: is not linear in its coefficients, by which terms have their joint covariance; "
+            "give --kind spline; a network may hold the bias alone, with --terms scale,misalignment --kind spline"
+        )
     if domain[1] - domain[0] < NARROW:
         return [polynomial(0, domain)]
     most = getattr(settings, "order", ORDERS)

@@ -48,6 +48,8 @@ class Equations:
     group : (m,) array of int
         Equations of one kind of noise, 0 or 1, whose size is found from them. Within it all count alike: after seconds
         at rest it is the instability and the mounting that are left, and no longer white noise.
+    recording : (m,) array of int, optional
+        Recording of each, in their order; the level of the bias is another in each. All are of one without it.
     """
 
     left: Array
@@ -55,6 +57,7 @@ class Equations:
     T: Array
     t: Array
     group: NDArray[np.int64]
+    recording: NDArray[np.int64] | None = None
 
 
 class TriadInput(ABC):

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.stimulus import (
@@ -68,6 +69,8 @@ class KnownRates(TriadInput):
         Of each, in degC and s.
     force : (S, 3) array, optional
         The specific force.
+    recordings : (S,) array of int, optional
+        Recording of each.
     """
 
     u: Array
@@ -75,6 +78,7 @@ class KnownRates(TriadInput):
     temperatures: Array
     times: Array
     force: Array | None = None
+    recordings: NDArray[np.int64] | None = None
 
     @property
     def T(self) -> Array:
@@ -91,7 +95,8 @@ class KnownRates(TriadInput):
             if q > len(TERMS) and self.force is not None:
                 J[:, i, 12 + 3 * i : 15 + 3 * i] = self.force
         each = np.repeat(self.T, 3), np.repeat(self.times, 3)
-        return Equations(left.ravel(), J.reshape(-1, q), *each, np.zeros(3 * S, dtype=np.int64))
+        own = None if self.recordings is None else np.repeat(self.recordings, 3)
+        return Equations(left.ravel(), J.reshape(-1, q), *each, np.zeros(3 * S, dtype=np.int64), own)
 
     def lacking(self, term: int) -> str:
         """Say which rates are missing."""
@@ -106,7 +111,7 @@ class KnownRates(TriadInput):
 
 @dataclass(frozen=True, eq=False)
 class PlacedForces(TriadInput):
-    """Placements of an accelerometer at rest: mean readings (P, 3), temperatures and times (P,), gravity.
+    """Placements of an accelerometer at rest: mean readings (P, 3), temperatures, times and recordings (P,), gravity.
 
     Gravity is unsure by a share, which is one in the scale factors of all axes.
 
@@ -118,6 +123,7 @@ class PlacedForces(TriadInput):
     times: Array
     gravity: float
     unsure: float = 0.0
+    recordings: NDArray[np.int64] | None = None
     sensor_frame = True
 
     @property
@@ -137,7 +143,9 @@ class PlacedForces(TriadInput):
         length = np.linalg.norm(f, axis=1)
         J = np.einsum("ni,nij->nj", f / length[:, None], input_derivative(W, f))
         J = np.pad(J, ((0, 0), (0, values.shape[1] - J.shape[1])))  # an accelerometer is under no other force
-        return Equations(self.gravity - length, J, self.T, self.times, np.zeros(len(f), dtype=np.int64))
+        return Equations(
+            self.gravity - length, J, self.T, self.times, np.zeros(len(f), dtype=np.int64), self.recordings
+        )
 
     def lacking(self, term: int) -> str:
         """Say which placements are missing."""

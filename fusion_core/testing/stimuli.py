@@ -25,6 +25,7 @@ def equations_have_their_shapes(stimulus: Stimulus) -> None:
         assert e.J.shape in ((m, q), (m, len(TERMS))), f"J has shape {e.J.shape}, {(m, q)} expected"
         assert all(len(part) == m for part in (e.T, e.t, e.group)), f"T, t and group have not {m} rows each"
         assert set(np.unique(e.group)) <= {0, 1}, "a group is neither 0 nor 1"
+        assert e.recording is None or len(e.recording) == m, f"recording has not {m} rows"
         for name, part in (("left", e.left), ("J", e.J), ("T", e.T), ("t", e.t)):
             assert np.all(np.isfinite(part)), f"{name} is not finite"
 

@@ -51,7 +51,8 @@ class PlacedStimulus(Stimulus):
         y = np.stack([chunk[channel][part].mean(axis=0) for chunk, part in rows])
         T = np.array([chunk["temperature"][part].mean() for chunk, part in rows])
         t = np.array([chunk.t[part].mean() for chunk, part in rows])
-        return PlacedForces(y, T, t, gravity, unsure / gravity)
+        own = np.repeat(np.arange(len(parts)), [len(places) for places in parts])
+        return PlacedForces(y, T, t, gravity, unsure / gravity, own)
 
     def _places(self, chunk: Chunk, k: int) -> list[tuple[int, int]]:
         if self.placements:

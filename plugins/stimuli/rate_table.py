@@ -63,16 +63,17 @@ class RateTable(Stimulus):
             raise ConfigError("stimulus: rate_table needs segments, a table, or channel, its rate; give one of them")
         known = all("accel" in chunk.channels for chunk in recordings)
         vertical = 0.0 if site.latitude is None else RATE * float(np.sin(site.latitude))
-        u, y, T, t, force = [], [], [], [], []
+        u, y, T, t, force, own = [], [], [], [], [], []
         for k, chunk in enumerate(recordings):
             for (a, b), axis, rate in self._turns(chunk, k, len(recordings)):
                 u.append((rate + vertical) * axis)
                 y.append(chunk["gyro"][a:b].mean(axis=0))
                 T.append(chunk["temperature"][a:b].mean())
                 t.append(chunk.t[a:b].mean())
+                own.append(k)
                 force.append(chunk["accel"][a:b].mean(axis=0) if known else gravity(site.latitude) * axis)
         pulled = np.stack(force) if known or site.latitude is not None else None
-        return KnownRates(np.stack(u), np.stack(y), np.array(T), np.array(t), pulled)
+        return KnownRates(np.stack(u), np.stack(y), np.array(T), np.array(t), pulled, np.array(own))
 
     def _turns(self, chunk: Chunk, k: int, count: int) -> list[_Turn]:
         if self.segments is not None:

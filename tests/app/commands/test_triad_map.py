@@ -7,6 +7,8 @@ from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strai
 
 import driftlab
 from driftlab.errors import ConfigError
+from driftlab.evaluation.uncertainty import bias_budget
+from driftlab.storage.map_file import read_map
 
 GYRO = """
 latitude: 0 deg
@@ -132,23 +134,36 @@ def test_a_run_takes_scale_and_misalignment_off(folder, bias):
     assert np.ptp(along) < 5e-3
 
 
-def test_without_the_bias_that_of_the_configs_map_stays(folder):
-    (folder / "both.yaml").write_text(GYRO.replace("gyro.json", "known.json"))
+@pytest.mark.parametrize(("kind", "suffix", "more"), [("polynomial", "json", []), ("onnx_network", "onnx", ["spline"])])
+def test_without_the_bias_that_of_the_configs_map_stays(folder, kind, suffix, more):
+    with_map = GYRO.replace("kind: polynomial, path: gyro.json", f"kind: {kind}, path: known.{suffix}")
+    (folder / "both.yaml").write_text(with_map)
     T = np.linspace(-20, 60, 300)
-    known = driftlab.fit_map(GYRO.replace("stimulus", "#"), {
+    known = driftlab.fit_map(with_map.replace("stimulus", "#"), {
         "time": (np.arange(300.0), "s"), "temperature": (T, "degC"),
         "gyro": (np.random.default_rng(0).normal(0, 1e-6, (300, 3)) + np.outer(T, [1e-6, 2e-6, 3e-6]), "rad/s"),
-    }, out=folder / "known.json").map  # fmt: skip
-    result = run("fit-map", "both.yaml", "--terms", "scale,misalignment", "--out", "whole.json", cwd=folder)
+    }, out=folder / f"known.{suffix}").map  # fmt: skip
+    more = ["--kind", *more] if more else []
+    asked = ["fit-map", "both.yaml", *more, "--terms"]
+    result = run(*asked, "scale,misalignment", "--out", f"whole.{suffix}", cwd=folder)
     assert result.returncode == 0, result.stderr
-    from driftlab.storage.map_file import read_map
-
-    whole = read_map(folder / "whole.json")
+    whole = read_map(folder / f"whole.{suffix}")
     T = np.linspace(*known.domain, 20)
     np.testing.assert_array_equal(whole.bias(T), known.bias(T))
     assert whole.record.matrix.at(np.array([20.0]))[0] == pytest.approx(matrix_of(20.0), abs=1e-4)
-    alone = run("fit-map", "both.yaml", "--terms", "scale", "--out", "scale.json", cwd=folder)
+    alone = run(*asked, "scale", "--out", f"scale.{suffix}", cwd=folder)
     assert "misalignment" not in alone.stdout.partition("frame")[0]
+
+
+def test_the_bias_of_a_stimulus_has_its_level_in_its_curve(folder):
+    """The noise of a mean over all samples is no part of it; power-ups are, where the fit had several."""
+    fitted = read_map(folder / "gyro.json")
+    assert [source.name for source in bias_budget(fitted).sources] == ["curve"]
+    of_level = bias_budget(fitted, level=1e-4).sources[-1]
+    assert of_level.name == "power-ups"
+    np.testing.assert_array_equal(of_level.u, 1e-4)
+    with_soak = fitted.noting(matrix=fitted.record.matrix.model_copy(update={"error": None}))
+    assert [source.name for source in bias_budget(with_soak).sources] == ["curve", "mean"]
 
 
 def test_terms_that_all_move_are_all_followed(tmp_path):
@@ -274,8 +289,6 @@ def test_autopilots_hold_constant_scale_factors_of_accelerometers(tmp_path, form
     back = run("import", form, f"out{suffix}", "--channel", "accel", "--out", "back.json", cwd=tmp_path)
     assert back.returncode == 0, back.stderr
     assert "scale x " in back.stdout
-    from driftlab.storage.map_file import read_map
-
     taken = read_map(tmp_path / "back.json")
     reading = np.array([[1.0, 2.0, 9.0]] * len(at)) + made.map.bias(at)
     np.testing.assert_allclose(
@@ -285,8 +298,6 @@ def test_autopilots_hold_constant_scale_factors_of_accelerometers(tmp_path, form
 
 def test_a_mat_file_holds_all_terms_and_gives_them_back(folder):
     from scipy.io import loadmat
-
-    from driftlab.storage.map_file import read_map
 
     assert run("export", "mat", "gyro.json", "--out", "gyro.mat", cwd=folder).returncode == 0
     done = run("import", "mat", "gyro.mat", "--kind", "spline", "--out", "again.json", cwd=folder)
@@ -311,7 +322,7 @@ def test_a_mat_file_holds_all_terms_and_gives_them_back(folder):
         (["--terms", TERMS, "--stimulus", "shaker"], "is none of positions, rate_table, tumble; name one of them"),
         (
             ["--terms", TERMS, "--compare"],
-            "--terms: tries the curves of one kind; leave --select, --compare and --family out",
+            "--terms: tries the curves of one kind, of no lot; leave --select, --compare and --lot out",
         ),
         (["--terms", TERMS, "--kind", "onnx_network"], "not linear in its coefficients"),
         (["--terms", TERMS, "--stimulus", "positions"], "channel 'accel' is needed"),

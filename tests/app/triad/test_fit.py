@@ -1,3 +1,5 @@
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strained, tumble, turntable
@@ -56,6 +58,46 @@ def test_terms_over_temperature_are_within_their_sigma(stimulus, sensor, size, u
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
     sigma = fit.sigma(AT)[:, 3:]
     assert np.max(sigma) < 1e-4  # 100 ppm, 0.1 mrad
+
+
+def by_recordings(seed, made, turn_on):
+    """A recording at each temperature, all by clocks from zero; the level of the bias is another in each."""
+    parts = [made(100 * seed + k, [T]) for k, T in enumerate(TEMPERATURES)]
+    names = [one.name for one in fields(parts[0]) if np.ndim(getattr(parts[0], one.name))]
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    own = np.repeat(range(len(parts)), [len(part.T) for part in parts])
+    whole["y"] = whole["y"] + np.random.default_rng(seed).normal(0, turn_on, (len(parts), 3))[own]
+    return replace(parts[0], **whole, recordings=own)
+
+
+@pytest.mark.parametrize(
+    ("stimulus", "sensor", "size", "usual", "turn_on"),
+    [(known_rates, lambda M: M, np.deg2rad(1.0), 0.02, 1e-4), (placed_forces, sensor_frame, 0.3, 0.5, 2e-3)],
+    ids=["rate table", "tumble"],
+)
+def test_terms_of_several_recordings_are_within_their_sigma(stimulus, sensor, size, usual, turn_on):
+    """Taken for one recording, the level of each power-up makes the bias far too sure."""
+    true, z, levels = truth(sensor, size), [], []
+    for seed in range(400, 405):
+        own = by_recordings(seed, stimulus, turn_on)
+        fit = fit_triad(own, POLYNOMIAL, usual, walk=1e-6)
+        z.append(((fit.terms.at(AT) - true) / fit.sigma(AT))[:, fit.free])
+        levels.append(fit.level)
+    z, one = np.array(z), fit_triad(replace(own, recordings=None), POLYNOMIAL, usual, walk=1e-6)
+    for part in (z[..., :3], z[..., 3:]):
+        assert 0.6 < np.sqrt(np.mean(part**2)) < 1.4
+    assert np.sqrt(np.mean(((one.terms.at(AT) - true) / one.sigma(AT))[:, :3] ** 2)) > 2
+    assert 0.6 * turn_on < np.median(levels) < 1.8 * turn_on
+
+
+def test_a_clock_goes_on_where_a_recording_begins_after_the_end_of_the_one_before():
+    """Then the bias walks between them: the later half is as unsure as it is of one recording."""
+    own = known_rates(seed=2)
+    parts = np.repeat([0, 1], [len(own.T) - 15, 15])
+    one, on = (fit_triad(replace(own, recordings=names), POLYNOMIAL, 0.02, walk=1e-4) for names in (None, parts))
+    sigma = [fit.sigma(AT)[2, :3].mean() for fit in (one, on)]
+    assert sigma[1] > 0.9 * sigma[0]
+    assert one.level == on.level == 0.0  # the bias has as many coefficients as the recordings have levels
 
 
 ALL = np.ones(21, dtype=bool)
@@ -253,5 +295,5 @@ def test_too_few_segments_are_refused():
 
 def test_a_network_is_refused():
     network = KINDS["onnx_network"].model_validate({"kind": "onnx_network"})
-    with pytest.raises(ConfigError, match="not linear in its coefficients; take spline or polynomial"):
+    with pytest.raises(ConfigError, match=r"not linear in its coefficients, by which .* give --kind spline"):
         fit_triad(known_rates(), network, 0.02)
