@@ -411,7 +411,7 @@ class _Search:
         if settled := fall < 1e-2:
             self.linearise()
         else:
-            self.x = self._means.coefficients
+            self.x = list(self._means.coefficients)
             self.s = np.full(2, SURE * self.usual[0])
             self.linearise()
         return settled
@@ -557,8 +557,8 @@ class _Search:
         free = np.sum(~lawful) - len(pinned) + float(np.diag(whole @ (A.T @ A)) @ lawful)
         freedom = max(len(self.z) - free, 3.0)
         student = freedom / (freedom - 2)
-        root = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
-        inside = np.hstack([np.linalg.inv(root).T, doubt * np.sqrt(student)])
+        half = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
+        inside = np.hstack([np.linalg.inv(half).T, doubt * np.sqrt(student)])
         scatter = self._scatter_over_walks(starts)
         root = np.hstack([inside, scatter, length])
         columns = len(N), len(pinned) + scatter.shape[1], 1
