@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 
-from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, UnitRecord
+from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord
 
 HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
 NUMBERS = 5  # before the figures: domain, hours, samples, seconds
@@ -25,6 +25,7 @@ class _Brief(NamedTuple):
     common: tuple[Any, ...]  # lot, date, other columns, channel, bias_unit, axes, driftlab, limits
     numbers: bytes
     repeats: tuple[RepeatedSoak, ...]  # of the few units that were soaked again
+    parabolas: TermParabolas | None  # of the few fleets with a stimulus
 
 
 class UnitRecords:
@@ -48,10 +49,11 @@ class UnitRecords:
         self._briefs[unit] = _Brief(
             record.key, record.state, record.error, self._common.setdefault(common, common),
             np.concatenate([np.array(numbers, dtype=np.float64), figures.ravel()]).tobytes(), tuple(record.repeats),
+            record.parabolas,
         )  # fmt: skip
 
     def __getitem__(self, unit: str) -> UnitRecord:
-        key, state, error, common, content, repeats = self._briefs[unit]
+        key, state, error, common, content, repeats, parabolas = self._briefs[unit]
         lot, date, more, channel, bias_unit, axes, driftlab, limits = common
         low, high, hours, samples, seconds, *rest = np.frombuffer(content).tolist()
         cells, d = [None if value != value else value for value in rest], len(axes)
@@ -64,7 +66,7 @@ class UnitRecords:
             key=key, unit=unit, lot=lot, date=date, more=dict(more), state=state, error=error, channel=channel,
             bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
             samples=int(samples), figures=figures, limits=[dict(row) for row in limits], seconds=seconds,
-            driftlab=driftlab, repeats=list(repeats),
+            driftlab=driftlab, repeats=list(repeats), parabolas=parabolas,
         )  # fmt: skip
 
     def of(self, units: Sequence[str]) -> RecordsOfUnits:

@@ -254,10 +254,12 @@ def fit_triad(
     search.check()
     if not search.converge():
         search.drop_unobservable()
-    for _ in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
+    for k in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
         before = [*search.chosen, *search.observable]
         search.choose()
         search.converge()
+        if k == 0:
+            search.expect_levels()
         search.measure_walk()
         search.converge(noise=False)
         search.drop_unobservable()
@@ -317,7 +319,9 @@ class _Search:
         self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T) - self._means.at(e.T))) / sigma  # of no terms
         self._J = e.J / sigma[:, None]
         self._columns: dict[tuple[int, int], Array] = {}
-        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk else None
+        self._root = (
+            np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk or self.level else None
+        )
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
 
@@ -415,6 +419,14 @@ class _Search:
             self.s = np.full(2, SURE * self.usual[0])
             self.linearise()
         return settled
+
+    def expect_levels(self) -> None:
+        """Choose the curves again beside levels of a usual size, of several recordings: curves must not follow them."""
+        self.level = (LEVEL * self.usual[0] * self._size()) ** 2 if np.any(self._levels()) else 0.0
+        if self.level:
+            self.converge(noise=False)
+            self.choose()
+            self.converge(noise=False)
 
     def measure_walk(self) -> None:
         """Find walk and levels of the bias beside the white noise, by restricted likelihood at these curves.

@@ -100,7 +100,7 @@ def test_terms_are_as_far_from_the_truth_as_their_deviations_say(folder, found, 
     terms = record.parabolas  # as a family takes them: in the middle the second polynomial is -1
     middle = terms.c @ [1.0, 0.0, -1.0] - own_matrix(11)(np.mean(terms.T)).ravel()
     sigma = np.sqrt(np.einsum("i,kij,j->k", [1.0, 0.0, -1.0], terms.covariance, [1.0, 0.0, -1.0]))
-    assert terms.T == pytest.approx((TEMPERATURES[0], TEMPERATURES[-1]), abs=0.5)
+    assert pytest.approx((TEMPERATURES[0], TEMPERATURES[-1]), abs=0.5) == terms.T
     assert np.max(np.abs(middle) / sigma) < 4.5
     assert np.max(sigma) < 1e-4
 
