@@ -173,8 +173,8 @@ def test_a_sensor_that_the_firmware_refuses_is_left_out_and_the_others_are_writt
     write_log(tmp_path / "soak.bin", t, [first, narrow], parameters("GYR") | parameters("GYR", 1))
     made = driftlab.vehicle(tmp_path / "soak.bin", out=tmp_path / "made")
     left_out = {sensor.name: sensor.left_out for sensor in made.sensors}
-    assert [name for name, why in left_out.items() if why] == ["gyro 1", "accel 1"]
-    assert "ArduPilot asks for 10 K and more" in left_out["gyro 1"]
+    assert [name for name, why in left_out.items() if why] == ["gyro 2", "accel 2"]
+    assert "ArduPilot asks for 10 K and more" in left_out["gyro 2"]
     text = next((tmp_path / "made").glob("vehicle.par*")).read_text()
     assert "INS_TCAL1_ENABLE" in text
     assert "INS_TCAL2" not in text
