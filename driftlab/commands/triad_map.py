@@ -28,7 +28,8 @@ from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_all, save, write_beside
-from driftlab.triad.fit import TriadFit, fit_triad
+from driftlab.triad.estimate import TriadFit
+from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit

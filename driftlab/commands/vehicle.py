@@ -268,7 +268,7 @@ def _exported(product: str, exporter: Exporter, sensors: Sequence[VehicleSensor]
     try:
         return VehicleResult(product, sensors, exporter.export(Export(of_maps), folder / f"{COMMAND}{exporter.suffix}"))
     except ConfigError as error:
-        refused, problem = {one.name: _refused(exporter, one) for one in of_maps}, str(error)
+        refused, problem = {one.channel: _refused(exporter, one) for one in of_maps}, str(error)
     if not any(refused.values()):
         return VehicleResult(product, sensors, None, problem)
     rest = [replace(one, left_out=one.left_out or refused.get(one.name, "")) for one in sensors]

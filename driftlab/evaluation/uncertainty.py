@@ -37,7 +37,7 @@ from driftlab.evaluation.limits import SIDE, Measured
 from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, TriadMatrix
+from fusion_core.contracts import FittedMap, MapRecord, TriadMatrix
 from fusion_core.contracts.stimulus import PAIRS
 
 K = 2.0  # coverage factor
@@ -96,11 +96,10 @@ def bias_budget(
     if record.error is None:
         return UncertaintyBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
     sources, missing = [UncertaintySource("curve", "A", fitted.sigma(T))], []
-    joint = record.matrix is not None and record.matrix.error is not None and record.matrix.error.T == record.error.T
     left = np.zeros(record.d) if record.residual is None else np.asarray(record.residual)
     if record.samples and record.residual is not None:
         mean = np.broadcast_to(left / np.sqrt(record.samples), shape)
-        sources += [] if joint else [UncertaintySource("mean", "A", mean)]
+        sources += [] if _knows_its_level(record) else [UncertaintySource("mean", "A", mean)]
     else:
         missing.append("the noise of the level: the map's file does not say its samples")
     half, unknown = _memory(fitted)
@@ -164,6 +163,12 @@ def temperatures(low: float, high: float, most: int = MAX_ROWS) -> Array:
         if len(between) <= most - 2:
             break
     return np.concatenate([[low], between, [high]])
+
+
+def _knows_its_level(record: MapRecord) -> bool:
+    """Return True where the error of the curve has its level, as of a stimulus, which shows bias and M together."""
+    of_M = None if record.matrix is None else record.matrix.error
+    return record.error is not None and of_M is not None and of_M.T == record.error.T
 
 
 def _memory(fitted: FittedMap) -> tuple[Array | None, str]:

@@ -84,5 +84,5 @@ def _information(unit: TermParabolas, T: Array) -> tuple[Array, Array]:
     """Return J (9, 3, 3) and h (9, 3) of a unit's terms at T (3,)."""
     low, high = unit.T
     B = chebyshev.chebvander((2 * T - low - high) / (high - low), PARABOLA)
-    J = np.linalg.inv(B @ unit.covariance @ B.T)
+    J = np.asarray(np.linalg.inv(B @ unit.covariance @ B.T), dtype=np.float64)
     return J, np.einsum("kij,kj->ki", J, unit.c @ B.T)

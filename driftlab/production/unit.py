@@ -194,9 +194,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "samples": len(unit.soak.T),
         "figures": {**figures_of(fitted, soaked, densities), **run.figures, **unit.terms()},
         "parabolas": unit.parabolas(),
-        "coast_of": str(run.name)
-        if isinstance(run.name, CopyName) or not run.name
-        else os.path.relpath(run.name, task.folder),
+        "coast_of": _relative(run.name, task.folder),
         "coast_in_sample": run.in_sample,
         "repeats": repeats,
         "map_sigma": None if good is None else tuple(good.tolist()),
@@ -216,6 +214,11 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if task.explain:
         record["loop"] = loop_of(config, recordings, files)
     return record, files
+
+
+def _relative(name: str, folder: str) -> str:
+    """Return the name of a recording relative to a folder; that of a copy, and none, as it is."""
+    return str(name) if isinstance(name, CopyName) or not name else os.path.relpath(name, folder)
 
 
 def _check_regular(recordings: Recordings) -> None:

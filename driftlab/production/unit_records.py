@@ -12,12 +12,15 @@ from typing import Any, overload
 
 import numpy as np
 
-from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, UnitRecord
+from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord
 
 HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
 NUMBERS = 5  # before the figures: domain, hours, samples, seconds
 HEX = frozenset("0123456789abcdef")
 OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
+
+# key, error, repeated soaks and parabolas of the terms, where a stimulus measured them
+_Alone = tuple[str, str, tuple[RepeatedSoak, ...], TermParabolas | None]
 
 
 class UnitRecords:
@@ -34,7 +37,7 @@ class UnitRecords:
         self._common, self._texts, self._known = list[tuple[Any, ...]](), dict[Any, Any](), dict[tuple[Any, ...], int]()
         self._numbers, self._sigmas = array("d"), array("f")
         self._starts = array("Q"), array("Q")  # of numbers and sigmas
-        self._alone: dict[int, tuple[str, str, tuple[RepeatedSoak, ...]]] = {}  # key, error, repeats
+        self._alone: dict[int, _Alone] = {}
 
     def __contains__(self, unit: str) -> bool:
         return unit in self._rows
@@ -47,8 +50,8 @@ class UnitRecords:
                   record.axes, record.driftlab, limits, names)  # fmt: skip
         values, sigmas = record.table(names, d)
         hashed = len(record.key) == 64 and set(record.key) <= HEX
-        if record.error or record.repeats or not hashed:
-            self._alone[row] = record.key, record.error, tuple(record.repeats)
+        if record.error or record.repeats or record.parabolas or not hashed:
+            self._alone[row] = record.key, record.error, tuple(record.repeats), record.parabolas
         self._rows[unit] = row
         self._keys += bytes.fromhex(record.key) if hashed else bytes(32)
         self._codes.append(self._code(tuple(self._texts.setdefault(text, text) for text in common)))
@@ -61,7 +64,12 @@ class UnitRecords:
     def __getitem__(self, unit: str) -> UnitRecord:
         row = self._rows[unit]
         state, lot, date, more, channel, bias_unit, axes, driftlab, limits, names = self._common[self._codes[row]]
-        key, error, repeats = self._alone.get(row) or (self._keys[32 * row : 32 * row + 32].hex(), "", ())
+        key, error, repeats, parabolas = self._alone.get(row) or (
+            self._keys[32 * row : 32 * row + 32].hex(),
+            "",
+            (),
+            None,
+        )
         start, own, d = self._starts[0][row], self._starts[1][row], len(axes)
         low, high, hours, samples, seconds = self._numbers[start : start + NUMBERS]
         figures = {}
@@ -73,7 +81,7 @@ class UnitRecords:
             key=key, unit=unit, lot=lot, date=date, more=dict(more), state=state, error=error, channel=channel,
             bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
             samples=int(samples), figures=figures, limits=[dict(row) for row in limits], seconds=seconds,
-            driftlab=driftlab, repeats=list(repeats),
+            driftlab=driftlab, repeats=list(repeats), parabolas=parabolas,
         )  # fmt: skip
 
     def of(self, units: Sequence[str]) -> RecordsOfUnits:

@@ -20,7 +20,7 @@ from driftlab.units import number
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from driftlab.triad.fit import TriadFit
+    from driftlab.triad.estimate import TriadFit
     from fusion_core.chunk import Array
 
 

@@ -29,7 +29,7 @@ from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.placements import Placements
 from driftlab.storage.json import plain, text_of
-from driftlab.triad.fit import TriadFit
+from driftlab.triad.estimate import TriadFit
 from driftlab.triad.model import AXES, GRAVITY, PAIRS
 from driftlab.units import BiasUnit, default_unit, duration, tracked_unit
 from fusion_core.chunk import Array

@@ -11,7 +11,7 @@ from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, band
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
-from driftlab.triad.fit import TriadFit
+from driftlab.triad.estimate import TriadFit
 from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, SCALE, TERMS
 from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
@@ -99,14 +99,14 @@ def frame_line(fit: TriadFit) -> str:
 
 
 def level_lines(fit: TriadFit, unit: BiasUnit) -> list[str]:
-    """Return how far the level of the bias differs between recordings, in a sentence; none where they are too few."""
+    """Return the deviation of the level of the bias between recordings, in a sentence; none where they are too few."""
     size = fit.level * unit.factor
     line = f"level of the bias: it differs by {size:.2g} {unit.shown} from one recording to another (one sigma)"
     return [f"{line}, and the map holds the mean"] if fit.level else []
 
 
 def family_line(fit: TriadFit, units: int) -> str:
-    """Return how well a stimulus agrees with the family of so many units, in a sentence."""
+    """Return the agreement of a stimulus with the family of so many units, in a sentence."""
     from scipy.special import chdtrc
 
     assert fit.distance is not None, "it was fitted with a family"

@@ -35,30 +35,31 @@ or 21.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.triad.estimate import TINY, TriadFit
 from driftlab.triad.model import (
     BIAS,
     GRAVITY,
-    GRID,
     NARROW,
     PARABOLA,
     SCALE,
-    SENSITIVITIES,
     TERMS,
     TermCurve,
     TermPrior,
     TriadTerms,
+    clocks_of,
     curves_of,
+    laws_of,
     polynomial,
+    recordings_of,
 )
 from fusion_core.chunk import Array
-from fusion_core.contracts import CurveError, Equations, MatrixCurve, ThermalMap, TriadInput, TriadMatrix
+from fusion_core.contracts import ThermalMap, TriadInput
 from fusion_core.errors import SingularFit
 
 STEPS = 30
@@ -67,146 +68,11 @@ UNOBSERVABLE = 0.5  # of the usual size: a term that is not known better is not 
 USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / GRAVITY  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
 PASSES = 4
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
-LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
 LEVELS = tuple(10.0 ** (k / 2) for k in range(-6, 13))  # and of the level from one recording to another
 LEVEL = 0.01  # of a usual bias: that level, of a usual unit
 TOLD = 3  # levels beyond the coefficients of the bias, from which their deviation is known
-SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 AHEAD = 2  # curves that are looked at beyond that of a term, to either side
-TINY = 1e-30
-
-
-@dataclass(frozen=True, eq=False)
-class TriadFit:
-    """Terms of a triad that were fitted, with their joint covariance.
-
-    Attributes
-    ----------
-    stimulus : TriadInput
-    terms : TriadTerms
-    domain : pair of float
-        Temperatures of the stimulus.
-    usual : (q,) array
-        Sizes of the terms of a usual unit, beside which a deviation is large or small.
-    free : (q,) array of bool
-        Terms that were looked for.
-    observable : (q,) array of bool
-        Terms that the stimulus shows; the others are zero.
-    unobservable_changes : (q,) array of bool
-        Observable terms whose change over temperature is not observable.
-    design, root : TriadTerms' curves and (n, n) array
-        Curves of the error, and the root of the covariance of their coefficients.
-    noise : tuple of float
-        Deviation of an equation in each group.
-    columns : tuple of int
-        How many of the columns of the root are of each of SOURCES.
-    level : float
-        Deviation of the level of the bias from one recording to another; 0 where the recordings are too few to tell it.
-    parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
-        Terms of M as a family takes them, Chebyshev coefficients over the domain with their covariance; None where the
-        temperatures or the equations are too few, or a family is their prior.
-    distance : (float, int), or None
-        Chi-square of the stimulus against the prior, and its degrees of freedom; None without a prior.
-    """
-
-    stimulus: TriadInput
-    terms: TriadTerms
-    domain: tuple[float, float]
-    usual: Array
-    free: NDArray[np.bool_]
-    observable: NDArray[np.bool_]
-    unobservable_changes: NDArray[np.bool_]
-    design: Sequence[TermCurve]
-    root: Array
-    noise: tuple[float, ...]
-    columns: tuple[int, ...]
-    level: float = 0.0
-    parabolas: tuple[Array, Array] | None = None
-    distance: tuple[float, int] | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the q terms."""
-        return (*TERMS, *SENSITIVITIES)[: len(self.free)]
-
-    @cached_property
-    def grid(self) -> Array:
-        """Temperatures at which the error is kept."""
-        low, high = self.domain
-        middle, half = (low + high) / 2, max(high - low, NARROW) / 2
-        return np.linspace(middle - half, middle + half, GRID if high - low >= NARROW else 2)
-
-    def modes(self, T: Array) -> Array:
-        """Return the modes (n, N, q) of the joint error of all terms at T (N,)."""
-        parts, at = [], 0
-        for curve in self.design:
-            parts.append(curve.values(T) @ self.root[at : at + curve.q])
-            at += curve.q
-        return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
-
-    def sigma(self, T: Array) -> Array:
-        """Return the deviation (N, q) of the terms at T (N,)."""
-        return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
-
-    def parts(self, T: Array) -> dict[str, Array]:
-        """Return the deviation (N, q) of the terms at T (N,) by source."""
-        parts = np.split(self.modes(T), np.cumsum(self.columns)[:-1])
-        return {name: np.sqrt(np.sum(part**2, axis=0)) for name, part in zip(SOURCES, parts, strict=True)}
-
-    def change(self) -> tuple[Array, Array]:
-        """Return the change of each term (q,) from the lowest to the highest temperature, and its deviation."""
-        ends = self.grid[[0, -1]]
-        values, modes = self.terms.at(ends), self.modes(ends)
-        return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
-
-    @cached_property
-    def _joint_modes(self) -> Array:
-        """Modes (r, G, q) on the grid, those alone that matter beside the deviation of some term."""
-        modes = self.modes(self.grid)
-        size = np.sqrt(np.sum(modes**2, axis=0)) + TINY
-        _, s, V = np.linalg.svd((modes / size).reshape(len(modes), -1), full_matrices=False)
-        kept = s > LEFT * s[0]
-        return np.asarray((s[kept, None] * V[kept]).reshape(-1, *size.shape) * size)
-
-    def curve_error(self, part: slice) -> CurveError:
-        """Return the error of some terms as a map's record holds it; its modes are those of all terms, one by one."""
-        T = self.grid
-        curve = self.terms.at(T)[:, part]
-        bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
-        modes = [[[float(f"{v:.6g}") for v in row] for row in mode] for mode in self._joint_modes[:, :, part].tolist()]
-        return CurveError(
-            T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes), bend=tuple(bend.tolist())
-        )
-
-    def matrix(self) -> TriadMatrix:
-        """Return M over temperature as a map's record holds it."""
-        frame = "sensor" if self.stimulus.sensor_frame else "given"
-        return TriadMatrix.model_validate({**self._curve(slice(3, 12)), "frame": frame})
-
-    def sensitivity(self) -> MatrixCurve | None:
-        """Return G over temperature as a map's record holds it; None where none of it was looked for."""
-        return MatrixCurve.model_validate(self._curve(slice(12, 21))) if np.any(self.free[12:]) else None
-
-    def _curve(self, part: slice) -> dict[str, object]:
-        """Return the fields of the 9 terms of a matrix."""
-        (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
-        bent = any(curve.q > 4 for curve in self.terms.curves)
-        T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
-        inside = np.clip(T, low + h, high - h)
-        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, part] / (2 * h)
-        if not bent:  # exact for a cubic through four points
-            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, part])
-            slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
-        return {
-            "T": tuple(T.tolist()), "values": tuple(map(tuple, self.terms.at(T)[:, part].tolist())),
-            "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.observable[part].tolist()),
-            "kinds": tuple(curve.name for curve in self.terms.curves[part]), "error": self.curve_error(part),
-        }  # fmt: skip
-
-    def _scaled(self, T: Array) -> Array:
-        low, high = self.grid[[0, -1]]
-        return np.asarray((2 * T - low - high) / (high - low))
 
 
 def fit_triad(
@@ -254,10 +120,12 @@ def fit_triad(
     search.check()
     if not search.converge():
         search.drop_unobservable()
-    for _ in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
+    for k in range(PASSES):  # noise and walk, curves, and what is not observable, each by the others
         before = [*search.chosen, *search.observable]
         search.choose()
         search.converge()
+        if k == 0:
+            search.expect_levels()
         search.measure_walk()
         search.converge(noise=False)
         search.drop_unobservable()
@@ -317,21 +185,23 @@ class _Search:
         self.z = (e.left + np.einsum("mj,mj->m", e.J, self.terms.at(e.T) - self._means.at(e.T))) / sigma  # of no terms
         self._J = e.J / sigma[:, None]
         self._columns: dict[tuple[int, int], Array] = {}
-        self._root = np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk else None
+        self._root = (
+            np.linalg.cholesky(self._covariance_of_noise(self.walk, self.level)) if self.walk or self.level else None
+        )
         if self._root is not None:
             self.z = np.linalg.solve(self._root, self.z)
 
     def _walked(self) -> Array:
         """Return the covariance (m, m) of the equations over their white noise that a walk of density one leaves."""
-        J, clock = self._J[:, list(BIAS)], _clocks(self.e)
+        J, clock = self._J[:, list(BIAS)], clocks_of(self.e)
         first = np.array([self.e.t[clock == k].min() for k in range(clock.max() + 1)])
         t = self.e.t - first[clock]
         return np.asarray((J @ J.T) * np.minimum.outer(t, t) * np.equal.outer(clock, clock))
 
     def _levels(self) -> Array:
         """Return the derivative (m, 3 R) of the equations by the levels of R recordings, at most of length one."""
-        J, recordings = self._J[:, list(BIAS)], np.unique(_recordings(self.e))
-        own = np.equal.outer(_recordings(self.e), recordings) * (len(recordings) > 1)
+        J, recordings = self._J[:, list(BIAS)], np.unique(recordings_of(self.e))
+        own = np.equal.outer(recordings_of(self.e), recordings) * (len(recordings) > 1)
         return np.asarray((own[:, :, None] * J[:, None]).reshape(len(J), -1) / self._size())
 
     def _size(self) -> float:
@@ -341,7 +211,7 @@ class _Search:
     def _level(self) -> float:
         """Return the deviation of the levels, in the unit of the bias; 0 where the curves of the bias leave too few."""
         taken = sum(curve.q for curve in self._curves(self.chosen)[: len(BIAS)])
-        told = len(BIAS) * len(np.unique(_recordings(self.e))) - taken >= TOLD
+        told = len(BIAS) * len(np.unique(recordings_of(self.e))) - taken >= TOLD
         return float(np.sqrt(self.level)) / self._size() if told else 0.0
 
     def _covariance_of_noise(self, walk: float, level: float = 0.0) -> Array:
@@ -411,10 +281,18 @@ class _Search:
         if settled := fall < 1e-2:
             self.linearise()
         else:
-            self.x = self._means.coefficients
+            self.x = list(self._means.coefficients)
             self.s = np.full(2, SURE * self.usual[0])
             self.linearise()
         return settled
+
+    def expect_levels(self) -> None:
+        """Choose the curves again beside levels of a usual size, of several recordings: curves must not follow them."""
+        self.level = (LEVEL * self.usual[0] * self._size()) ** 2 if np.any(self._levels()) else 0.0
+        if self.level:
+            self.converge(noise=False)
+            self.choose()
+            self.converge(noise=False)
 
     def measure_walk(self) -> None:
         """Find walk and levels of the bias beside the white noise, by restricted likelihood at these curves.
@@ -423,16 +301,8 @@ class _Search:
         """
         if not np.any(self.observable):
             return
-        prices, squares, solutions, J, L = [], [], [], self._J, self._levels()
-        curves = self._curves(self.chosen)
-        seen = [(j, curve) for j, curve in enumerate(curves) if self.observable[j]]
-        X = np.hstack([J[:, j, None] * curve.values(self.e.T) for j, curve in seen])
-        lawful = np.repeat([curve.precision is not None for _, curve in seen], [curve.q for _, curve in seen])
-        weak = lawful / np.repeat([WIDE * self.usual[j] for j, _ in seen], [curve.q for _, curve in seen]) ** 2
-        about = self.e.left / self.s[self.e.group]
-        for j, curve in seen:
-            if curve.precision is not None:
-                about = about + J[:, j] * (curve.values(self.e.T) @ (self.x[j] - curve.mean))
+        prices, squares, solutions, L = [], [], [], self._levels()
+        X, about, lawful, weak = self._regressors()
         usual = 1.0 if not self.declared else self.declared**2 * float(np.max(np.diag(self._walked()))) + TINY
         levels, q, m = LEVELS if np.any(L) else LEVELS[:1], X.shape[1], len(X)
         for walk in WALKS:
@@ -459,6 +329,23 @@ class _Search:
         self.walk, self.level = (float(likely @ (np.array(squares) * size)) / white_noise for size in (walks, own))
         self.by_walk = list(zip(likely.tolist(), solutions, strict=True))
         self.s = self.s * np.sqrt(white_noise)
+
+    def _regressors(self) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+        """Return the columns X (m, n) of the terms over their white noise, and what is left to them (m,).
+
+        Coefficients with a law (n,) are left about its mean; without it they have a weak prior, its precision (n,).
+        """
+        J, about, lawful, weak = self._J, self.e.left / self.s[self.e.group], [], []
+        columns = []
+        for j, curve in enumerate(self._curves(self.chosen)):
+            if not self.observable[j]:
+                continue
+            known = curve.precision is not None
+            columns.append(J[:, j, None] * curve.values(self.e.T))
+            about = about + columns[-1] @ (self.x[j] - curve.mean) * known
+            lawful += [known] * curve.q
+            weak += [known / (WIDE * self.usual[j]) ** 2] * curve.q
+        return np.hstack(columns), about, np.array(lawful), np.array(weak)
 
     def _take(self, solution: Array) -> None:
         sizes = [curve.q for curve in self._curves(self.chosen)]
@@ -553,12 +440,11 @@ class _Search:
         share = 1 / (1 + np.sqrt(len(self.z)) * np.exp(-((b / s) ** 2) / 2))
         others = np.linalg.solve(whole[np.ix_(pinned, pinned)], whole[pinned]).T  # by which the others go with a change
         doubt = others * np.sqrt(share * (s**2 + b**2))
-        lawful = np.diag(_laws(design)) > 0
+        lawful = np.diag(laws_of(design)) > 0
         free = np.sum(~lawful) - len(pinned) + float(np.diag(whole @ (A.T @ A)) @ lawful)
-        freedom = max(len(self.z) - free, 3.0)
-        student = freedom / (freedom - 2)
-        root = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
-        inside = np.hstack([np.linalg.inv(root).T, doubt * np.sqrt(student)])
+        student = 1 + 2 / max(len(self.z) - free - 2, 1.0)  # f / (f - 2), of f degrees of freedom
+        half = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
+        inside = np.hstack([np.linalg.inv(half).T, doubt * np.sqrt(student)])
         scatter = self._scatter_over_walks(starts)
         root = np.hstack([inside, scatter, length])
         columns = len(N), len(pinned) + scatter.shape[1], 1
@@ -573,7 +459,7 @@ class _Search:
         curves[part] = [polynomial(PARABOLA, domain)] * len(curves[part])
         N, A = self._system(curves, self.free)
         freedom = len(self.z) - len(N)
-        if freedom < 3 or domain[1] - domain[0] < NARROW or np.any(_laws(self._curves(self.chosen))):
+        if freedom < 3 or domain[1] - domain[0] < NARROW or np.any(laws_of(self._curves(self.chosen))):
             return None
         C, at = np.linalg.inv(N), sum(curve.q for curve in curves[: len(BIAS)])
         own = [slice(at + k, at + k + PARABOLA + 1) for k in range(0, len(curves[part]) * (PARABOLA + 1), PARABOLA + 1)]
@@ -583,7 +469,7 @@ class _Search:
     def _distance(self) -> tuple[float, int] | None:
         """Return the chi-square of the terms that have a law against it, in the directions that the equations tell."""
         curves = self._curves(self.chosen)
-        known = _laws(curves)
+        known = laws_of(curves)
         own = np.flatnonzero(np.diag(known))
         if not len(own):
             return None
@@ -606,24 +492,3 @@ class _Search:
             mean = sum((p * x for p, x in self.by_walk), np.zeros(len(places)))
             modes[places.astype(np.int64)] = np.stack([np.sqrt(p) * (x - mean) for p, x in self.by_walk], axis=1)
         return modes
-
-
-def _laws(curves: Sequence[TermCurve]) -> Array:
-    """Return the precision (n, n) of the coefficients of curves by their own laws, zero of those that have none."""
-    sizes = [curve.q for curve in curves]
-    known, starts = np.zeros((sum(sizes), sum(sizes))), np.cumsum([0, *sizes])
-    for curve, at in zip(curves, starts, strict=False):
-        if curve.precision is not None:
-            known[at : at + curve.q, at : at + curve.q] = curve.precision
-    return known
-
-
-def _recordings(e: Equations) -> NDArray[np.int64]:
-    return np.zeros(len(e.t), dtype=np.int64) if e.recording is None else e.recording
-
-
-def _clocks(e: Equations) -> NDArray[np.int64]:
-    """Return the number of the clock of each equation: it goes on in a recording after the end of the one before."""
-    names, own = np.unique(_recordings(e), return_inverse=True)
-    first, last = (np.array([end(e.t[own == k]) for k in range(len(names))]) for end in (np.min, np.max))
-    return np.asarray(np.cumsum(np.concatenate([[0], first[1:] <= last[:-1]])))[own]

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import NetworkMap, ThermalMap
+from fusion_core.contracts import Equations, NetworkMap, ThermalMap
 from fusion_core.contracts.stimulus import AXES as AXES
 from fusion_core.contracts.stimulus import PAIRS as PAIRS
 from fusion_core.contracts.stimulus import SENSITIVITIES as SENSITIVITIES
@@ -130,3 +131,25 @@ class TriadTerms:
         """Return G (N, 3, 3); zero where it was not asked for."""
         values = self.at(T)[:, 12:]
         return values.reshape(-1, 3, 3) if values.shape[1] else np.zeros((len(values), 3, 3))
+
+
+def laws_of(curves: Sequence[TermCurve]) -> Array:
+    """Return the precision (n, n) of the coefficients of curves by their own laws, zero of those that have none."""
+    sizes = [curve.q for curve in curves]
+    known, starts = np.zeros((sum(sizes), sum(sizes))), np.cumsum([0, *sizes])
+    for curve, at in zip(curves, starts, strict=False):
+        if curve.precision is not None:
+            known[at : at + curve.q, at : at + curve.q] = curve.precision
+    return known
+
+
+def recordings_of(e: Equations) -> NDArray[np.int64]:
+    """Return the recording of each equation (m,)."""
+    return np.zeros(len(e.t), dtype=np.int64) if e.recording is None else e.recording
+
+
+def clocks_of(e: Equations) -> NDArray[np.int64]:
+    """Return the number of the clock of each equation: it goes on in a recording after the end of the one before."""
+    names, own = np.unique(recordings_of(e), return_inverse=True)
+    first, last = (np.array([end(e.t[own == k]) for k in range(len(names))]) for end in (np.min, np.max))
+    return np.asarray(np.cumsum(np.concatenate([[0], first[1:] <= last[:-1]])))[own]

@@ -167,6 +167,19 @@ def test_what_it_cannot_use_is_said(folder, tmp_path):
         driftlab.vehicle(folder / "soak.ulg", settings={"instance": 1})
 
 
+def test_a_sensor_that_the_firmware_refuses_is_left_out_and_the_others_are_written(tmp_path):
+    t, (first, (gyro, accel, T)) = soak()
+    narrow = gyro, accel, np.round(20 + 0.2 * (T - T[0]), 1)  # 6 K, ArduPilot asks for ten
+    write_log(tmp_path / "soak.bin", t, [first, narrow], parameters("GYR") | parameters("GYR", 1))
+    made = driftlab.vehicle(tmp_path / "soak.bin", out=tmp_path / "made")
+    left_out = {sensor.name: sensor.left_out for sensor in made.sensors}
+    assert [name for name, why in left_out.items() if why] == ["gyro 2", "accel 2"]
+    assert "ArduPilot asks for 10 K and more" in left_out["gyro 2"]
+    text = next((tmp_path / "made").glob("vehicle.par*")).read_text()
+    assert "INS_TCAL1_ENABLE" in text
+    assert "INS_TCAL2" not in text
+
+
 HOURS, PERIOD = 2, 3600.0
 PRESSURE, FIELD = np.array([3.0, 0.05]), np.array([[2e-4, -1e-4, 3e-4], [1e-6, 0.0, -2e-6]])  # Pa, G by K, K^2
 MAG = [name for name in FORMATS["sensor_gyro"] if "clip" not in name and "samples" not in name]

@@ -97,6 +97,12 @@ def test_terms_are_as_far_from_the_truth_as_their_deviations_say(folder, found, 
     assert len(z) > 15
     assert np.max(np.abs(z)) < 4.5
     assert 0.2 < np.mean(z**2) < 2.0
+    terms = record.parabolas  # as a family takes them: in the middle the second polynomial is -1
+    middle = terms.c @ [1.0, 0.0, -1.0] - own_matrix(11)(np.mean(terms.T)).ravel()
+    sigma = np.sqrt(np.einsum("i,kij,j->k", [1.0, 0.0, -1.0], terms.covariance, [1.0, 0.0, -1.0]))
+    assert pytest.approx((TEMPERATURES[0], TEMPERATURES[-1]), abs=0.5) == terms.T
+    assert np.max(np.abs(middle) / sigma) < 4.5
+    assert np.max(sigma) < 1e-4
 
 
 def test_the_map_has_the_bias_of_the_soak_and_m_of_the_stimulus(found, alone, tmp_path):

@@ -1,0 +1,153 @@
+"""The terms of a triad as a stimulus tells them, over temperature, with their joint covariance.
+
+n coefficients, q terms, N temperatures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.triad.model import GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
+from fusion_core.chunk import Array
+from fusion_core.contracts import CurveError, MatrixCurve, TriadInput, TriadMatrix
+
+LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
+SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
+TINY = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class TriadFit:
+    """Terms of a triad that were fitted, with their joint covariance.
+
+    Attributes
+    ----------
+    stimulus : TriadInput
+    terms : TriadTerms
+    domain : pair of float
+        Temperatures of the stimulus.
+    usual : (q,) array
+        Sizes of the terms of a usual unit, beside which a deviation is large or small.
+    free : (q,) array of bool
+        Terms that were looked for.
+    observable : (q,) array of bool
+        Terms that the stimulus shows; the others are zero.
+    unobservable_changes : (q,) array of bool
+        Observable terms whose change over temperature is not observable.
+    design, root : TriadTerms' curves and (n, n) array
+        Curves of the error, and the root of the covariance of their coefficients.
+    noise : tuple of float
+        Deviation of an equation in each group.
+    columns : tuple of int
+        How many of the columns of the root are of each of SOURCES.
+    level : float
+        Deviation of the level of the bias from one recording to another; 0 where the recordings are too few to tell it.
+    parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
+        Terms of M as a family takes them, Chebyshev coefficients over the domain with their covariance; None where the
+        temperatures or the equations are too few, or a family is their prior.
+    distance : (float, int), or None
+        Chi-square of the stimulus against the prior, and its degrees of freedom; None without a prior.
+    """
+
+    stimulus: TriadInput
+    terms: TriadTerms
+    domain: tuple[float, float]
+    usual: Array
+    free: NDArray[np.bool_]
+    observable: NDArray[np.bool_]
+    unobservable_changes: NDArray[np.bool_]
+    design: Sequence[TermCurve]
+    root: Array
+    noise: tuple[float, ...]
+    columns: tuple[int, ...]
+    level: float = 0.0
+    parabolas: tuple[Array, Array] | None = None
+    distance: tuple[float, int] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the q terms."""
+        return (*TERMS, *SENSITIVITIES)[: len(self.free)]
+
+    @cached_property
+    def grid(self) -> Array:
+        """Temperatures at which the error is kept."""
+        low, high = self.domain
+        middle, half = (low + high) / 2, max(high - low, NARROW) / 2
+        return np.linspace(middle - half, middle + half, GRID if high - low >= NARROW else 2)
+
+    def modes(self, T: Array) -> Array:
+        """Return the modes (n, N, q) of the joint error of all terms at T (N,)."""
+        parts, at = [], 0
+        for curve in self.design:
+            parts.append(curve.values(T) @ self.root[at : at + curve.q])
+            at += curve.q
+        return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
+
+    def sigma(self, T: Array) -> Array:
+        """Return the deviation (N, q) of the terms at T (N,)."""
+        return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    def parts(self, T: Array) -> dict[str, Array]:
+        """Return the deviation (N, q) of the terms at T (N,) by source."""
+        parts = np.split(self.modes(T), np.cumsum(self.columns)[:-1])
+        return {name: np.sqrt(np.sum(part**2, axis=0)) for name, part in zip(SOURCES, parts, strict=True)}
+
+    def change(self) -> tuple[Array, Array]:
+        """Return the change of each term (q,) from the lowest to the highest temperature, and its deviation."""
+        ends = self.grid[[0, -1]]
+        values, modes = self.terms.at(ends), self.modes(ends)
+        return values[1] - values[0], np.sqrt(np.sum((modes[:, 1] - modes[:, 0]) ** 2, axis=0))
+
+    @cached_property
+    def _joint_modes(self) -> Array:
+        """Modes (r, G, q) on the grid, those alone that matter beside the deviation of some term."""
+        modes = self.modes(self.grid)
+        size = np.sqrt(np.sum(modes**2, axis=0)) + TINY
+        _, s, V = np.linalg.svd((modes / size).reshape(len(modes), -1), full_matrices=False)
+        kept = s > LEFT * s[0]
+        return np.asarray((s[kept, None] * V[kept]).reshape(-1, *size.shape) * size)
+
+    def curve_error(self, part: slice) -> CurveError:
+        """Return the error of some terms as a map's record holds it; its modes are those of all terms, one by one."""
+        T = self.grid
+        curve = self.terms.at(T)[:, part]
+        bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
+        modes = [[[float(f"{v:.6g}") for v in row] for row in mode] for mode in self._joint_modes[:, :, part].tolist()]
+        return CurveError(
+            T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes), bend=tuple(bend.tolist())
+        )
+
+    def matrix(self) -> TriadMatrix:
+        """Return M over temperature as a map's record holds it."""
+        frame = "sensor" if self.stimulus.sensor_frame else "given"
+        return TriadMatrix.model_validate({**self._curve(slice(3, 12)), "frame": frame})
+
+    def sensitivity(self) -> MatrixCurve | None:
+        """Return G over temperature as a map's record holds it; None where none of it was looked for."""
+        return MatrixCurve.model_validate(self._curve(slice(12, 21))) if np.any(self.free[12:]) else None
+
+    def _curve(self, part: slice) -> dict[str, object]:
+        """Return the fields of the 9 terms of a matrix."""
+        (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
+        bent = any(curve.q > 4 for curve in self.terms.curves)
+        T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
+        inside = np.clip(T, low + h, high - h)
+        slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, part] / (2 * h)
+        if not bent:  # exact for a cubic through four points
+            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, part])
+            slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
+        return {
+            "T": tuple(T.tolist()), "values": tuple(map(tuple, self.terms.at(T)[:, part].tolist())),
+            "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.observable[part].tolist()),
+            "kinds": tuple(curve.name for curve in self.terms.curves[part]), "error": self.curve_error(part),
+        }  # fmt: skip
+
+    def _scaled(self, T: Array) -> Array:
+        low, high = self.grid[[0, -1]]
+        return np.asarray((2 * T - low - high) / (high - low))
