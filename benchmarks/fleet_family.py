@@ -101,7 +101,7 @@ def measured(manifest: Path, out: Path, workers: int, rules: str = "") -> dict[s
 
 
 def light(folder: Path, count: int, workers: int) -> dict[str, Any]:
-    """Return what the family of so many light units takes; a fleet of them that is in the folder is taken."""
+    """Return time and memory of the family of so many light units; a fleet of them that is in the folder is taken."""
     (folder / "family.yaml").write_text(config_text())
     out = folder / f"fleet-{count}"
     manifest = out.with_suffix(".csv") if out.exists() else put_units(out, count, workers)
