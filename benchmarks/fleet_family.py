@@ -29,7 +29,7 @@ from fleet_units import PER_LOT, config_text, date_of_light, key_of_light, put_l
 from driftlab.config import load_config
 from driftlab.production.fleet import fleet
 from driftlab.production.manifest import read_manifest
-from driftlab.production.store import fleet_folder
+from driftlab.production.store import TABLE, fleet_folder
 from driftlab.production.unit import Task
 from driftlab.production.units_pass import stamp_of, versions_of
 from driftlab.production.workers import Pool
@@ -105,6 +105,7 @@ def light(folder: Path, count: int, workers: int) -> dict[str, Any]:
     (folder / "family.yaml").write_text(config_text())
     out = folder / f"fleet-{count}"
     manifest = out.with_suffix(".csv") if out.exists() else put_units(out, count, workers)
+    (out / TABLE).unlink(missing_ok=True)  # or nothing would be left to do
     return measured(manifest, out, workers)
 
 
