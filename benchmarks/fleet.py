@@ -92,7 +92,7 @@ def overheads(folder: Path, count: int, turns: int) -> tuple[list[Row], dict[str
 
 
 def real(folder: Path, count: int, workers: int) -> list[Row]:
-    """Return what real units take end to end, and their family beside their own work: with all workers, and with one.
+    """Return the time of real units end to end, and of their family beside their own work: of all workers, and of one.
 
     Another command with run rules does the family again and no unit.
     """

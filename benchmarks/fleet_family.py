@@ -29,7 +29,7 @@ from fleet_units import PER_LOT, config_text, date_of_light, key_of_light, put_l
 from driftlab.config import load_config
 from driftlab.production.fleet import fleet
 from driftlab.production.manifest import read_manifest
-from driftlab.production.store import fleet_folder
+from driftlab.production.store import TABLE, fleet_folder
 from driftlab.production.unit import Task
 from driftlab.production.units_pass import stamp_of, versions_of
 from driftlab.production.workers import Pool
@@ -101,10 +101,11 @@ def measured(manifest: Path, out: Path, workers: int, rules: str = "") -> dict[s
 
 
 def light(folder: Path, count: int, workers: int) -> dict[str, Any]:
-    """Return what the family of so many light units takes; a fleet of them that is in the folder is taken."""
+    """Return time and memory of the family of so many light units; a fleet of them that is in the folder is taken."""
     (folder / "family.yaml").write_text(config_text())
     out = folder / f"fleet-{count}"
     manifest = out.with_suffix(".csv") if out.exists() else put_units(out, count, workers)
+    (out / TABLE).unlink(missing_ok=True)  # or nothing would be left to do
     return measured(manifest, out, workers)
 
 

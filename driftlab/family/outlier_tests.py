@@ -209,10 +209,10 @@ def tests_of(
     tests = [(name, axis) for name in (*CURVES, *figures) for axis in range(d)]
     p, values, odd_lots = np.empty((len(names), len(tests))), np.empty((len(names), len(tests)), np.float32), []
     for k, name in enumerate(CURVES):
-        own = curves[:, k]
-        law = TailLaw.of(own) if laws is None else laws.curves.get(name)
+        statistic = curves[:, k]
+        law = TailLaw.of(statistic) if laws is None else laws.curves.get(name)
         of_curves |= {} if law is None else {name: law}
-        p[:, k * d : (k + 1) * d], values[:, k * d : (k + 1) * d] = _chance(law, own, name), own
+        p[:, k * d : (k + 1) * d], values[:, k * d : (k + 1) * d] = _chance(law, statistic, name), statistic
     for k, name in enumerate([*figures], len(CURVES)):
         of_axes = figures.pop(name)
         usual, off = figure_law(name, of_axes, lots) if laws is None else (laws.figures.get(name), [{}] * d)

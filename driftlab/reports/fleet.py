@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
     failed = [(record.unit, "", record.error) for record in records if record.state == "failed"]
     done, odd, table = len(records) - len(failed), len(reasons), _table(overview, reasons)
-    domains = [record.domain for record in records if record.domain and record.state == "done"]
+    done_over = (record.domain for record in records if record.domain and record.state == "done")
+    domains = np.fromiter(chain.from_iterable(done_over), dtype=np.float64).reshape(-1, 2)
     lists, shown_below = _lists(overview, reasons), in_tables(line)
     write_page(
         path,
@@ -50,7 +52,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         called=figure_name,
         remarks=[*(one for one in line.sentences[1:] if one not in shown_below), *overview.remarks],
         numbers=_numbers(records),
-        maps=map_charts(overview, np.array(domains, dtype=np.float64).reshape(-1, 2)),
+        maps=map_charts(overview, domains),
         lots=distributions(line),
         lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
         charts=[*joint_charts(line), *control_charts(line)],

@@ -134,12 +134,15 @@ def _levels(x: Array, sigma: Array, found: Sequence[LevelStep]) -> Array:
         start, stop = edges[k - 1], edges[k + 1]
         ends = max(step.low, start + SHORTEST), min(step.high, stop - SHORTEST)
         some = sorted({*np.linspace(*ends, PLACES).astype(int).tolist(), step.at}) if ends[0] <= ends[1] else []
-        fits = {at: np.concatenate([_level(x[start:at]), _level(x[at:stop])]) for at in some}
         part = slice(start, stop)
-        edges[k] = min(
-            fits, key=lambda at: float(np.sum(_residuals(x[part], sigma[part], fits[at]) ** 2)), default=edges[k]
-        )
+        costs = [_cost_of_step(x[part], sigma[part], at - start) for at in some]
+        edges[k] = some[int(np.argmin(costs))] if some else edges[k]
     return np.concatenate([_level(x[i:j]) for i, j in pairwise(edges)])
+
+
+def _cost_of_step(x: Array, sigma: Array, at: int) -> float:
+    """Return the sum of squares about the levels of values x (n,) before and after a place."""
+    return float(np.sum(_residuals(x, sigma, np.concatenate([_level(x[:at]), _level(x[at:])])) ** 2))
 
 
 def _level(x: Array) -> Array:

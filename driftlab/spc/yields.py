@@ -138,18 +138,19 @@ def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iter
     """Return the yield of units, of which `odd` stand out, and by the columns `by`: COLUMNS, or the manifest's own."""
     known: dict[tuple[str, ...], list[str]] = {}  # of a line of many units few differ
     why = [known.setdefault(tuple(own), own) for own in map(reasons, records)]
-    units = [record.unit for record in records]
-    stands_out = set(units).intersection(odd)
-    whole = _group("", [*zip(units, why, strict=True)], stands_out)
+    known_odd = set(odd)
+    stand_out = [record.unit in known_odd for record in records]
+    whole = _group("", why, sum(stand_out))
     place = {reason: k for k, reason in enumerate(whole.reasons)}
     first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
     covered = tuple(accumulate(first[k] for k in place.values()))
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
-        parts: dict[str, list[tuple[str, list[str]]]] = {}
-        for name, unit, of_unit in zip(_names(records, column), units, why, strict=True):
-            parts.setdefault(name, []).append((unit, of_unit))
-        groups[column] = tuple(_group(name, part, stands_out) for name, part in parts.items())
+        parts, counts = dict[str, list[list[str]]](), Counter[str]()
+        for name, of_unit, stands_out in zip(_names(records, column), why, stand_out, strict=True):
+            parts.setdefault(name, []).append(of_unit)
+            counts[name] += stands_out
+        groups[column] = tuple(_group(name, part, counts[name]) for name, part in parts.items())
     p = {
         column: chance([one.units for one in parts], [one.accepted for one in parts])
         for column, parts in groups.items()
@@ -172,10 +173,10 @@ def reasons(record: UnitRecord) -> list[str]:
     return [f"{name} {SAID[verdict]}" for name, verdict in rows if verdict in SAID]
 
 
-def _group(name: str, part: Sequence[tuple[str, list[str]]], odd: Collection[str]) -> YieldGroup:
-    counts = Counter(reason for _, why in part for reason in why)
-    accepted, stands_out = sum(not why for _, why in part), sum(unit in odd for unit, _ in part)
-    return YieldGroup(name, len(part), accepted, stands_out, dict(counts.most_common()))
+def _group(name: str, why: Sequence[list[str]], odd: int) -> YieldGroup:
+    """Return a group of the units of these reasons, of which `odd` stand out."""
+    counts = Counter(reason for of_unit in why for reason in of_unit)
+    return YieldGroup(name, len(why), sum(not of_unit for of_unit in why), odd, dict(counts.most_common()))
 
 
 def _names(records: Sequence[UnitRecord], column: str) -> list[str]:
