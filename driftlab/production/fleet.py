@@ -154,7 +154,10 @@ def fleet(
             command.to_database(database, summary)
         if not command.status.done:
             first = command.status.failed[0]
-            raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
+            raise DataError(
+                f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}; the others' "
+                "errors are in the column `error` of units.parquet"
+            )
         return FleetResult(Path(out), summary)
 
 
