@@ -14,8 +14,6 @@ from fusion_core.units import convert
 if TYPE_CHECKING:
     from fusion_core.contracts import MeasurementModel, Sensor
 
-OF_MOTION = ("rad/s", "m/s^2")  # SI units that are read as they are
-
 
 @dataclass(frozen=True)
 class BiasUnit:
@@ -42,11 +40,6 @@ class BiasUnit:
         """
         own, si = (self.shown, self.factor, self.digits), (self.si, 1.0, ".3e")
         return [own] if self.si in (self.shown, "1") else [own, si]
-
-    @property
-    def said(self) -> BiasUnit:
-        """That of sentences: SI for rates and accelerations, whose tables have both; else that of tables."""
-        return BiasUnit(self.si, self.si) if self.si in OF_MOTION else self
 
     def number(self, value: float, missing: str = "nan") -> str:
         """Return a bias (SI) as tables show it, without its unit; `missing` stands for one that is not finite."""

@@ -146,12 +146,12 @@ def show(result: Imported, given: Mapping[str, Any]) -> None:
     """Print the calibration's size, and the lines of a config by which it is used."""
     record, read = result.map.record, result.read
     unit = Calibrated(read.channel, read.unit, SHOWN.get(read.unit, read.unit), read.axes)
-    swing = unit.said(np.ptp(read.bias(np.linspace(*record.domain, PLACES)), axis=0))
+    swing = unit.text(np.ptp(read.bias(np.linspace(*record.domain, PLACES)), axis=0))
     say_lines(
         [
             *read.notes,
             f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
-            f"°C; the map is within {unit.said(np.array(result.apart))} {unit.shown} of it",
+            f"°C; the map is within {unit.text(np.array(result.apart))} {unit.shown} of it",
             *(() if record.matrix is None else term_lines(record.matrix, axes_of(result.map))),
             "in a config, as the vehicle uses it:",
             "filter:",

@@ -365,6 +365,7 @@ class Reason:
     """Reason of an odd curve: `sign`, `swap`, `scale`, `level`, `bump`, or `curve` where none of these is all.
 
     The curve of `axes` is `off` most at `T` degC, where units spread by `spread` (SI), or is so many `times` the usual.
+    Of `bump` and `curve` both are of the likeliest local deviation, the rest of the curve given.
     """
 
     what: str
@@ -423,7 +424,8 @@ class CurveReasons:
         t = (bumps.T @ own.z) ** 2 / np.sum((own.K @ bumps) * bumps, axis=0)
         k = int(seen[np.argmax(t)]) if len(seen) else 0
         add("bump", 1.0, shapes.bumps[:, k], float(self.statistics.at[k]))
-        return [*sorted(reasons, key=lambda one: one[0]), (cost, where, True)]
+        none = replace(reasons[-1][1], what="curve")  # where a local deviation would be likeliest
+        return [*sorted(reasons, key=lambda one: one[0]), (cost, none, True)]
 
     def _hypothesis(
         self, J: Array, h: Array, mine: DeviationShapes, c: Array, L: Array, axis: int, g: Array | None = None

@@ -159,10 +159,10 @@ def term_lines(matrix: TriadMatrix, axes: Sequence[str]) -> list[str]:
 def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     """Return a map's file in sentences: its sensor, its deviation, temperatures without a sample.
 
-    In the unit in which sentences are about `sensor`, whose map it is; where it is not known, in that of the file.
+    In the unit in which figures of `sensor` are shown, whose map it is; where it is not known, in that of the file.
     """
     record = fitted.record
-    unit = BiasUnit(record.unit, sensor.shown if sensor and sensor.unit == record.unit else record.unit).said
+    unit = BiasUnit(record.unit, sensor.shown if sensor and sensor.unit == record.unit else record.unit)
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} °C"]
     if record.matrix is not None:

@@ -72,17 +72,16 @@ class Database:
             ) from None
         try:
             parsed = sqlalchemy.make_url(url)
-        except (sqlalchemy.exc.ArgumentError, ValueError):
-            raise ConfigError(
-                "--to: is no URL of a database; write KIND://USER@HOST/NAME, or sqlite:///FILE.db"
-            ) from None
-        self.name, self._secrets = place_of(parsed), _secrets(parsed)
-        try:
+            self.name, self._secrets = place_of(parsed), _secrets(parsed)
             self._engine: Engine = sqlalchemy.create_engine(parsed, hide_parameters=True)
         except sqlalchemy.exc.NoSuchModuleError:
             raise ConfigError(
                 f"--to {self.name}: no package for {quote(parsed.drivername)} is installed; pip install "
                 "'driftlab[sql]' has duckdb's, SQLAlchemy's pages name others"
+            ) from None
+        except (sqlalchemy.exc.ArgumentError, ValueError):  # sqlite://line.db: two slashes for three
+            raise ConfigError(
+                "--to: is no URL of a database; write KIND://USER@HOST/NAME, or sqlite:///FILE.db"
             ) from None
         except ImportError as error:
             raise ConfigError(f"--to {self.name}: needs the package {error.name}; install it") from None

@@ -24,6 +24,7 @@ from driftlab.production.store import FAMILY, REPORT, TABLE, fleet_folder, store
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS
+from driftlab.production.unit_records import RecordsOfUnits
 from driftlab.production.unit_terms import terms_of_units
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.recordings.identity import sha256
@@ -157,9 +158,15 @@ def fleet(
         if database is not None:
             command.to_database(database, summary)
         if not command.status.done:
-            first = command.status.failed[0]
-            raise DataError(f"all {len(command.status.failed)} units failed; the first is {first.unit}: {first.error}")
+            raise _none_done(command.status.failed)
         return FleetResult(Path(out), summary)
+
+
+def _none_done(failed: RecordsOfUnits) -> DataError:
+    return DataError(
+        f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors are in "
+        "the column `error` of units.parquet"
+    )
 
 
 def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifest, FleetOptions]:

@@ -99,7 +99,7 @@ class Yield:
         """Return the name of a column with its unit."""
         return f"{column} [{UNITS[column]}]" if column in UNITS else column
 
-    def said(self, column: str) -> str:
+    def text(self, column: str) -> str:
         """Return the probability in words: `p = 0.02`."""
         return "p ≤ 0.0001" if self.p[column] <= 1e-4 else f"p = {self.p[column]:.2g}"
 
@@ -123,7 +123,7 @@ class Yield:
             if self.differs(column):
                 least, most = (f(groups, key=lambda one: one.share) for f in (min, max))
                 lines.append(
-                    f"yield differs by {column} ({self.said(column)}): "
+                    f"yield differs by {column} ({self.text(column)}): "
                     f"{least.name} {_per_cent(least)}, {most.name} {_per_cent(most)}"
                 )
         return lines
@@ -164,7 +164,8 @@ def reasons(record: UnitRecord) -> list[str]:
     Errors that differ in a name of a file or a number are one reason.
     """
     if record.state == "failed":
-        text = re.sub(r"[^\s:;,]*[/\\][^\s:;,]*", "…", record.error.partition(";")[0].replace(record.unit, "…"))
+        text = re.sub(r"^\S*[/\\]\S*: ", "", record.error.partition(";")[0]).replace(record.unit, "…")
+        text = re.sub(r"[^\s:;,]*[/\\][^\s:;,]*", "…", text)
         text = re.sub(r"[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?", "…", text)
         return [f"not calibrated: {re.sub('(… ?)+', '… ', text).strip() or 'no reason given'}"]
     if worst(record.limits) in (None, "pass"):

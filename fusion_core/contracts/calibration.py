@@ -79,7 +79,7 @@ class Calibrated:
         """Return the same without some of its effects."""
         return replace(self, effects=tuple(effect for effect in self.effects if effect not in effects))
 
-    def said(self, values: Array) -> str:
+    def text(self, values: Array) -> str:
         """Return values (d,) in `unit` as a reader gets them, in `shown`, which the text does not name."""
         return "/".join(_said(float(value) * self.factor) for value in values)
 

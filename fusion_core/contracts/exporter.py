@@ -232,7 +232,7 @@ class SensorLoss:
             lines.append(f"{self._whose}: loses {self.matrix} at most over {low:.4g} to {high:.4g} degC")
         residual = self.residual
         if residual is not None:
-            lines.append(f"{self._whose}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
+            lines.append(f"{self._whose}: the map itself leaves {sensor.text(residual)} {sensor.shown} rms")
         return lines
 
     @property
@@ -253,7 +253,7 @@ class SensorLoss:
 
     def _said(self, deviation: Deviation) -> str:
         sensor = self.sensor
-        return f"{sensor.said(deviation.rms)} {sensor.shown} rms, {sensor.said(deviation.largest)} at most"
+        return f"{sensor.text(deviation.rms)} {sensor.shown} rms, {sensor.text(deviation.largest)} at most"
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers in the sensor's SI unit, and in the unit in which they are shown."""
@@ -307,10 +307,10 @@ def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
         size = "of a size that a warm-up does not show"
         if effect in visible.effects:
             lost = Deviation.of(visible.bias(recording) - visible.without(effect).bias(recording))
-            size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
+            size = f"{sensor.text(lost.rms)} {sensor.shown} rms over a warm-up"
         left_out.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
     if sensor.walk is not None and np.any(sensor.walk):
-        after = sensor.said(sensor.walk * np.sqrt(HOUR))
+        after = sensor.text(sensor.walk * np.sqrt(HOUR))
         left_out.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
     return visible, tuple(left_out)
 

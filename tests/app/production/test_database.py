@@ -142,6 +142,7 @@ def test_a_column_is_spelt_as_the_table_has_it(place, tmp_path):
     ("url", "said"),
     [
         ("no url secret", "--to: is no URL of a database; write KIND"),
+        ("sqlite://line.db?timeout=secret", "--to: is no URL of a database; write KIND"),
         ("nosuch://user:secret@host/line", "--to nosuch://host/line: no package for nosuch is installed"),
         ("postgresql+pg8000://user:secret@host/line", "--to postgresql+pg8000://host/line: needs the package pg8000"),
         ("sqlite:////no/such/folder/line.db?timeout=7", "--to sqlite:////no/such/folder/line.db: cannot be"),

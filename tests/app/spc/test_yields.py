@@ -46,9 +46,7 @@ def test_yield_and_reasons_of_the_whole():
 def test_errors_that_differ_in_names_and_numbers_are_one_reason():
     a, b = (reasons(one) for one in SOME[-2:])
     assert a == b
-    assert "no HDF" in a[0]
-    assert a[0].startswith("not calibrated: ")
-    assert "write it again" not in a[0]
+    assert a == ["not calibrated: no HDF… file"]
     other = unit(3, error="a/b.h5: time goes back by 0.3 s at row 17")
     assert reasons(other) == reasons(unit(4, error="c/d.h5: time goes back by 12 s at row 1,000")) != a
     assert reasons(unit(0, "pass", "pass")) == reasons(unit(0)) == []
