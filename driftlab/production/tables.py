@@ -69,12 +69,7 @@ def write_fleet(
     writes the rows of its units to `scratch`.
     """
     if analysis.family is not None:
-        kind = next((settings.kind for settings in config.tracked_maps()), "")
-        common = analysis.common.model_dump(mode="json") if analysis.common.effects else None
-        save_family(
-            folder.hidden(FAMILY), analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
-            odd_lots=[lot.sentence for lot in analysis.lots],
-        )  # fmt: skip
+        _save_family(folder.hidden(FAMILY), analysis, analysis.family, config)
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
     drawn = _drawn(status, analysis)
     table = _Table(folder.units, scratch, analysis.family, analysis.common.effects, tuple(more))
@@ -100,6 +95,13 @@ def write_fleet(
     overview = _overview(title, status, tracked_unit(config.filter), analysis, links, curves, drawn)
     write_fleet_report(folder.hidden(REPORT), replace(overview, **beside))
     folder.publish([TABLE, REPORT] if analysis.family is None else [TABLE, FAMILY, REPORT])
+
+
+def _save_family(path: Path, analysis: FamilyAnalysis, family: Family, config: Config) -> None:
+    kind = next((settings.kind for settings in config.tracked_maps()), "")
+    common = analysis.common.model_dump(mode="json") if analysis.common.effects else None
+    lots = [lot.sentence for lot in analysis.lots]
+    save_family(path, family, map_kind=kind, config=config.as_yaml(), common_effects=common, odd_lots=lots)
 
 
 def _drawn(status: FleetStatus, analysis: FamilyAnalysis) -> list[str]:

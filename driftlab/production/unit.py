@@ -183,7 +183,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if len(soaks) > 1:
         names = dict(zip(task.recordings[CALIBRATION], soaks, strict=True))
         repeats, notes = repeated(config, names, recordings.get(HOLDOUT, ()))
-        notes = [_with_urls(note, recordings) for note in notes]
+    notes = [*faults.lines(), *_excess_walk(soaked, densities), *run.notes, *notes]
     record: dict[str, Any] = {
         "state": "done",
         "channel": fitted.record.channel,
@@ -201,12 +201,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "map_file": unit.file,
         "verdict": unit.sentences(),
         "limits": run.limits,
-        "notes": [
-            *faults.lines(),
-            *_excess_walk(soaked, densities),
-            *run.notes,
-            *(_with_urls(note, recordings) for note in notes),
-        ],
+        "notes": [_with_urls(note, recordings) for note in notes],
         "plugins": participants(unit.config),
     }
     if task.page:

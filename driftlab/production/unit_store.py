@@ -73,7 +73,7 @@ class UnitStore(UnitFolders):
 
     @property
     def said(self) -> dict[str, str]:
-        """What the store says of itself."""
+        """Content of `driftlab.json`: the fleet that the store is of."""
         return {"program": "driftlab fleet", "id": self.fleet}
 
     def get(self, name: str) -> bytes:
