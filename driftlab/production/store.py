@@ -107,7 +107,7 @@ class FleetFolder:
         check_folder(f"--out {self.out}", changed if self.mark.get("complete") or MARK in changed else [])
 
     def _url(self, store: str | None) -> str | None:
-        """Return the URL of the units' folders, None if they are here; raises ConfigError if they were put elsewhere."""
+        """Return the URL of the units' folders, None if here; raises ConfigError if they were put elsewhere."""
         known = self.mark.get("store")
         if self.mark and store not in (None, known):
             raise ConfigError(
