@@ -401,13 +401,19 @@ class _Search:
             best, chosen = least, tried
 
     def _price(self, chosen: list[int]) -> float:
-        curves, m, p = self._curves(chosen), len(self.z), 0.0
+        from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+
+        curves, m, p, at = self._curves(chosen), len(self.z), 0.0, 0
         N, A = self._system(curves, self.observable)
-        left, shares = self.z - A @ np.linalg.solve(N, A.T @ self.z), np.diag(np.linalg.solve(N, A.T @ A))
-        for curve, own in zip(curves, np.split(shares, np.cumsum([curve.q for curve in curves])[:-1]), strict=True):
-            free = curve.precision is None and not np.any(curve.penalty)
-            p += curve.q if free else float(np.sum(own)) + bool(np.any(curve.penalty))
-        if p >= m - 1:
+        root, failed = dpotrf(N, lower=1)
+        left = self.z - A @ dpotrs(root, A.T @ self.z, lower=1)[0]
+        half = dpotri(root, lower=1)[0]  # lower half of the inverse of N
+        for curve in curves:
+            own, at, p = slice(at, at + curve.q), at + curve.q, p + curve.q
+            if curve.precision is not None or np.any(curve.penalty):  # its prior knows a part of it
+                prior, inverse = N[own, own] - A[:, own].T @ A[:, own], np.tril(half[own, own])
+                p += bool(np.any(curve.penalty)) - float(np.sum((inverse + np.tril(inverse, -1).T) * prior))
+        if failed or p >= m - 1:
             return np.inf
         return float(m * np.log(float(left @ left) / m + TINY) + p * (np.log(m) + 2 * np.log(len(self.free))))
 
