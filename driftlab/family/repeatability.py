@@ -57,7 +57,8 @@ def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, ste
 def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
     """Return the largest difference (d,), rms, of the curves of a unit's first and any further soak; None of one soak.
 
-    The noise is that of each soak on its own: of two units under one name a joint one would be a wide walk.
+    The noise is that of each soak on its own: of two units under one name a joint one would be a wide walk. The walk is
+    the likely one: a short soak that does not show any does not exclude one.
     """
     d = recordings[0].bias.shape[1]
     noise, differences = [densities_of([rows], step) for rows in recordings], []
@@ -70,7 +71,8 @@ def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
         at = np.linspace(low, high, 25)
         H = {k: _curve(recordings[k], at, step) for k in both}
         apart = H[0] @ recordings[0].bias - H[other] @ recordings[other].bias
-        variance = [_covariance(H[k] / np.sqrt(len(at)), [recordings[k]], noise[k].white, noise[k].walk) for k in both]
+        parts = ((H[k] / np.sqrt(len(at)), recordings[k], noise[k]) for k in both)
+        variance = [_covariance(own, [rows], known.white, known.likely) for own, rows, known in parts]
         differences.append((np.sqrt(np.mean(apart**2, axis=0)), np.sqrt(variance[0] + variance[1])))
     if not differences:
         return Figure(value=(None,) * d, sigma=(None,) * d)

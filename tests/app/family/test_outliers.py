@@ -275,6 +275,23 @@ def test_no_unit_is_odd_for_what_a_soak_one_way_cannot_show() -> None:
     assert soaks_of([rows], 2.5).value == (None,)
 
 
+@pytest.mark.parametrize("walk", [0.02, 0.005])
+def test_two_short_soaks_one_way_of_one_unit_do_not_differ(walk: float) -> None:
+    """The walk of a soak that only warms is hidden in its curve, and is there all the same."""
+    rng, t = np.random.default_rng(3), np.arange(360) * 10.0
+    T = np.interp(t, [600, t[-1]], [10, 50])
+
+    def soak() -> SoakRows:
+        wander = np.cumsum(rng.normal(0, walk * np.sqrt(10), (360, 3)), axis=0)
+        bias = (4 * T + 0.05 * T**2)[:, None] + wander + rng.normal(0, 2 / np.sqrt(10), (360, 3)) + rng.normal(0, 5, 3)
+        return SoakRows(t, T, bias, np.full(360, 10.0), {})
+
+    figures = [soaks_of([soak(), soak()], 2.5) for _ in range(20)]
+    sigmas = np.array([one.value for one in figures]) / np.array([one.sigma for one in figures])
+    assert np.mean(sigmas > 2) <= 0.05
+    assert np.sqrt(np.mean(sigmas**2)) < 1.1
+
+
 def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
     """A curve is unknown in a gap of its soak: a height there is no bend."""
     units = made.deal("together", 60, 24, size=SIZE)
