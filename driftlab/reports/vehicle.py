@@ -51,6 +51,17 @@ def _row(section: SensorReport) -> list[str]:
     return [*cells, *("-" if part is None else text(float(np.max(part.rms)) * unit.factor) for part in parts)]
 
 
+def _most_lost(sections: Sequence[SensorReport]) -> str:
+    """Return the sensor of which the firmware loses most beside the sigma of its map; empty where it is none of it."""
+    lost = []
+    for title, _, verdict, unit, loss in sections:
+        if verdict is not None and unit is not None and loss is not None and verdict.good is not None:
+            beside = float(np.max(loss.domain.rms)), float(np.max(verdict.good))
+            lost.append((beside[0] / beside[1], title, *(text(value * unit.factor) for value in beside), unit.shown))
+    times, title, off, good, shown = max(lost, default=(0.0, "", "", "", ""))
+    return f"; the firmware is off its map by {off} {shown} on {title}, which is good to {good}" if times > 1 else ""
+
+
 def charts(sections: Sequence[SensorReport]) -> list[tuple[SensorReport, Chart | None]]:
     """Return each sensor with the chart of its map."""
     drawn = (None if one.verdict is None or one.unit is None else chart(one.verdict, one.unit) for one in sections)
@@ -73,7 +84,7 @@ def page_of(
         title="Thermal calibration of a vehicle",
         lead=f"{', '.join(Path(name).name for name in recordings)}, read by `{product}`",
         verdict=f"{mapped} of {len(sections)} sensors have a map, {exported} are in the parameter file"
-        + (f": {problem}" if problem else ""),
+        + (f": {problem}" if problem else _most_lost(sections)),
         table=table(sections),
         sections=charts(sections),
         losses=[] if loss is None else loss.lines(),
