@@ -317,13 +317,17 @@ def test_what_serves_nothing_is_named(config, tmp_path):
         simulate(config, out=tmp_path / "twin.h5", speed=2.0)
     with pytest.raises(ConfigError, match=r"--speed 0: more than 0 was expected"):
         simulate(config, serve=True, speed=0.0)
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(ConfigError, match=r"--out .*taken: cannot be linked \(File exists\); name another"):
-        simulate(config, serve=True, out=tmp_path / "taken")
     done = driftlab("simulate", "twin.yaml", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (
         2, "driftlab: --out: is missing; name a file, as FILE.h5, or play it out of a device with --serve\n",
     )  # fmt: skip
+
+
+def test_a_name_that_is_taken_is_no_device_s(config, tmp_path):
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(ConfigError, match=r"--out .*taken: cannot be linked \(File exists\); name another"):
+        simulate(config, serve=True, out=tmp_path / "taken")
 
 
 def test_a_config_reads_what_is_served(config, tmp_path):
@@ -350,6 +354,7 @@ def test_a_config_reads_what_is_served(config, tmp_path):
 
 
 def test_a_device_that_nobody_opened_ends_by_ctrl_c(config, tmp_path):
+    pytest.importorskip("pty", reason="terminals are those of POSIX")
     command = [sys.executable, "-m", "driftlab", "simulate", "twin.yaml", "--serve", "--out", "port", "--json"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     first = json.loads(process.stdout.readline())["source"]

@@ -7,7 +7,7 @@ import pytest
 
 from driftlab.errors import ConfigError, Unwritable
 from driftlab.family.record import UnitRecord
-from driftlab.production import store
+from driftlab.production import store, unit_folders
 from driftlab.production.store import fleet_folder
 from driftlab.storage.folders import remove
 
@@ -160,7 +160,7 @@ def test_a_certificate_that_a_kill_stops_is_replaced_by_the_next(tmp_path, monke
         folder.put_certificate("6", *sheet("a"))
         with monkeypatch.context() as patched:
             patched.setattr(os, "replace", killed(os.replace))
-            patched.setattr(store, "remove", killed(remove))
+            patched.setattr(unit_folders, "remove", killed(remove))
             with pytest.raises(Killed):
                 folder.put_certificate("6", *sheet("b"))
     with fleet_folder(tmp_path / "fleet") as folder:

@@ -23,7 +23,7 @@ COUNT = 4
 @pytest.fixture(scope="module", autouse=True)
 def server():
     """A server of S3, by the environment, which workers have too."""
-    pytest.importorskip("s3fs")
+    s3fs = pytest.importorskip("s3fs")
     moto = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0)
     moto.start()
     host, port = moto.get_host_and_port()
@@ -31,17 +31,19 @@ def server():
         for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
             patch.setenv(f"AWS_{name}", value)
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        fsspec.filesystem("s3").mkdir("line")
+        s3fs.S3FileSystem.clear_instance_cache()  # of another server
+        fsspec.filesystem("s3").mkdir("results")
         yield
+        s3fs.S3FileSystem.clear_instance_cache()
     moto.stop()
 
 
 @pytest.fixture
 def bucket():
-    """The file system of the bucket `line`, which is empty."""
+    """The file system of the bucket `results`, which is empty."""
     system = fsspec.filesystem("s3")
     system.invalidate_cache()
-    for name in system.find("line"):
+    for name in system.find("results"):
         system.rm_file(name)
     return system
 
@@ -63,15 +65,15 @@ def unit(name="7", **more):
 
 
 def test_a_unit_is_there_when_its_record_is_and_what_others_put_there_stays(bucket):
-    units = opened("s3://line/a/", "id")
-    assert opened("s3://line/a", "id") == units
+    units = opened("s3://results/a/", "id")
+    assert opened("s3://results/a", "id") == units
     assert units.reached()
     assert units.names() == []
     assert units.record("7") is None
     put = units.put(unit(), {"map.json": b"1", "page/report.html": b"p"})
     assert units.record("7").written.keys() == {*put.written, "unit.json"}
-    bucket.pipe_file("line/a/units/7/mine.txt", b"mine")
-    bucket.pipe_file("line/a/units/7/page/report.html", b"edited")
+    bucket.pipe_file("results/a/units/7/mine.txt", b"mine")
+    bucket.pipe_file("results/a/units/7/page/report.html", b"edited")
     units.put(unit(), {"map.json": b"2"})
     assert units.names() == ["7"]
     assert units.names("map.json") == ["7"]
@@ -83,7 +85,7 @@ def test_a_unit_is_there_when_its_record_is_and_what_others_put_there_stays(buck
 
 
 def test_scratch_is_gone_at_the_end(bucket):
-    units = opened("s3://line/a", "id")
+    units = opened("s3://results/a", "id")
     with units.scratch() as scratch:
         scratch.write("part-1", b"1")
         assert scratch.read("part-1") == b"1"
@@ -93,14 +95,14 @@ def test_scratch_is_gone_at_the_end(bucket):
 
 
 def test_another_s_place_is_refused(bucket):
-    opened("s3://line/a", "id")
+    opened("s3://results/a", "id")
     with pytest.raises(ConfigError, match="has the units of another fleet; name another place"):
-        opened("s3://line/a", "other")
-    assert not UnitStore("s3://line/a", "other").reached()
-    bucket.pipe_file("line/b/notes.txt", b"mine")
+        opened("s3://results/a", "other")
+    assert not UnitStore("s3://results/a", "other").reached()
+    bucket.pipe_file("results/b/notes.txt", b"mine")
     with pytest.raises(ConfigError, match="has objects that no fleet of driftlab wrote"):
-        opened("s3://line/b", "id")
-    for url in ("line/a", "file:///line", "https://host/line"):
+        opened("s3://results/b", "id")
+    for url in ("results/a", "file:///folder", "https://host/line"):
         with pytest.raises(ConfigError, match="is no URL of a store"):
             opened(url, "id")
     with pytest.raises(ConfigError, match="cannot be reached"):
@@ -112,8 +114,8 @@ def test_another_s_place_is_refused(bucket):
 def in_store(bucket, place):
     """Return the objects of a fleet as files in a folder."""
     folder = Path(f"copy-{place}")
-    for name in bucket.find(f"line/{place}/units"):
-        path = folder / name.removeprefix(f"line/{place}/")
+    for name in bucket.find(f"results/{place}/units"):
+        path = folder / name.removeprefix(f"results/{place}/")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(bucket.cat_file(name))
     return folder
@@ -124,10 +126,10 @@ def test_a_fleet_there_is_as_in_a_folder(line, bucket, monkeypatch):
     here = fleets.Here()
     monkeypatch.setattr(units_pass, "Pool", lambda workers: here)
     wanted = {"pages": ["0001"], "certificate": True}
-    result = job.fleet(load_config(Path("family.yaml")), "units.csv", Path("there"), store="s3://line/c", **wanted)
+    result = job.fleet(load_config(Path("family.yaml")), "units.csv", Path("there"), store="s3://results/c", **wanted)
     assert not (line / "there" / "units").exists()
     assert [name for name in result.written if "s3:" in name] == [
-        "s3://line/c/units/", "pages of 1 in s3://line/c/units/NAME/page/",
+        "s3://results/c/units/", "pages of 1 in s3://results/c/units/NAME/page/",
     ]  # fmt: skip
     assert result.record("0001").state == "done"
     found, expected = fleets.contents(in_store(bucket, "c")), fleets.contents(line / "here")
@@ -138,15 +140,15 @@ def test_a_fleet_there_is_as_in_a_folder(line, bucket, monkeypatch):
     tables = [pl.read_parquet(f"{name}/units.parquet").drop("seconds") for name in ("there", "here")]
     assert tables[0].equals(tables[1])
     assert Path("there/family.json").exists() == Path("here/family.json").exists()
-    assert "s3://line/c/units/0001/page/report.html" in Path("there/report.html").read_text()
+    assert "s3://results/c/units/0001/page/report.html" in Path("there/report.html").read_text()
     here.asked.clear()
     again = job.fleet(load_config(Path("family.yaml")), "units.csv", Path("there"), **wanted)  # it knows its store
     assert here.asked == []
-    assert again.summary["store"] == "s3://line/c"
-    with pytest.raises(ConfigError, match="the units of there are in s3://line/c; leave --store out"):
-        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("there"), store="s3://line/d")
+    assert again.summary["store"] == "s3://results/c"
+    with pytest.raises(ConfigError, match="the units of there are in s3://results/c; leave --store out"):
+        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("there"), store="s3://results/d")
     with pytest.raises(ConfigError, match="the units of here are in the folder itself"):
-        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("here"), store="s3://line/d")
+        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("here"), store="s3://results/d")
 
 
 def test_workers_that_do_not_see_the_folder_go_through_the_store(line, bucket, tmp_path, monkeypatch):
@@ -158,7 +160,7 @@ def test_workers_that_do_not_see_the_folder_go_through_the_store(line, bucket, t
         monkeypatch.setattr(store, "UnitPlace", lambda path, signed: UnitPlace(path, b"another's"))  # out of sight
         with worker(tmp_path, address):
             job.fleet(
-                load_config(Path("family.yaml")), "units.csv", Path("far"), scheduler=address, store="s3://line/e"
+                load_config(Path("family.yaml")), "units.csv", Path("far"), scheduler=address, store="s3://results/e"
             )
     expected = {name: content for name, content in fleets.contents(line / "here").items() if "units/" in name}
     found = fleets.contents(in_store(bucket, "e"))
@@ -166,4 +168,4 @@ def test_workers_that_do_not_see_the_folder_go_through_the_store(line, bucket, t
     assert {name for name in expected if name not in found} == {
         name for name in expected if "page/" in name or "certificate" in name
     }
-    assert json.loads(bucket.cat_file("line/e/driftlab.json"))["program"] == "driftlab fleet"
+    assert json.loads(bucket.cat_file("results/e/driftlab.json"))["program"] == "driftlab fleet"
