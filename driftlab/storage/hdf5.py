@@ -267,6 +267,15 @@ def columns_of(path: Path, group: h5py.Group, names: Collection[str]) -> dict[st
     return columns
 
 
+def _rows_of(path: Path) -> int:
+    """Return the rows of a file that are whole; 0 where it cannot be read."""
+    try:
+        with reading(path) as file:
+            return min((len(data) for data in file.values()), default=0)
+    except UnreadableFile:
+        return 0
+
+
 def continued(
     path: Path,
     rows: int | None,
@@ -276,6 +285,8 @@ def continued(
     settling: Collection[str] = (),
 ) -> GrowingFile:
     """Return a file in the place of `path` that begins with its first rows (all that are whole, where rows is None)."""
+    if not has_posix_locks() and _rows_of(beside(path)) > _rows_of(path):  # of a killed program, which had it open
+        os.replace(beside(path), path)
     new = GrowingFile(path, attributes, column_attributes, single, settling, early=False)
     with reading(path) as old:
         whole = min((len(data) for data in old.values()), default=0)
