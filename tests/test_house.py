@@ -269,7 +269,7 @@ BUDGET = {
     "driftlab/production": 3246,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
-    "driftlab/reports": 3503,
+    "driftlab/reports": 3504,
     "driftlab/soak": 658,
     "driftlab/spc": 1510,
     "driftlab/starter": 850,

@@ -53,13 +53,14 @@ def _row(section: SensorReport) -> list[str]:
 
 def _most_lost(sections: Sequence[SensorReport]) -> str:
     """Return the sensor of which the firmware loses most beside the sigma of its map; empty where it is none of it."""
-    lost = []
+    lost = list[tuple[float, str, str]]()
     for title, _, verdict, unit, loss in sections:
         if verdict is not None and unit is not None and loss is not None and verdict.good is not None:
             beside = float(np.max(loss.domain.rms)), float(np.max(verdict.good))
-            lost.append((beside[0] / beside[1], title, *(text(value * unit.factor) for value in beside), unit.shown))
-    times, title, off, good, shown = max(lost, default=(0.0, "", "", "", ""))
-    return f"; the firmware is off its map by {off} {shown} on {title}, which is good to {good}" if times > 1 else ""
+            off, good = (text(value * unit.factor) for value in beside)
+            lost.append((beside[0] / beside[1], f"{off} {unit.shown} on {title}", good))
+    times, off, good = max(lost, default=(0.0, "", ""))
+    return f"; the firmware is off its map by {off}, which is good to {good}" if times > 1 else ""
 
 
 def charts(sections: Sequence[SensorReport]) -> list[tuple[SensorReport, Chart | None]]:
