@@ -208,7 +208,7 @@ def _end_with_parent() -> None:
 
 
 def _end_after(parent: int) -> None:
-    """End this process when the sentinel of the parent says that it has ended."""
+    """End this process when the sentinel of the parent says that it has ended, once compiled code lets threads run."""
     wait([parent])
     os._exit(1)
 

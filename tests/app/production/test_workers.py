@@ -14,6 +14,7 @@ import unit_work
 from driftlab.errors import WorkersError
 from driftlab.production import workers
 from driftlab.production.workers import Pool, WorkerLost, available
+from driftlab.storage.system import has_posix_locks
 
 WHY = {
     "killed": "its worker was killed (SIGKILL), as the system does where memory runs out",
@@ -23,12 +24,14 @@ WHY = {
     "raise": "KeyError: 'heading' (support/unit_work.py, line",
     "unpicklable": "AttributeError: Can't",
 }
+# on Windows the system ends no process with another; a thread does, which code in C may keep waiting
+WORK = "burn_in_c" if has_posix_locks() else "burn"
 SCRIPT = """
 import sys, unit_work
 from driftlab.production.workers import Pool
 print("main", flush=True)
 with Pool(2) as pool:
-    for item, result in pool.map(unit_work.burn_in_c, [0, 0, {last}]):
+    for item, result in pool.map(unit_work.{work}, [0, 0, {last}]):
         print(result, flush=True)
 """
 
@@ -51,7 +54,7 @@ def until(condition, patience=10.0):
 def script(tmp_path, last):
     """Start a script with two workers, as a user writes it, without a guard; return it and their process ids."""
     path = tmp_path / "line.py"
-    path.write_text(SCRIPT.format(last=last))
+    path.write_text(SCRIPT.format(work=WORK, last=last))
     support = str(Path(unit_work.__file__).parent)
     paths = os.pathsep.join([support, *filter(None, sys.path)])
     started = subprocess.Popen([sys.executable, path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
