@@ -288,7 +288,7 @@ BUDGET = {
     "plugins/exporters": 1754,
     "plugins/framings": 641,
     "plugins/measurement_models": 774,
-    "plugins/sources": 5308,
+    "plugins/sources": 5311,
     "plugins/stimuli": 288,
     "plugins/thermal_maps": 839,
 }

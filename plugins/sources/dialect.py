@@ -167,10 +167,16 @@ def _format(cells: list[str]) -> str | None:
         return None
     years = "%Y" if all(re.search(r"\d{4}", cell.partition(":")[0]) for cell in filled) else "%y"
     few, all_of = pl.Series(filled[:50]), pl.Series(filled)
-    forms = [form for form in forms if years in form or form in HOURS]
+    forms = [form for form in forms if (years in form or form in HOURS) and _may_be(form, filled[0])]
     forms = [form for form in forms if seconds_of(few, form).is_not_null().all()]
     spans = {form: _span(seconds_of(all_of, form)) for form in forms}
     return min(spans, key=lambda form: spans[form], default=None)  # of days and months in turn: that of fewer days
+
+
+def _may_be(form: str, cell: str) -> bool:
+    """Return False where a cell lacks a sign that stands between the parts of a format."""
+    between = re.sub(r"%[-_0]?.", "", form)
+    return all(cell.count(sign) >= between.count(sign) for sign in "-/:T")
 
 
 def _span(seconds: pl.Series) -> float:
