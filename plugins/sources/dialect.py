@@ -31,7 +31,7 @@ NUMBER = {
 MONTHS = "jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec"
 DATE = re.compile(
     r"(?!\d+\.\d*$)(?=.*\d[-/.:]\d)"  # no decimal number
-    rf"\d{{1,4}}(?:[-/.:, T]+(?:\d+|{MONTHS}))*\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?",
+    rf"\d{{1,4}}(?:[-/.:, T]+(?:\d+|{MONTHS})){{0,8}}\s?(?:[AP]M|Z|UTC|GMT|[+-]\d\d:?\d\d)?",
     re.I,
 )
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
