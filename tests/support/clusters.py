@@ -7,12 +7,15 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 SUPPORT = str(Path(__file__).parent)
 
 
 @contextmanager
 def started(tmp_path, *args, **environment):
     """Start a part of a cluster, with its words in a file."""
+    pytest.importorskip("resource", reason="Dask needs on this system what POSIX has")
     paths = os.pathsep.join([*environment.pop("before", ()), SUPPORT, *filter(None, sys.path)])
     log = tmp_path / f"{len(list(tmp_path.iterdir()))}.log"
     with log.open("w") as file:
