@@ -28,8 +28,8 @@ from fleet_units import PER_LOT, config_text, date_of_light, key_of_light, put_l
 
 from driftlab.config import load_config
 from driftlab.production.fleet import fleet
+from driftlab.production.fleet_folder import TABLE, fleet_folder
 from driftlab.production.manifest import read_manifest
-from driftlab.production.store import TABLE, fleet_folder
 from driftlab.production.unit import Task
 from driftlab.production.units_pass import stamp_of, versions_of
 from driftlab.production.workers import Pool

@@ -16,7 +16,7 @@ import numpy as np
 from driftlab.family.basis import STEP
 from driftlab.family.record import Figure, UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.production.store import UnitPlace
+from driftlab.production.unit_folders import UnitPlace
 from driftlab.soak.blocks import SoakRows
 
 RESULT = os.urandom(100_000)

@@ -18,9 +18,9 @@ from driftlab.config import Config, with_recording
 from driftlab.family.partitions import serial
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
+from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
 from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.store import FAMILY, REPORT, TABLE, fleet_folder, stored_units
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from driftlab.commands.result import Result
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.production.store import FAMILY, REPORT, TABLE
+from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE
 from driftlab.production.tables import COLUMNS
 from driftlab.production.unit_folders import UnitFolders, UnitPlace
 from driftlab.production.unit_store import UnitStore

@@ -29,7 +29,7 @@ from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.store import FAMILY, REPORT, TABLE, FleetFolder, StoredUnits
+from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, FleetFolder, StoredUnits
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.unit_folders import COMMAND, FAMILY_MAP, UnitFolders
 from driftlab.production.unit_map import file_content

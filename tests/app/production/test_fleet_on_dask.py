@@ -16,7 +16,7 @@ from clusters import said, scheduler, worker
 from driftlab.config import load_config
 from driftlab.production import fleet as job
 from driftlab.production import units_pass
-from driftlab.production.store import fleet_folder
+from driftlab.production.fleet_folder import fleet_folder
 from driftlab.production.unit import Task, UnitResult
 from driftlab.production.unit_folders import SCRATCH, UnitPlace
 from driftlab.production.units_pass import work_in_place

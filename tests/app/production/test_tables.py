@@ -8,7 +8,7 @@ import pytest
 
 from driftlab.family.partitions import ScratchFolder
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.production.store import StoredUnits
+from driftlab.production.fleet_folder import StoredUnits
 from driftlab.production.tables import COLUMNS, _Table, all_columns, frame_of, join_tables, rows_of
 from driftlab.production.unit_folders import UnitPlace
 from fusion_core.errors import UnreadableFile

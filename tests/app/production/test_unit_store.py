@@ -13,7 +13,7 @@ from driftlab.config import load_config
 from driftlab.errors import ConfigError, Unwritable
 from driftlab.family.record import UnitRecord
 from driftlab.production import fleet as job
-from driftlab.production import store, units_pass
+from driftlab.production import fleet_folder, units_pass
 from driftlab.production.unit_folders import UnitPlace
 from driftlab.production.unit_store import UnitStore, opened
 
@@ -157,7 +157,9 @@ def test_workers_that_do_not_see_the_folder_go_through_the_store(line, bucket, t
     monkeypatch.setattr(units_pass, "Pool", None)  # nobody else works
     with scheduler(tmp_path) as (_, log):
         address = said(log, "Scheduler at:").split()[-1]
-        monkeypatch.setattr(store, "UnitPlace", lambda path, signed: UnitPlace(path, b"another's"))  # out of sight
+        monkeypatch.setattr(
+            fleet_folder, "UnitPlace", lambda path, signed: UnitPlace(path, b"another's")
+        )  # out of sight
         with worker(tmp_path, address):
             job.fleet(
                 load_config(Path("family.yaml")), "units.csv", Path("far"), scheduler=address, store="s3://results/e"

@@ -14,7 +14,7 @@ from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import _bare
-from driftlab.production.store import stored_units
+from driftlab.production.fleet_folder import stored_units
 from driftlab.production.unit_folders import UNITS, UnitPlace
 from driftlab.production.workers import Pool
 from driftlab.soak.blocks import SoakRows

@@ -7,8 +7,9 @@ import pytest
 
 from driftlab.errors import ConfigError, Unwritable
 from driftlab.family.record import UnitRecord
-from driftlab.production import store, unit_folders
-from driftlab.production.store import fleet_folder
+from driftlab.production import fleet_folder as folder_module
+from driftlab.production import unit_folders
+from driftlab.production.fleet_folder import fleet_folder
 from driftlab.storage.folders import remove
 
 FAILED = {"key": "k", "state": "failed", "error": "none"}
@@ -202,7 +203,7 @@ def test_a_fleet_is_looked_at_once_its_lock_is_held(tmp_path, monkeypatch):
         complete(folder, b"a")
         folder.put(UnitRecord(unit="6", **FAILED), {}, "stamp")
 
-    class Late(store.Lock):
+    class Late(folder_module.Lock):
         def __init__(self, path, what):
             monkeypatch.undo()
             with fleet_folder(tmp_path / "fleet") as folder:
@@ -210,7 +211,7 @@ def test_a_fleet_is_looked_at_once_its_lock_is_held(tmp_path, monkeypatch):
             (tmp_path / "fleet" / "report.html").write_text("mine")
             super().__init__(path, what)
 
-    monkeypatch.setattr(store, "Lock", Late)
+    monkeypatch.setattr(folder_module, "Lock", Late)
     with pytest.raises(ConfigError, match=r"holds report\.html"), fleet_folder(tmp_path / "fleet"):
         pass
     assert not (tmp_path / "fleet" / "driftlab.lock").exists()
