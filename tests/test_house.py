@@ -266,7 +266,7 @@ BUDGET = {
     "driftlab/maps": 1789,
     "driftlab/noise": 1199,
     "driftlab/planning": 1263,
-    "driftlab/production": 3246,
+    "driftlab/production": 3243,
     "driftlab/products": 6,
     "driftlab/recordings": 454,
     "driftlab/reports": 3504,

@@ -35,7 +35,7 @@ from driftlab.production.unit_folders import (
     write_whole,
 )
 from driftlab.production.unit_records import UnitRecords
-from driftlab.production.unit_store import opened
+from driftlab.production.unit_store import open_store
 from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove
 from driftlab.storage.hdf5 import reason
@@ -80,7 +80,7 @@ class FleetFolder:
             if url is None:
                 self.place.finish()
             else:
-                self.units = opened(url, self.mark["id"])
+                self.units = open_store(url, self.mark["id"])
             self._shorten()
             self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")

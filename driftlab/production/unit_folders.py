@@ -45,9 +45,9 @@ class UnitFolders(ABC):
         """Folder of the units, as links have it."""
 
     @property
-    @abstractmethod
     def address(self) -> str:
         """Folder of the units, as messages have it."""
+        return self.root
 
     @abstractmethod
     def reached(self) -> bool:

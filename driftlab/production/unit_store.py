@@ -25,7 +25,7 @@ from fusion_core.errors import ConfigError, FusionError, Unwritable, describe_er
 HELD = "driftlab.json"  # says which fleet a store is of
 
 
-def opened(url: str, fleet: str) -> UnitStore:
+def open_store(url: str, fleet: str) -> UnitStore:
     """Return the store of a fleet, by its id, behind a URL; a new one is begun where nothing is.
 
     Raises
@@ -47,10 +47,10 @@ def opened(url: str, fleet: str) -> UnitStore:
         said = None
     if said is None and store.find(""):
         raise ConfigError(f"{subject}: has objects that no fleet of driftlab wrote; name another place in the store")
-    if said is not None and said != store.said:
+    if said is not None and said != store.owner:
         raise ConfigError(f"{subject}: has the units of another fleet; name another place in the store")
     if said is None:
-        store.pipe(HELD, json.dumps(store.said).encode())
+        store.pipe(HELD, json.dumps(store.owner).encode())
     return store
 
 
@@ -67,12 +67,7 @@ class UnitStore(UnitFolders):
         return f"{self.url}/{UNITS}"
 
     @property
-    def address(self) -> str:
-        """The URL of the units."""
-        return self.root
-
-    @property
-    def said(self) -> dict[str, str]:
+    def owner(self) -> dict[str, str]:
         """Content of `driftlab.json`: the fleet that the store is of."""
         return {"program": "driftlab fleet", "id": self.fleet}
 
@@ -120,7 +115,7 @@ class UnitStore(UnitFolders):
     def reached(self) -> bool:
         """Return True if this process reaches the store, and it is of this fleet."""
         try:
-            return bool(json.loads(self.get(HELD)) == self.said)
+            return bool(json.loads(self.get(HELD)) == self.owner)
         except (OSError, ValueError, FusionError):
             return False
 
@@ -141,16 +136,14 @@ class UnitStore(UnitFolders):
         record, old = record.model_copy(update={"written": digests(files)}), self.record(record.unit)
         if old is not None:
             self.remove(f"{UNITS}/{old.unit}", [RECORD])
-            self._remove_known(old, [name for name in old.written if name not in files])
+            gone = [
+                name for name, known in old.written.items() if name not in files and self.is_as(old.unit, name, known)
+            ]
+            self.remove(f"{UNITS}/{old.unit}", gone)
         for name, content in files.items():
             self.write(record.unit, name, content)
         self.write(record.unit, RECORD, content_of(record))
         return record
-
-    def _remove_known(self, record: UnitRecord, names: Sequence[str]) -> None:
-        """Remove objects of a unit that are as its record knows them."""
-        own = [name for name in names if self.is_as(record.unit, name, record.written[name])]
-        self.remove(f"{UNITS}/{record.unit}", own)
 
     def write(self, unit: str, name: str, content: bytes) -> None:
         """Write an object of a unit."""

@@ -15,7 +15,7 @@ from driftlab.family.record import UnitRecord
 from driftlab.production import fleet as job
 from driftlab.production import fleet_folder, units_pass
 from driftlab.production.unit_folders import UnitPlace
-from driftlab.production.unit_store import UnitStore, opened
+from driftlab.production.unit_store import UnitStore, open_store
 
 COUNT = 4
 
@@ -65,8 +65,8 @@ def unit(name="7", **more):
 
 
 def test_a_unit_is_there_when_its_record_is_and_what_others_put_there_stays(bucket):
-    units = opened("s3://results/a/", "id")
-    assert opened("s3://results/a", "id") == units
+    units = open_store("s3://results/a/", "id")
+    assert open_store("s3://results/a", "id") == units
     assert units.reached()
     assert units.names() == []
     assert units.record("7") is None
@@ -85,7 +85,7 @@ def test_a_unit_is_there_when_its_record_is_and_what_others_put_there_stays(buck
 
 
 def test_scratch_is_gone_at_the_end(bucket):
-    units = opened("s3://results/a", "id")
+    units = open_store("s3://results/a", "id")
     with units.scratch() as scratch:
         scratch.write("part-1", b"1")
         assert scratch.read("part-1") == b"1"
@@ -95,20 +95,20 @@ def test_scratch_is_gone_at_the_end(bucket):
 
 
 def test_another_s_place_is_refused(bucket):
-    opened("s3://results/a", "id")
+    open_store("s3://results/a", "id")
     with pytest.raises(ConfigError, match="has the units of another fleet; name another place"):
-        opened("s3://results/a", "other")
+        open_store("s3://results/a", "other")
     assert not UnitStore("s3://results/a", "other").reached()
     bucket.pipe_file("results/b/notes.txt", b"mine")
     with pytest.raises(ConfigError, match="has objects that no fleet of driftlab wrote"):
-        opened("s3://results/b", "id")
+        open_store("s3://results/b", "id")
     for url in ("results/a", "file:///folder", "https://host/line"):
         with pytest.raises(ConfigError, match="is no URL of a store"):
-            opened(url, "id")
+            open_store(url, "id")
     with pytest.raises(ConfigError, match="cannot be reached"):
-        opened("nosuch://line", "id")
+        open_store("nosuch://line", "id")
     with pytest.raises(Unwritable, match=r"s3://no-such-bucket/a: there is no such bucket .*; create it"):
-        opened("s3://no-such-bucket/a", "id")
+        open_store("s3://no-such-bucket/a", "id")
 
 
 def in_store(bucket, place):
