@@ -1,4 +1,4 @@
-"""A Dask cluster on this machine: a scheduler and workers, each a process of its own that may be killed."""
+"""Servers on this machine, each a process of its own that may be killed: a Dask scheduler, its workers, and S3."""
 
 import os
 import subprocess
@@ -14,8 +14,7 @@ SUPPORT = str(Path(__file__).parent)
 
 @contextmanager
 def started(tmp_path, *args, **environment):
-    """Start a part of a cluster, with its words in a file."""
-    pytest.importorskip("resource", reason="Dask needs on this system what POSIX has")
+    """Start a module as a server, with its words in a file."""
     paths = os.pathsep.join([*environment.pop("before", ()), SUPPORT, *filter(None, sys.path)])
     log = tmp_path / f"{len(list(tmp_path.iterdir()))}.log"
     with log.open("w") as file:
@@ -29,6 +28,7 @@ def started(tmp_path, *args, **environment):
 
 
 def scheduler(tmp_path, **environment):
+    pytest.importorskip("resource", reason="Dask needs on this system what POSIX has")
     return started(
         tmp_path, "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1",
         "--scheduler-file", "scheduler.json", **environment,
@@ -62,3 +62,21 @@ def said(path, text, patience=30.0):
                 return line
         time.sleep(0.02)
     raise AssertionError(f"{path} has no {text}: {path.read_text()}")
+
+
+@contextmanager
+def s3(tmp_path):
+    """Give the file system of a server that has the API of S3, by the environment, which workers have too."""
+    s3fs = pytest.importorskip("s3fs")
+    pytest.importorskip("moto.server")
+    given = {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}
+    with (
+        started(tmp_path, "moto.server", "-H", "127.0.0.1", "-p", "0") as (_, log),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        given["ENDPOINT_URL"] = said(log, "Running on", patience=120.0).split()[-1]
+        for name, value in given.items():
+            patch.setenv(f"AWS_{name}", value)
+        s3fs.S3FileSystem.clear_instance_cache()  # of another server
+        yield s3fs.S3FileSystem()
+        s3fs.S3FileSystem.clear_instance_cache()

@@ -2,7 +2,6 @@
 
 import os
 import select
-import signal
 import subprocess
 import sys
 import time
@@ -10,6 +9,13 @@ import time
 import pytest
 
 SECONDS = 120  # on a machine that others keep busy
+# a shell has its background jobs ignore SIGINT
+TAKE_THE_TERMINAL = """
+import fcntl, os, signal, sys, termios
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, "-m", "driftlab", *sys.argv[1:]])
+"""
 
 
 def at_a_terminal(*args, cwd, answers=(), **environment):
@@ -17,20 +23,13 @@ def at_a_terminal(*args, cwd, answers=(), **environment):
 
     A command that waits for more is stopped, and an error.
     """
-    fcntl = pytest.importorskip("fcntl", reason="terminals are those of POSIX")
-    termios = pytest.importorskip("termios", reason="terminals are those of POSIX")
+    pytest.importorskip("termios", reason="terminals are those of POSIX")
     ours, theirs = os.openpty()
-
-    def take_the_terminal():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a shell has its background jobs ignore
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
     known = {"TERM": "xterm", "COLUMNS": "100", "LINES": "40", "PROMPT_TOOLKIT_NO_CPR": "1"}
     env = {**os.environ, **known, **environment}
     running = subprocess.Popen(
-        [sys.executable, "-m", "driftlab", *map(str, args)],
+        [sys.executable, "-c", TAKE_THE_TERMINAL, *map(str, args)],
         stdout=theirs, stderr=theirs, stdin=theirs, env=env, cwd=cwd, start_new_session=True,
-        preexec_fn=take_the_terminal,
     )  # fmt: skip
     os.close(theirs)
     shown, passed, left, until = b"", 0, list(answers), time.monotonic() + SECONDS

@@ -29,7 +29,12 @@ def campaign(name, failures):
     command = [sys.executable, CAMPAIGN, "--only", name, "--dose", str(DOSES[name]), "--workers", "1"]
     environment = {**os.environ, "MPLBACKEND": "Agg"}
     return subprocess.run(
-        [*command, "--failures", failures], capture_output=True, text=True, check=False, env=environment
+        [*command, "--failures", failures],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        timeout=1000,
     )
 
 

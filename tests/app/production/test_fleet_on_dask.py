@@ -46,7 +46,7 @@ def assert_same(line, out):
     assert [path.name for path in (line / out).rglob(".*")] == []
 
 
-def wait_for(there, patience=1500.0):
+def wait_for(there, patience=600.0):
     end = time.monotonic() + patience
     while not there():
         assert time.monotonic() < end

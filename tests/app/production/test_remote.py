@@ -13,6 +13,7 @@ from threading import Thread
 import family
 import fsspec
 import pytest
+from clusters import s3
 
 from driftlab.errors import ConfigError, UnreadableFile
 from driftlab.production.remote import is_url, local, look
@@ -205,18 +206,9 @@ def test_a_real_server(tmp_path):
         look(url)
 
 
-def test_a_real_bucket(monkeypatch):
+def test_a_real_bucket(tmp_path):
     """moto serves the API of S3; s3fs asks it as it asks the real one."""
-    pytest.importorskip("s3fs")
-    moto = pytest.importorskip("moto.server")
-    server = moto.ThreadedMotoServer("127.0.0.1", 0)
-    server.start()
-    host, port = server.get_host_and_port()
-    for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
-        monkeypatch.setenv(f"AWS_{name}", value)
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    try:
-        system = fsspec.filesystem("s3")
+    with s3(tmp_path) as system:
         system.mkdir("line")
         system.pipe({"line/0001/soak.h5": b"first", "line/0002/soak.h5": b"second one"})
         with local(["s3://line/0001/soak.h5::0:5", "s3://line/0002/soak.h5"]) as found:
@@ -231,5 +223,3 @@ def test_a_real_bucket(monkeypatch):
             look("s3://line/0003/soak.h5")
         with pytest.raises(UnreadableFile, match=r"cannot be fetched|is not there"):
             look("s3://other/0001/soak.h5")
-    finally:
-        server.stop()

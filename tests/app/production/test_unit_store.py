@@ -7,7 +7,7 @@ import fleets
 import fsspec
 import polars as pl
 import pytest
-from clusters import said, scheduler, worker
+from clusters import s3, said, scheduler, worker
 
 from driftlab.config import load_config
 from driftlab.errors import ConfigError, Unwritable
@@ -21,21 +21,10 @@ COUNT = 4
 
 
 @pytest.fixture(scope="module", autouse=True)
-def server():
-    """A server of S3, by the environment, which workers have too."""
-    s3fs = pytest.importorskip("s3fs")
-    moto = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0)
-    moto.start()
-    host, port = moto.get_host_and_port()
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
-            patch.setenv(f"AWS_{name}", value)
-        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        s3fs.S3FileSystem.clear_instance_cache()  # of another server
-        fsspec.filesystem("s3").mkdir("results")
+def server(tmp_path_factory):
+    with s3(tmp_path_factory.mktemp("server")) as system:
+        system.mkdir("results")
         yield
-        s3fs.S3FileSystem.clear_instance_cache()
-    moto.stop()
 
 
 @pytest.fixture
