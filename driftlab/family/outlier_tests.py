@@ -19,7 +19,7 @@ known family. n units, d axes, q coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from sys import intern
@@ -33,6 +33,7 @@ from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.reml import WEIGHT
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
+from driftlab.family.unit_records import figure_of, figures_in
 from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak with less information on an axis has none
@@ -193,7 +194,7 @@ class Tests:
 
 
 def tests_of(
-    family: Family, statistics: CurveStatistics, units: FamilyUnits, records: Iterable[UnitRecord],
+    family: Family, statistics: CurveStatistics, units: FamilyUnits, records: Sequence[UnitRecord],
     laws: TailLaws | None,
 ) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
@@ -203,7 +204,9 @@ def tests_of(
         curves[len(names) : len(names) + len(own)] = table
         names += own
         lots += map(intern, of_lots)
-    figures = _figures(records, {name: k for k, name in enumerate(names)}, d)
+    places = _places(records, names)
+    known = figures_in(records)
+    figures = [name for name in FIGURES if name in known]
     of_curves: dict[str, TailLaw] = {}
     of_figures: dict[str, FigureLaw] = {}
     tests = [(name, axis) for name in (*CURVES, *figures) for axis in range(d)]
@@ -213,8 +216,9 @@ def tests_of(
         law = TailLaw.of(statistic) if laws is None else laws.curves.get(name)
         of_curves |= {} if law is None else {name: law}
         p[:, k * d : (k + 1) * d], values[:, k * d : (k + 1) * d] = _chance(law, statistic, name), statistic
-    for k, name in enumerate([*figures], len(CURVES)):
-        of_axes = figures.pop(name)
+    for k, name in enumerate(figures, len(CURVES)):
+        of_axes = np.full((len(names), 2, d), np.nan)
+        of_axes[places[places >= 0]] = figure_of(records, name, d).swapaxes(0, 1)[places >= 0]
         usual, off = figure_law(name, of_axes, lots) if laws is None else (laws.figures.get(name), [{}] * d)
         if usual is not None:
             of_figures[name] = usual
@@ -224,17 +228,10 @@ def tests_of(
     return Tests(names, tests, p, values, TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots)
 
 
-def _figures(records: Iterable[UnitRecord], places: Mapping[str, int], d: int) -> dict[str, Array]:
-    """Return value and sigma (n, 2, d) of each of FIGURES that a unit has, by the places of the units."""
-    found: dict[str, Array] = {}
-    for record in records:
-        names = [name for name in FIGURES if name in record.figures]
-        if record.state == "done" and record.unit in places and names:
-            for name, own in zip(names, record.table(names, d).swapaxes(0, 1), strict=True):
-                if name not in found:
-                    found[name] = np.full((len(places), 2, d), np.nan)
-                found[name][places[record.unit]] = own
-    return {name: found[name] for name in FIGURES if name in found}
+def _places(records: Sequence[UnitRecord], names: Sequence[str]) -> npt.NDArray[np.intp]:
+    """Return the place of each record among units, -1 of one that is not done or not among them."""
+    at = {name: k for k, name in enumerate(names)}
+    return np.array([at.get(one.unit, -1) if one.state == "done" else -1 for one in records], dtype=np.intp)
 
 
 def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[list[str], list[str], Array]:

@@ -19,7 +19,7 @@ number of trials. A hypothesis holds if with it the curve is an ordinary one of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -114,7 +114,7 @@ class Outliers:
 
 
 def find_outliers(
-    family: Family, units: FamilyUnits, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None,
+    family: Family, units: FamilyUnits, records: Sequence[UnitRecord], *, shown: BiasUnit | None = None,
     fitted: bool = True,
 ) -> Outliers:  # fmt: skip
     """Return the odd units with their reasons.
@@ -124,7 +124,7 @@ def find_outliers(
     family : Family
     units : FamilyUnits
         Those to be judged.
-    records : iterable of UnitRecord
+    records : sequence of UnitRecord
         Of the same units; one without a record is judged by its curves alone.
     shown : BiasUnit, optional
         Of sentences; of a rate deg/h, else SI.

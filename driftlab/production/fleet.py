@@ -16,6 +16,7 @@ from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
 from driftlab.family.partitions import serial
+from driftlab.family.unit_records import RecordsOfUnits
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
@@ -24,7 +25,6 @@ from driftlab.production.result import FleetResult
 from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS
-from driftlab.production.unit_records import RecordsOfUnits
 from driftlab.production.unit_terms import terms_of_units
 from driftlab.production.units_pass import FleetOptions, FleetStatus, UnitJobs, versions_of
 from driftlab.recordings.identity import sha256

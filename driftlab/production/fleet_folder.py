@@ -22,6 +22,7 @@ from uuid import uuid4
 
 from driftlab.family.partitions import SIZE, Engine, Partitions, Scratch, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
+from driftlab.family.unit_records import UnitRecords
 from driftlab.production.unit_folders import (
     MARK,
     NEW,
@@ -34,7 +35,6 @@ from driftlab.production.unit_folders import (
     digests,
     write_whole,
 )
-from driftlab.production.unit_records import UnitRecords
 from driftlab.production.unit_store import open_store
 from driftlab.storage import ownership
 from driftlab.storage.folders import FULL, LOCK, Lock, check_writable, refusals, remove

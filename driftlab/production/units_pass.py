@@ -25,13 +25,13 @@ from driftlab.config import Config, part_of
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.partitions import Engine
 from driftlab.family.record import UnitRecord
+from driftlab.family.unit_records import RecordsOfUnits, UnitRecords
 from driftlab.production.fleet_folder import FleetFolder
 from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.remote import is_url, look
 from driftlab.production.summary import MAX_PAGES, FleetProgress, Stage
 from driftlab.production.unit import STIMULUS, Task, UnitResult, certificate_of, config_of, key_of, work
 from driftlab.production.unit_folders import PAGE_FILE, UnitFolders
-from driftlab.production.unit_records import RecordsOfUnits, UnitRecords
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
 from driftlab.spc.yields import COLUMNS

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
@@ -25,6 +25,7 @@ from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.family.tail_law import TailLaw
+from driftlab.family.unit_records import RecordsOfUnits, figure_of
 from driftlab.spc.capability import Capability, indices, share_beyond, why_no_index
 from driftlab.spc.change_points import Course, LevelStep, course_of
 from driftlab.spc.charts import (
@@ -54,15 +55,15 @@ OF_THE_RANGE = ("swing", "coast")  # figures that a soak over a part of the rang
 
 
 def line_of(
-    records: Iterable[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
+    records: Sequence[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
     levels: Array | None = None, baseline: Baseline | None = None, rules: str | None = None,
 ) -> LineReport:  # fmt: skip
     """Return the report of a line.
 
     Parameters
     ----------
-    records : iterable of UnitRecord
-        In the order of the manifest; gone through once. Failed units are left out.
+    records : sequence of UnitRecord
+        In the order of the manifest. Failed units are left out.
     limits : Limits or None
         Of the config.
     unit : BiasUnit, optional
@@ -74,36 +75,67 @@ def line_of(
     rules : str, optional
         Run rules beside three sigma, one of `driftlab.spc.run_rules.RULES`.
     """
-    line, table = _ordered(records, levels, unit)
-    line = replace(line, baseline=baseline)
-    if baseline is not None:
-        part = np.array(
-            [not baseline.covered(None if low != low else (low, high)) for low, high in line.domains.tolist()],
-            dtype=bool,
-        )
-        for name in OF_THE_RANGE:
-            table[name][:, part] = np.nan
-        line = replace(line, partial=int(np.sum(part)))
-    names = (*FIGURES, *(() if levels is None else (LEVEL,)))
+    done = records.in_state("done") if isinstance(records, RecordsOfUnits) else _done(records)
+    line, place = _ordered(done, unit)
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
-    for (name, axis), limits_of in known.items():
-        if limits_of.scale == "log" and axis in line.axes and name in table:  # nothing shows: there is no logarithm
-            values = table[name][:, :, line.axes.index(axis)]
-            values[:, ~(values[0] > 0)] = np.nan
-    enough = {
-        (name, axis): np.sum(np.isfinite(table[name][0, :, k])) >= (1 if (name, axis) in known else MIN_UNITS)
-        for name in names for k, axis in enumerate(line.axes)
-    }  # fmt: skip
+    part = _partial(line, baseline)
+    quantities = _Quantities(done, place, line.axes, levels, part, known)
+    line = replace(line, baseline=baseline, partial=int(np.sum(part)))
+    enough = quantities.enough()
     alpha = FALSE / max(sum(enough.values()), 1)
     of_rules, everywhere = RULES.get(rules or "", {}), np.arange(len(line.units))
+    names = dict.fromkeys(name for (name, _), there in enough.items() if there)
     controls = tuple(
-        _control(line, name, k, table[name][:, :, k], alpha, known.get((name, axis)), of_rules, everywhere)
-        for name in names for k, axis in enumerate(line.axes) if enough[name, axis]
+        _control(line, name, k, figures[:, :, k], alpha, known.get((name, axis)), of_rules, everywhere)
+        for name, figures in ((name, quantities.read(name)) for name in names)
+        for k, axis in enumerate(line.axes) if enough[name, axis]
     )  # fmt: skip
-    too_few = tuple(f"{axis} {name}" for (name, axis), many in enough.items() if not many)
+    too_few = tuple(f"{axis} {name}" for (name, axis), there in enough.items() if not there)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
     line = replace(line, multivariate=_multivariate(line))
     return replace(line, sentences=tuple(sentences(line)))
+
+
+def _partial(line: LineReport, baseline: Baseline | None) -> NDArray[np.bool_]:
+    """Return the units (n,) that were soaked over a part of the range of a baseline."""
+    if baseline is None:
+        return np.zeros(len(line.units), dtype=bool)
+    spans = (None if low != low else (low, high) for low, high in line.domains.tolist())
+    return np.array([not baseline.covered(span) for span in spans], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class _Quantities:
+    """The quantities of units in the order of a line, read one at a time, as a line may be long."""
+
+    records: Sequence[UnitRecord]
+    place: NDArray[np.intp]  # of each unit, among the records
+    axes: tuple[str, ...]
+    levels: Array | None
+    partial: NDArray[np.bool_]
+    known: Mapping[tuple[str, str], FrozenLimits]  # by quantity and axis
+
+    def read(self, name: str) -> Array:
+        """Return values and deviations (2, n, d) of a quantity, NaN where they are not known."""
+        if name == LEVEL and self.levels is not None:
+            return np.stack([self.levels[self.place], np.full(self.levels.shape, np.nan)])
+        values = figure_of(self.records, name, len(self.axes))[:, self.place]
+        if name in OF_THE_RANGE:
+            values[:, self.partial] = np.nan
+        for k, axis in enumerate(self.axes):
+            limits = self.known.get((name, axis))
+            if limits is not None and limits.scale == "log":  # nothing shows: there is no logarithm
+                values[:, ~(values[0, :, k] > 0), k] = np.nan
+        return values
+
+    def enough(self) -> dict[tuple[str, str], bool]:
+        """Return True where there are units enough for a chart, by quantity and axis."""
+        names = (*FIGURES, *(() if self.levels is None else (LEVEL,)))
+        count = {name: np.sum(np.isfinite(self.read(name)[0]), axis=0) for name in names}
+        return {
+            (name, axis): bool(count[name][k] >= (1 if (name, axis) in self.known else MIN_UNITS))
+            for name in names for k, axis in enumerate(self.axes)
+        }  # fmt: skip
 
 
 def _control(
@@ -296,36 +328,26 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
     return tuple(rows)
 
 
-def _ordered(
-    records: Iterable[UnitRecord], levels: Array | None, unit: BiasUnit | None
-) -> tuple[LineReport, dict[str, Array]]:
-    """Return the units that are done, in order, and by quantity values and deviations (2, n, d), NaN if not known.
+def _done(records: Iterable[UnitRecord]) -> list[UnitRecord]:
+    return [record for record in records if record.state == "done"]
 
-    `levels` (n, d) become the quantity `level`.
-    """
+
+def _ordered(records: Sequence[UnitRecord], unit: BiasUnit | None) -> tuple[LineReport, NDArray[np.intp]]:
+    """Return a line of units in their order, and their places (n,) among the records."""
     axes: tuple[str, ...] = ()
     si = ""
     columns: tuple[list[str], ...] = ([], [], [])
-    domains, rows = array("d"), array("d")
+    domains = array("d")
     for record in records:
-        if record.state == "done":
-            axes, si = axes or record.axes, si or record.bias_unit
-            for column, text in zip(columns, (record.unit, record.lot, record.date), strict=True):
-                column.append(text)
-            domains.extend(record.domain or (np.nan, np.nan))
-            rows.frombytes(record.table(FIGURES, len(axes)).tobytes())
+        axes, si = axes or record.axes, si or record.bias_unit
+        for column, text in zip(columns, (record.unit, record.lot, record.date), strict=True):
+            column.append(text)
+        domains.extend(record.domain or (np.nan, np.nan))
     place, order = _places(columns[2])
-    n, d = len(place), len(axes)
     units, lots, dates = (tuple(column[k] for k in place) for column in columns)
-    figures = np.frombuffer(rows).reshape(n, 2, len(FIGURES), d)[place]
-    level = np.full((2, n, d), np.nan)
-    if levels is not None:
-        level[0] = levels[place]
-    table = {name: figures[:, :, k].swapaxes(0, 1) for k, name in enumerate(FIGURES)} | {LEVEL: level}
     unit = default_unit(si) if unit is None else unit
-    spans = np.frombuffer(domains).reshape(n, 2)[place]
-    line = LineReport(units=units, lots=lots, dates=dates, domains=spans, order=order, axes=axes, unit=unit)
-    return line, table
+    spans = np.frombuffer(domains).reshape(len(place), 2)[place]
+    return LineReport(units=units, lots=lots, dates=dates, domains=spans, order=order, axes=axes, unit=unit), place
 
 
 def _places(dates: list[str]) -> tuple[NDArray[np.intp], str]:

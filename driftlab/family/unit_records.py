@@ -13,6 +13,7 @@ from typing import Any, overload
 import numpy as np
 
 from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord
+from fusion_core.chunk import Array
 
 HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
 NUMBERS = 5  # before the figures: domain, hours, samples, seconds
@@ -88,6 +89,27 @@ class UnitRecords:
         """Return the records of some units, in that order."""
         return RecordsOfUnits(self, units)
 
+    def column(self, units: Sequence[str], name: str, d: int) -> Array:
+        """Return values and deviations (2, n, d) of a figure of some units, NaN where they are not known."""
+        rows = np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
+        table, codes = np.full((2, len(units), d), np.nan), np.asarray(self._codes)[rows]
+        for code in np.unique(codes):
+            axes, names = (self._common[code][k] for k in (6, -1))
+            if name not in names or len(axes) != d:
+                continue
+            of_code, at = np.flatnonzero(codes == code), d * names.index(name) + np.arange(d)
+            for held, starts, before, out in zip(
+                (self._numbers, self._sigmas), self._starts, (NUMBERS, 0), table, strict=True
+            ):
+                first = np.asarray(starts)[rows[of_code]].astype(np.intp) + before
+                out[of_code] = np.asarray(held)[first[:, None] + at]
+        return table
+
+    def names(self, units: Sequence[str]) -> set[str]:
+        """Return the names of the figures that any of some units has."""
+        codes = {self._codes[self._rows[unit]] for unit in units}
+        return {name for code in codes for name in self._common[code][-1]}
+
     def state(self, unit: str) -> str:
         """Return the state of a unit: `done` or `failed`."""
         return str(self._common[self._codes[self._rows[unit]]][0])
@@ -124,3 +146,17 @@ class RecordsOfUnits(Sequence[UnitRecord]):
     def in_state(self, state: str) -> RecordsOfUnits:
         """Return those that are in a state."""
         return RecordsOfUnits(self.records, [unit for unit in self.units if self.records.state(unit) == state])
+
+
+def figure_of(records: Sequence[UnitRecord], name: str, d: int) -> Array:
+    """Return values and deviations (2, n, d) of a figure of records, NaN where they are not known."""
+    if isinstance(records, RecordsOfUnits):
+        return records.records.column(records.units, name, d)
+    return np.array([record.table((name,), d)[:, 0] for record in records]).reshape(len(records), 2, d).swapaxes(0, 1)
+
+
+def figures_in(records: Sequence[UnitRecord]) -> set[str]:
+    """Return the names of the figures that any of some records has."""
+    if isinstance(records, RecordsOfUnits):
+        return records.records.names(records.units)
+    return {name for record in records for name in record.figures}

@@ -6,7 +6,7 @@ import numpy as np
 from lines import line
 
 from driftlab.family.record import FIGURES, Figure, UnitRecord
-from driftlab.production.unit_records import HELD, UnitRecords
+from driftlab.family.unit_records import HELD, UnitRecords, figure_of, figures_in
 from driftlab.spc.line import line_of
 from driftlab.spc.yields import yields_of
 
@@ -50,6 +50,12 @@ def test_a_record_in_brief_has_what_it_is_read_for():
     assert [record.unit for record in found.in_state("done")] == ["u0", "u1"]
     assert [record.unit for record in found.in_state("failed")] == ["f"]
     assert [record.unit for record in found[1:]] == ["f", "u1"]
+    assert figures_in(found) == figures_in(given) == {"noise", "soaks"}
+    for name in ("noise", "soaks", "walk"):
+        (value, sigma), (known, own) = figure_of(found, name, 3), figure_of(given, name, 3)
+        assert value.shape == (3, 3)
+        assert np.array_equal(value, known, equal_nan=True)
+        np.testing.assert_allclose(sigma, own, rtol=2.0**-24)
 
 
 def in_single_precision(record):
