@@ -155,9 +155,9 @@ class UnitJobs:
         Raises ConfigError where the recordings of most are not there: each takes its time, and there may be any number.
         """
         folder, units, lost, first, stamps = self.folder, self.manifest.units, 0, "", self.folder.stamps()
-        for entry in units:
+        for name, entry in zip(self.manifest.names, units, strict=True):
             task = self._task(entry)
-            stamp, record = stamp_of(task, self.versions), folder.brief(entry.unit)
+            stamp, record, before = stamp_of(task, self.versions), folder.brief(name), stamps.pop(name, "")
             if not stamp and record is None and missing(task):
                 lost, first = lost + 1, first or entry.unit
             if lost > MISSING + len(units) - lost:
@@ -165,9 +165,9 @@ class UnitJobs:
                     f"--units {self.manifest.name}: the recordings of {lost:,} of {len(units):,} units are not there, "
                     f"the first is {first}; at most {MISSING:,} may be missing beside as many as are there, name those"
                 )
-            as_it_was = bool(stamp) and stamps.get(entry.unit) == stamp
+            as_it_was = bool(stamp) and before == stamp
             if self.options.force or not as_it_was or record is None:
-                yield entry.unit, stamp
+                yield name, stamp
 
     def _tasks(self, stamps: Mapping[str, str], stage: Stage) -> Iterator[Task]:
         """Yield the tasks, as they are needed; units of another stamp whose contents are the same are left out."""
