@@ -18,11 +18,11 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, BinaryIO, Protocol, Self
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from fusion_core.errors import UnreadableFile, Unwritable
@@ -86,40 +86,65 @@ def read_whole(path: Path, most: int = FILE) -> bytes:
     return data
 
 
-def opened(content: bytes) -> NpzFile:
-    """Open a NumPy archive as `np.savez` writes it: no pickle, nothing compressed, so that it holds what it declares.
+def arrays_in(content: bytes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an archive as `np.savez` writes it: no objects, nothing compressed, so that it is as large.
 
     Raises ValueError or BadZipFile where it is anything else.
     """
-    archive = np.load(io.BytesIO(content), allow_pickle=False)
-    if not isinstance(archive, NpzFile) or archive.zip is None:
-        raise ValueError("it is no archive of arrays")
-    entries = archive.zip.infolist()
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries) or (
-        sum(entry.file_size for entry in entries) > len(content)
-    ):
-        raise ValueError("it is compressed, or declares more than it holds")
-    for entry in entries:
-        with archive.zip.open(entry) as file:
-            _check_array(file, f"the array '{entry.filename}'", entry.file_size)
-    return archive
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries) or (
+            sum(entry.file_size for entry in entries) > len(content)
+        ):
+            raise ValueError("it is compressed, or declares more than it holds")
+        return {
+            entry.filename.removesuffix(".npy"): _array(archive.read(entry), f"the array '{entry.filename}'")
+            for entry in entries
+        }
 
 
 def next_array(file: BinaryIO) -> NDArray[Any]:
     """Return the next array of a file as `np.save` writes it; raises ValueError or EOFError where it is none."""
     place = file.tell()
-    _check_array(file, "an array", os.fstat(file.fileno()).st_size - place)
+    shape, _, dtype = _header_of(file)
+    if math.prod(shape) * dtype.itemsize > os.fstat(file.fileno()).st_size - place:
+        raise ValueError("an array declares more than it holds")
     file.seek(place)
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def _check_array(file: IO[bytes], what: str, size: int) -> None:
-    """Read the header of an array; raises ValueError where it declares more bytes than there are."""
+_Header = tuple[tuple[int, ...], bool, np.dtype[Any]]  # shape, whether columns come first, and type
+
+
+def _header_of(file: IO[bytes]) -> _Header:
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    if math.prod(shape) * dtype.itemsize > size:
+    header: _Header = read(file)
+    return header
+
+
+@lru_cache(maxsize=256)
+def _known_header(text: bytes) -> _Header:
+    """Return the fields of a header: files of one kind have the same, and to parse one takes as long as its array.
+
+    Raises ValueError where it is none.
+    """
+    return _header_of(io.BytesIO(text))
+
+
+def _array(data: bytes, what: str) -> NDArray[Any]:
+    """Return an array as `np.save` writes it; raises ValueError where it is none, or declares more than there is."""
+    size = (
+        10 + int.from_bytes(data[8:10], "little")
+        if data[6:7] == b"\x01"
+        else (12 + int.from_bytes(data[8:12], "little"))
+    )
+    shape, by_columns, dtype = _known_header(data[:size])
+    if dtype.hasobject:
+        raise ValueError(f"{what} holds objects")
+    if math.prod(shape) * dtype.itemsize > len(data) - size:
         raise ValueError(f"{what} declares more than it holds")
+    return np.ndarray(shape, dtype, data, size, order="F" if by_columns else "C").copy()
 
 
 def rows_at_once(path: Path, what: str, size: int, row: float) -> int:

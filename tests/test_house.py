@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3612
+    assert 0 < count <= 3627
 
 
 def imports():
@@ -259,7 +259,7 @@ BUDGET = {
     "driftlab": 633,
     "driftlab/commands": 3759,
     "driftlab/evaluation": 1457,
-    "driftlab/family": 3252,
+    "driftlab/family": 3257,
     "driftlab/filtering": 1209,
     "driftlab/identification": 2155,
     "driftlab/live": 848,
@@ -275,7 +275,7 @@ BUDGET = {
     "driftlab/starter": 850,
     "driftlab/storage": 1269,
     "driftlab/triad": 585,
-    "fusion_core": 1840,
+    "fusion_core": 1855,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 737,
     "fusion_core/host": 748,

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,13 +236,20 @@ def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:
     return replace(rows, channels={}).coarsened(starts), [means(values, starts, rows.span) for values in columns]
 
 
+@lru_cache(maxsize=8)
+def _waves(R: int) -> tuple[Array, Array]:
+    """Return the waves (R, J) of placebos over R rows, and their products by pairs (R, J J)."""
+    waves = np.cos(np.pi * np.outer((np.arange(R) + 0.5) / R, np.arange(1, PLACEBOS + 1)))
+    return waves, (waves[:, :, None] * waves[:, None]).reshape(R, -1)
+
+
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:
     """Return r (R,) along the placebos (K, J) of e (R, K), each in its own deviation."""
     R, K = e.shape
-    waves = np.cos(np.pi * np.outer((np.arange(R) + 0.5) / R, np.arange(1, PLACEBOS + 1)))
+    waves, products = _waves(R)
     square = e * e
     with_e = square.T @ waves
-    G = (square.T @ (waves[:, :, None] * waves[:, None]).reshape(R, -1)).reshape(K, PLACEBOS, PLACEBOS)
+    G = (square.T @ products).reshape(K, PLACEBOS, PLACEBOS)
     with_Q = (Q.T @ (e[:, :, None] * waves[:, None]).reshape(R, -1)).reshape(-1, K, PLACEBOS).transpose(1, 2, 0)
     G -= with_Q @ with_Q.transpose(0, 2, 1) + with_e[:, :, None] * with_e[:, None] / size[:, None, None]
     b = (e * r[:, None]).T @ waves - with_e * along[:, None]

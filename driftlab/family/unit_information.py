@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.basis import SplineBasis
 from driftlab.soak.blocks import SoakRows
-from fusion_core.budget import opened
+from fusion_core.budget import arrays_in
 from fusion_core.chunk import Array
 
 
@@ -124,15 +124,15 @@ class UnitInformation:
     @classmethod
     def from_bytes(cls, content: bytes) -> UnitInformation:
         """Return the information that `to_bytes` wrote."""
-        with opened(content) as file:
-            first, intervals, step = file["knots"]
-            names = [name.split("/", 1) for name in file.files if "/" in name]
-            recordings = []
-            for k in sorted({int(number) for number, _ in names}):
-                own = {name: file[f"{k}/{name}"] for number, name in names if int(number) == k}
-                channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
-                recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
-            return cls(
-                str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
-                file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
-            )  # fmt: skip
+        file = arrays_in(content)
+        first, intervals, step = file["knots"]
+        names = [name.split("/", 1) for name in file if "/" in name]
+        recordings = []
+        for k in sorted({int(number) for number, _ in names}):
+            own = {name: file[f"{k}/{name}"] for number, name in names if int(number) == k}
+            channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
+            recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
+        return cls(
+            str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
+            file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
+        )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftlab.filtering.coasting import Coast
 from driftlab.filtering.segment import Stretches
-from fusion_core.budget import PIECE, opened, read_whole
+from fusion_core.budget import PIECE, arrays_in, read_whole
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment
 from fusion_core.errors import PluginError, UnreadableFile
@@ -49,9 +49,9 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint; raises UnreadableFile."""
     try:
-        with opened(read_whole(path, PIECE)) as archive:
-            content: dict[str, Any] = _alive(json.loads(str(archive["tree"])), archive)
-            return content
+        arrays = arrays_in(read_whole(path, PIECE))
+        content: dict[str, Any] = _alive(json.loads(str(arrays["tree"])), arrays)
+        return content
     except (OSError, ValueError, KeyError, TypeError, RecursionError, zipfile.BadZipFile) as error:
         raise UnreadableFile(f"{path}: is not a checkpoint ({error}); begin anew without --resume") from None
 
