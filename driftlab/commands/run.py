@@ -79,17 +79,14 @@ class RunResult(Result):
 
     def lines(self) -> list[str]:
         """Return the notes on the run, a sentence each."""
-        return [*remarks(self.run), *self._map_notes]
+        return [*remarks(self.run), *self._unused_map]
 
     @cached_property
-    def _map_notes(self) -> list[str]:
-        """Remarks on a map that has seen this recording, or on one beside the config that was not used."""
-        fitted, file, sensor = map_of(self.config), self.config.file, self.run.sensor
-        if fitted is not None:
-            name = Path(self.config.recording).name.partition("::")[0]
-            seen = {one.partition("::")[0] for one in fitted.record.provenance.get("recordings", "").split(", ")}
-            text = f"the map was fitted on {name}: where that is this file, judge the prediction by another recording"
-            return [text] * (name in seen)
+    def _unused_map(self) -> list[str]:
+        """A remark on a map beside the config that was not used."""
+        file, sensor = self.config.file, self.run.sensor
+        if map_of(self.config) is not None:
+            return []
         beside = Path() if file is None else file.with_name(f"{file.stem}.map.json")
         record = document(beside).get("record") if file is not None and not self.config.tracked_maps() else None
         if not isinstance(record, dict) or record.get("channel") != sensor.channel:
@@ -122,7 +119,7 @@ class RunResult(Result):
         write_json(folder / "summary.json", self.summary)
         recording = None if self.recorded is None else [str(self.recorded)]
         sheet = sheet_of(self.config, recording, judged=self.judged, plugins=self.summary["plugins"])
-        fitted, notes = map_of(self.config), self._map_notes
+        fitted, notes = map_of(self.config), self._unused_map
         page = page_of(self.run, self.summary, title=self.name, sheet=sheet, fitted=fitted, notes=notes)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if certificate:

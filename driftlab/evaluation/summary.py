@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from driftlab.evaluation.overview import ScoredRun
+from driftlab.evaluation.overview import ScoredRun, map_of
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.units import axis_name
@@ -78,7 +79,20 @@ def remarks(run: ScoredRun) -> list[str]:
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
-    return [*lines, *(line for sensor in model.sensors for line in _noise(sensor, first.noise_ratio))]
+    return [*lines, *(line for sensor in model.sensors for line in _noise(sensor, first.noise_ratio)), *_seen(run)]
+
+
+def _seen(run: ScoredRun) -> list[str]:
+    name = in_sample(run)
+    text = f"the map was fitted on {name}: where that is this file, judge the prediction by another recording"
+    return [text] * bool(name)
+
+
+def in_sample(run: ScoredRun) -> str:
+    """Return the name of the recording if the map was fitted on one of that name; empty otherwise."""
+    fitted, name = map_of(run.config), Path(run.config.recording or "").name.partition("::")[0]
+    known = "" if fitted is None else fitted.record.provenance.get("recordings", "")
+    return name if name in {one.partition("::")[0] for one in known.split(", ")} else ""
 
 
 def is_trusted(nis: NisTest) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from driftlab.evaluation.comparison import TO_THE_END, Columns, Comparison, notes, paper, ranking, verdict
 from driftlab.evaluation.overview import thin
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, over_axes
-from driftlab.evaluation.summary import Rows, error_pairs
+from driftlab.evaluation.summary import Rows, error_pairs, in_sample
 from driftlab.reports import charts
 from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Panel, Shade, series
 from driftlab.reports.pages import write_page
@@ -43,6 +43,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
         names=list(runs),
         verdict=verdict(runs),
         best=ranked.best if ranked is not None and len(runs) > 1 else (),
+        in_sample=[name for name, run in runs.items() if in_sample(run)],
         remarks=notes(runs),
         unit=sensor.shown,
         errors=_folded(scores, sensor.axes, unit),

@@ -1,6 +1,7 @@
 """The page of a comparison in a browser: what one decides from comes first, and a config can be switched off."""
 
 import hashlib
+import shutil
 
 import h5py
 import pytest
@@ -8,6 +9,7 @@ from browsers import colours, overflow
 from units_at_rest import unit_at_rest
 
 from driftlab.commands.compare import compare
+from driftlab.commands.fit_map import fit_map
 from driftlab.config import Config
 from driftlab.evaluation.comparison import verdict
 from driftlab.evaluation.scores import over_axes
@@ -143,3 +145,31 @@ def test_charts_show_what_was_estimated_and_where_it_moved(found):
     factor = found["constant"].sensor.factor
     assert line.y == pytest.approx((curves["coast"] - curves["reference"])[:, 2] * factor, nan_ok=True)
     assert line.high == pytest.approx(2 * curves["coast_sigma"][:, 2] * factor, nan_ok=True)
+
+
+def test_a_map_is_not_recommended_by_the_recording_that_it_was_fitted_on(tmp_path):
+    unit_at_rest(seconds=900, rate=2, temperature=lambda t: 20 + t / 50).write(tmp_path / "soak.h5")
+    shutil.copy(tmp_path / "soak.h5", tmp_path / "day.h5")
+    units = (("time", "s"), ("gyro", "rad/s"), ("temperature", "degC"))
+    source = {"kind": "hdf5", "channels": {name: {"path": name, "unit": unit} for name, unit in units}}
+
+    def config(recording, bias):
+        gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": bias}
+        return Config.model_validate(
+            {"source": {**source, "path": str(tmp_path / recording)}, "filter": {"gyro": gyro}}
+        )
+
+    fit_map(config("soak.h5", {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial"}}),
+            tmp_path / "soak.h5").save(tmp_path / "map.json")  # fmt: skip
+    known = {"kind": "polynomial", "path": str(tmp_path / "map.json")}
+    mapped = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": known}
+    said = []
+    for recording in ("soak.h5", "day.h5"):
+        both = {"mapped": config(recording, mapped), "constant": config(recording, {"kind": "constant"})}
+        compared = compare(both)
+        compared.save(tmp_path / recording.partition(".")[0])
+        page = (tmp_path / recording.partition(".")[0] / "report.html").read_text()
+        said.append((any("the map was fitted on soak.h5" in line for line in compared.lines()),
+                     "compare on another recording: the map of mapped was fitted on one of this name" in page,
+                     "run with" in page))  # fmt: skip
+    assert said == [(True, True, False), (False, False, True)]
