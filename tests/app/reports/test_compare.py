@@ -153,19 +153,16 @@ def test_a_map_is_not_recommended_by_the_recording_that_it_was_fitted_on(tmp_pat
     units = (("time", "s"), ("gyro", "rad/s"), ("temperature", "degC"))
     source = {"kind": "hdf5", "channels": {name: {"path": name, "unit": unit} for name, unit in units}}
 
-    def config(recording, bias):
-        gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": bias}
-        return Config.model_validate(
-            {"source": {**source, "path": str(tmp_path / recording)}, "filter": {"gyro": gyro}}
-        )
+    def config(recording, **of_map):
+        bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", **of_map}}
+        gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": bias if of_map else {"kind": "constant"}}
+        read = {**source, "path": str(tmp_path / recording)}
+        return Config.model_validate({"source": read, "filter": {"gyro": gyro}})
 
-    fit_map(config("soak.h5", {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial"}}),
-            tmp_path / "soak.h5").save(tmp_path / "map.json")  # fmt: skip
-    known = {"kind": "polynomial", "path": str(tmp_path / "map.json")}
-    mapped = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": known}
+    fit_map(config("soak.h5", order=3), tmp_path / "soak.h5").save(tmp_path / "map.json")
     said = []
     for recording in ("soak.h5", "day.h5"):
-        both = {"mapped": config(recording, mapped), "constant": config(recording, {"kind": "constant"})}
+        both = {"mapped": config(recording, path=str(tmp_path / "map.json")), "constant": config(recording)}
         compared = compare(both)
         compared.save(tmp_path / recording.partition(".")[0])
         page = (tmp_path / recording.partition(".")[0] / "report.html").read_text()
