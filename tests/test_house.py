@@ -271,7 +271,7 @@ BUDGET = {
     "driftlab/recordings": 454,
     "driftlab/reports": 3505,
     "driftlab/soak": 658,
-    "driftlab/spc": 1522,
+    "driftlab/spc": 1524,
     "driftlab/starter": 850,
     "driftlab/storage": 1269,
     "driftlab/triad": 585,

@@ -12,7 +12,7 @@ Changes of the line that an odd lot explains, and odd lots that a change of the 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -75,7 +75,7 @@ def line_of(
     rules : str, optional
         Run rules beside three sigma, one of `driftlab.spc.run_rules.RULES`.
     """
-    done = records.in_state("done") if isinstance(records, RecordsOfUnits) else _done(records)
+    done = _done(records)
     line, place = _ordered(done, unit)
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     part = _partial(line, baseline)
@@ -328,7 +328,9 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
     return tuple(rows)
 
 
-def _done(records: Iterable[UnitRecord]) -> list[UnitRecord]:
+def _done(records: Sequence[UnitRecord]) -> Sequence[UnitRecord]:
+    if isinstance(records, RecordsOfUnits):
+        return records.in_state("done")
     return [record for record in records if record.state == "done"]
 
 
