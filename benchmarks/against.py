@@ -1,8 +1,9 @@
 """This revision beside another one: `python against.py REV [--cases help,m10] [--pairs 3]`, in the repository.
 
 Both are installed into environments of their own, in a temporary folder, on the libraries of the environment that runs
-this, where a revision that needs others finds them (2aca0dbd: skl2onnx). Each case is run in turns, the other revision first in every second pair, so that what else the machine does hits
-both; the ratio of each pair is printed with the least and the largest. Below 1 this revision is the faster one.
+this, where a revision that needs others finds them (2aca0dbd: skl2onnx). Each case is run in turns, the other revision
+first in every second pair, so that what else the machine does hits both; the ratio of each pair is printed with the
+least and the largest. Below 1 this revision is the faster one.
 """
 
 from __future__ import annotations
