@@ -29,7 +29,7 @@ from driftlab.commands.result import Result
 from driftlab.evaluation.limits import Measured, verdict
 from driftlab.evaluation.measurements import normal
 from driftlab.evaluation.overview import ScoredRun, accumulator_of, map_of, scored
-from driftlab.evaluation.summary import is_trusted, remarks, summarise
+from driftlab.evaluation.summary import in_sample, is_trusted, remarks, summarise
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.recordings.identity import beforehand
@@ -144,9 +144,7 @@ class RunResult(Result):
         if fitted is None or measured is None:
             return []
         record, unit = fitted.record, self.run.unit
-        fitted_on = {name.partition("::")[0] for name in record.provenance.get("recordings", "").split(", ")}
-        names = [Path(str(one["name"])).name for one in sheet.recordings]
-        both = [name for name in names if name.partition("::")[0] in fitted_on]
+        both = in_sample(fitted, (str(one["name"]) for one in sheet.recordings))
         remarks = [f"the map was fitted on {name} too, so it predicts what it has seen" for name in both]
         if not both:
             remarks = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from driftlab.filtering.segment import RunLog
 from driftlab.units import axis_name
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest
-from fusion_core.contracts import Sensor
+from fusion_core.contracts import FittedMap, Sensor
 from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
@@ -83,16 +83,16 @@ def remarks(run: ScoredRun) -> list[str]:
 
 
 def _seen(run: ScoredRun) -> list[str]:
-    name = in_sample(run)
-    text = f"the map was fitted on {name}: where that is this file, judge the prediction by another recording"
-    return [text] * bool(name)
+    names = (name.partition("::")[0] for name in in_sample(map_of(run.config), [run.config.recording]))
+    text = "the map was fitted on {}: where that is this file, judge the prediction by another recording"
+    return [text.format(name) for name in names]
 
 
-def in_sample(run: ScoredRun) -> str:
-    """Return the name of the recording if the map was fitted on one of that name; empty otherwise."""
-    fitted, name = map_of(run.config), Path(run.config.recording or "").name.partition("::")[0]
+def in_sample(fitted: FittedMap | None, recordings: Iterable[str]) -> list[str]:
+    """Return the names of recordings without their folders, of those that are named as one that a map was fitted on."""
     known = "" if fitted is None else fitted.record.provenance.get("recordings", "")
-    return name if name in {one.partition("::")[0] for one in known.split(", ")} else ""
+    seen = {name.partition("::")[0] for name in known.split(", ") if name}
+    return [name for name in (Path(path).name for path in recordings) if name.partition("::")[0] in seen]
 
 
 def is_trusted(nis: NisTest) -> bool:

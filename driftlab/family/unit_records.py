@@ -94,7 +94,7 @@ class UnitRecords:
         rows = np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
         table, codes = np.full((2, len(units), d), np.nan), np.asarray(self._codes)[rows]
         for code in np.unique(codes):
-            axes, names = (self._common[code][k] for k in (6, -1))
+            *_, axes, _, _, names = self._common[code]
             if name not in names or len(axes) != d:
                 continue
             of_code, at = np.flatnonzero(codes == code), d * names.index(name) + np.arange(d)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.evaluation.comparison import TO_THE_END, Columns, Comparison, notes, paper, ranking, verdict
-from driftlab.evaluation.overview import thin
+from driftlab.evaluation.overview import map_of, thin
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, over_axes
 from driftlab.evaluation.summary import Rows, error_pairs, in_sample
 from driftlab.reports import charts
@@ -43,7 +43,7 @@ def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, S
         names=list(runs),
         verdict=verdict(runs),
         best=ranked.best if ranked is not None and len(runs) > 1 else (),
-        in_sample=[name for name, run in runs.items() if in_sample(run)],
+        in_sample=[name for name, run in runs.items() if in_sample(map_of(run.config), [run.config.recording])],
         remarks=notes(runs),
         unit=sensor.shown,
         errors=_folded(scores, sensor.axes, unit),
