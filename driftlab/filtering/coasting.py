@@ -78,10 +78,11 @@ def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
     n = len(P)
     for k in range(len(variance)):
         F_k, Q_k = F[min(k, len(F) - 1)], Q[min(k, len(Q) - 1)]
-        for i in range(n):
-            for j in range(n):
-                if i != j and (F_k[i, j] != 0 or Q_k[i, j] != 0 or P[i, j] != 0):
-                    return False
+        if k < max(len(F), len(Q)):  # else the same as before
+            for i in range(n):
+                for j in range(n):
+                    if i != j and (F_k[i, j] != 0 or Q_k[i, j] != 0 or P[i, j] != 0):
+                        return False
         for i in range(n):
             P[i, i] = variance[k, i] = F_k[i, i] ** 2 * P[i, i] + Q_k[i, i]
     return True
@@ -298,7 +299,6 @@ class Prediction:
         tracked, fitted = plan.model.tracked, plan.fitted
         self.block = plan.model.places[tracked.channel]
         self.effects = isinstance(tracked.bias, ThermalBias) and bool(tracked.bias.effects)
-        self.initial_error = plan.initial_error
         self.first = first
         self.coast: Coast | None = None  # from the end of the first alignment on
         known = NO_STEPS if fitted is None else fitted.record.steps
@@ -326,17 +326,12 @@ class Prediction:
         if self.coast is not None:
             self.uncertainty.resume(self.coast)
 
-    def depart(self, state: State, after: Chunk) -> State:
-        """End the alignment with the epochs that come after it; return the state that the filter goes on from."""
-        at = after if after.previous is None else after.previous
-        T_0 = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
+    def depart(self, state: State, T_0: float) -> None:
+        """Begin to predict from the state at the end of the alignment, at T_0 in degC (NaN: not known)."""
         block = self.block
         self.coast = Coast(state.x[block], state.P[block, block], self.first.t, T_0)
         self.uncertainty.depart(self.coast)
         self.departed = self.extrapolation.memory.last
-        error = np.zeros(len(state.x))
-        error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
-        return State(state.x + error, state.P)
 
     def look(self, done: Chunk, estimates: Estimates, step: Transition, tilt: Array, calibration: Array) -> BiasOutput:
         """Return the bias over the next epochs, whose block went by `step`; `calibration` (N, d) was subtracted.

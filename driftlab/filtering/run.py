@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing, contextmanager, suppress
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from driftlab.filtering.setup import (
     needed_channels,
     prior_at,
 )
-from driftlab.filtering.tracker import Tracker
+from driftlab.filtering.tracker import Filtered, Segments, Tracker
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.prefetch import prefetch
 from driftlab.recordings.screening import read
@@ -38,6 +38,14 @@ from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT
 from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
+
+
+class Moment(NamedTuple):
+    """The state of the filter between two chunks of epochs: the time in s, the tracker's snapshot, its alignments."""
+
+    t: float
+    tracker: dict[str, Any]
+    alignments: list[Alignment]
 
 
 class Run:
@@ -90,11 +98,11 @@ class Run:
                 f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
             )
         stream = epochs(read(self.config, self.journal.faults), self.model.update_interval)
-        return self._filtered(prefetch(self._prepared(stream)))
+        return self._segments(self._prepared(stream), prefetch)
 
     def over(self, stream: Iterable[Chunk]) -> Generator[RunSegment]:
         """Yield the stretches of a stream of epochs."""
-        return self._filtered(self._prepared(stream))
+        return self._segments(self._prepared(stream), lambda items: items)
 
     def _prepared(self, stream: Iterable[Chunk]) -> Generator[Chunk]:
         """Yield the epochs, checked and with the rate of their temperature."""
@@ -113,9 +121,23 @@ class Run:
             self._note_beyond_effects(chunk)
             yield chunk
 
-    def _filtered(self, stream: Generator[Chunk]) -> Generator[RunSegment]:
-        tracker, waiting = self._resumed(), FirstRest(self.plan)
-        done = -np.inf if self.resume is None else self.resume["t"]
+    def _segments(
+        self, stream: Generator[Chunk], beside: Callable[[Generator[Any]], Generator[Any]]
+    ) -> Generator[RunSegment]:
+        """Yield the segments of a stream of epochs; `beside` has another thread make what is asked for."""
+        tracker, segments = self._resumed()
+        with closing(beside(self._filtered(beside(stream), tracker))) as parts:
+            for part in parts:
+                if isinstance(part, Moment):
+                    assert self.settled is not None, "who did not ask for moments gets none"
+                    assert segments is not None, "a moment comes after epochs"
+                    self.settled(partial(self._snapshot, part, segments))
+                else:
+                    segments = segments or Segments(self.plan, self.journal)
+                    yield segments.segment(part)
+
+    def _filtered(self, stream: Generator[Chunk], tracker: Tracker | None) -> Generator[Filtered | Moment]:
+        waiting, done = FirstRest(self.plan), -np.inf if self.resume is None else self.resume["t"]
         with closing(stream), self._timed_errors():
             for chunk in stream:
                 chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
@@ -127,7 +149,7 @@ class Run:
                 yield from tracker.advance(chunk)
                 done = float(chunk.t[-1])
                 if self.settled is not None:
-                    self.settled(partial(self._snapshot, tracker, done))
+                    yield Moment(done, tracker.snapshot(), list(self.journal.alignments))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
 
@@ -149,25 +171,25 @@ class Run:
         state = prior_at(self.model, chunk, waiting.alignment)
         return Tracker(self.plan, self.journal, waiting.alignment, state)
 
-    def _resumed(self) -> Tracker | None:
+    def _resumed(self) -> tuple[Tracker, Segments] | tuple[None, None]:
         if self.resume is None:
-            return None
+            return None, None
         try:
             self.journal.alignments[:] = self.resume["alignments"]
             self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
-            return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+            tracker = Tracker.of(self.plan, self.journal, self.resume["tracker"])
+            return tracker, Segments.of(self.plan, self.journal, self.resume["segments"])
         except (AttributeError, LookupError, TypeError, ValueError) as error:
             raise ConfigError(
                 f"--resume: the checkpoint is not laid out as this version of driftlab writes it ({error}); begin anew "
                 "without --resume"
             ) from None
 
-    def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
+    def _snapshot(self, moment: Moment, segments: Segments) -> dict[str, Any]:
         journal = self.journal
         return {
-            "t": t,
-            "tracker": tracker.snapshot(),
-            "alignments": list(journal.alignments),
+            **moment._asdict(),
+            "segments": segments.snapshot(),
             "moving": journal.moving,
             "refused": journal.refused,
         }

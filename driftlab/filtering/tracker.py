@@ -1,7 +1,8 @@
 """Tracker: the filter after its alignment, its state and memories, and the run of epochs through it.
 
-Its estimates are checked to be finite. Motion is monitored, and so is a rest at another bias or attitude, where the
-filter begins anew.
+Its estimates are checked to be finite. A rest at another bias or attitude, where the filter begins anew, is looked for
+in what it refuses. What else is said of the epochs feeds nothing back to it, and is made after it, of what it yields:
+motion, the prediction and the deviations (`Segments`).
 """
 
 from __future__ import annotations
@@ -46,6 +47,26 @@ SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bound
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
+class Departure(NamedTuple):
+    """The end of the alignment, from which on the bias is predicted: the state there and the temperature in degC."""
+
+    state: State
+    T: float  # NaN where there is no thermometer
+
+
+class Filtered(NamedTuple):
+    """Epochs with their estimates."""
+
+    epochs: Chunk
+    calibration: Array  # (N, d) of the tracked sensor
+    estimates: Estimates
+    step: Transition  # of the tracked sensor's block
+    alignment: Alignment
+    departure: Departure | None  # that comes before them
+    began: State | None
+    equations: tuple[Transition, Measurement] | None
+
+
 class _Piece(NamedTuple):
     """Epochs that last alike: as measured, what calibrations subtract, the steps of the bias blocks."""
 
@@ -82,8 +103,9 @@ class Tracker:
         self.fresh = True  # whether it is a prior
         self.memories: list[Memory] = [None] * len(plan.model.sensors)
         self.tracked = [sensor.channel for sensor in plan.model.sensors].index(plan.model.tracked.channel)
-        self.watch, self.realigning = RestMonitor(plan, journal), Realigning(plan)
-        self.prediction = Prediction(plan, self.first)
+        self.realigning = Realigning(plan)
+        self.aligning = True  # up to the end of the first alignment
+        self.departure: Departure | None = None  # of the next epochs
 
     def snapshot(self) -> dict[str, Any]:
         """Return the tracker's state; between two calls of `advance`."""
@@ -92,9 +114,8 @@ class Tracker:
             "state": self.state,
             "fresh": self.fresh,
             "memories": self.memories,
-            "watch": self.watch.memory,
             "refused": self.realigning.refused,
-            "prediction": self.prediction.snapshot(),
+            "aligning": self.aligning,
         }
 
     @classmethod
@@ -102,11 +123,10 @@ class Tracker:
         """Return the tracker that goes on from a snapshot; the journal knows the alignments already."""
         tracker = cls(plan, journal, snapshot["alignment"], snapshot["state"])
         tracker.fresh, tracker.memories = snapshot["fresh"], snapshot["memories"]
-        tracker.watch.memory, tracker.realigning.refused = snapshot["watch"], snapshot["refused"]
-        tracker.prediction.restore(snapshot["prediction"])
+        tracker.realigning.refused, tracker.aligning = snapshot["refused"], snapshot["aligning"]
         return tracker
 
-    def advance(self, chunk: Chunk) -> Iterator[RunSegment]:
+    def advance(self, chunk: Chunk) -> Iterator[Filtered]:
         """Yield the estimates of the next epochs."""
         for piece in self._pieces(chunk):
             start = 0
@@ -123,7 +143,8 @@ class Tracker:
                 done = piece.epochs.part(start, start + N)
                 self.state, self.fresh = estimates.state, False
                 calibration = piece.calibration[start : start + N]
-                yield self._stretch(done, calibration, estimates, own, began, equations)
+                departure, self.departure = self.departure, None
+                yield Filtered(done, calibration, estimates, own, self.alignment, departure, began, equations)
                 start += N
                 self._align_anew(done, estimates, piece, start)
 
@@ -132,8 +153,8 @@ class Tracker:
         for regular in regular_pieces(chunk, self.first.dt):
             at = int(np.searchsorted(regular.t, self.first.t, side="right"))
             for epochs in (regular.part(*ends) for ends in ((0, at), (at, len(regular))) if ends[0] < ends[1]):
-                if epochs.t[0] > self.first.t and self.prediction.coast is None:
-                    self.state = self.prediction.depart(self.state, epochs)
+                if epochs.t[0] > self.first.t and self.aligning:
+                    self._depart(epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
                 less = subtracted(epochs, self.plan.calibrations, self.plan.followed)
@@ -170,27 +191,52 @@ class Tracker:
         _, memories = bias_steps(self.model, piece.epochs.part(0, stop), piece.before)  # as of now
         self.state, self.fresh = prior_again(self.model, memories, alignment), True
 
-    def _stretch(
-        self,
-        done: Chunk,
-        calibration: Array,
-        estimates: Estimates,
-        step: Transition,
-        began: State | None,
-        equations: tuple[Transition, Measurement] | None,
-    ) -> RunSegment:
-        channel = self.model.tracked.channel
-        still = self.watch.look(done, estimates)
-        output = self.prediction.look(done, estimates, step, self.alignment.unsure, calibration)
+    def _depart(self, after: Chunk) -> None:
+        """End the alignment with the epochs that come after it; from here on the filter has the plan's error."""
+        at = after if after.previous is None else after.previous
+        T = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
+        self.departure, self.aligning = Departure(self.state, T), False
+        error, tracked = np.zeros(len(self.state.x)), self.model.tracked
+        start = self.model.places[tracked.channel].start
+        error[start : start + len(tracked.axes)] = self.plan.initial_error
+        self.state = State(self.state.x + error, self.state.P)
+
+
+class Segments:
+    """What is said of filtered epochs: motion, the bias and its prediction with all parts of their deviations."""
+
+    def __init__(self, plan: RunSetup, journal: RunLog) -> None:
+        self.model = plan.model
+        self.watch, self.prediction = RestMonitor(plan, journal), Prediction(plan, journal.alignments[0])
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state so far."""
+        return {"watch": self.watch.memory, "prediction": self.prediction.snapshot()}
+
+    @classmethod
+    def of(cls, plan: RunSetup, journal: RunLog, snapshot: dict[str, Any]) -> Segments:
+        """Return those that go on from a snapshot; the journal knows the alignments already."""
+        segments = cls(plan, journal)
+        segments.watch.memory = snapshot["watch"]
+        segments.prediction.restore(snapshot["prediction"])
+        return segments
+
+    def segment(self, filtered: Filtered) -> RunSegment:
+        """Return the segment of the next epochs."""
+        done, alignment = filtered.epochs, filtered.alignment
+        still = self.watch.look(done, filtered.estimates)
+        if filtered.departure is not None:
+            self.prediction.depart(*filtered.departure)
+        output = self.prediction.look(done, filtered.estimates, filtered.step, alignment.unsure, filtered.calibration)
         return RunSegment(
             epochs=done,
-            rate=done[channel] - self.model.known(done, self.alignment),
+            rate=done[self.model.tracked.channel] - self.model.known(done, alignment),
             **output._asdict(),
-            calibration=calibration,
+            calibration=filtered.calibration,
             still=still,
-            estimates=estimates,
-            began=began,
-            model=equations,
+            estimates=filtered.estimates,
+            began=filtered.began,
+            model=filtered.equations,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -70,15 +71,19 @@ def _make(items: Iterable[Any], queue: Queue[tuple[bool, Any]], left: threading.
 
 
 @contextmanager
-def aside() -> Iterator[Callable[[Callable[[Item], object], Item], None]]:
-    """Give a callable that has another thread do `function(item)`, after the one before, whose error it raises."""
+def aside(depth: int = 4) -> Iterator[Callable[[Callable[[Item], object], Item], None]]:
+    """Give a callable that has another thread do `function(item)`, one after the other, up to `depth` of them later.
+
+    It raises the error of an earlier one.
+    """
     with ThreadPoolExecutor(1) as thread:
-        under_way: Future[object] = thread.submit(int)
+        under_way: deque[Future[object]] = deque()
 
         def do(function: Callable[[Item], object], item: Item) -> None:
-            nonlocal under_way
-            under_way.result()
-            under_way = thread.submit(function, item)
+            while under_way and (len(under_way) >= depth or under_way[0].done()):
+                under_way.popleft().result()
+            under_way.append(thread.submit(function, item))
 
         yield do
-        under_way.result()
+        for one in under_way:
+            one.result()

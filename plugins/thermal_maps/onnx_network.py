@@ -25,7 +25,7 @@ other hands with one is taken too, where it is made of the operations of `onnx_g
 is run: where it gives the bias, `slope` needs a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any
 such graph will do.
 The last bits may depend on how many samples are asked for at once (1e-12 of the map's range): matrix products
-are summed in another order.
+are summed in another order, and MANY samples are read from a table of the graph where that is as exact (`curve_table`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ from fusion_core.thermal.soak_noise import Blocks, Smoother
 from fusion_plugins.thermal_maps import network as net
 from fusion_plugins.thermal_maps import onnx_graph
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
+from fusion_plugins.thermal_maps.curve_table import CurveTable
 from fusion_plugins.thermal_maps.onnx_graph import KEY
+
+MANY = 4096  # temperatures at once from which on a table takes less time than the graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,10 @@ class OnnxMap(contracts.FittedMap):
         return session, inputs[0].name, numbers, len(inputs[0].shape) == 1
 
     @cached_property
+    def _table(self) -> CurveTable | None:
+        return CurveTable.of(self._asked, self.domain)
+
+    @cached_property
     def _chain(self) -> onnx_graph.Chain:
         steps = onnx_graph.read_chain(self.graph, self.name)
         T = np.linspace(*self.domain, 5)
@@ -104,9 +111,15 @@ class OnnxMap(contracts.FittedMap):
         return onnx_graph.derive(self._chain, T)[1] if self.constant is None else self._run(T)
 
     def _run(self, T: Array) -> Array:
+        if len(T) == 0:
+            return np.empty((0, self.record.d))
+        if len(T) >= MANY and self._table is not None and self._table.covers(T):
+            return self._table.at(T)
+        return self._asked(T)
+
+    def _asked(self, T: Array) -> Array:
+        """Return what the graph gives at T, as onnxruntime works it out."""
         N, d = len(T), self.record.d
-        if N == 0:
-            return np.empty((0, d))
         try:
             session, name, numbers, flat = self._session
             values = T.astype(numbers)

@@ -132,9 +132,10 @@ def test_another_config_is_not_continued(recording):
 
 
 @pytest.mark.parametrize("broken", [
-    lambda tracker: tracker.pop("prediction"),
-    lambda tracker: _shortened(tracker["prediction"], "thermometer"),
-    lambda tracker: _shortened(tracker["prediction"], "uncertainty"),
+    lambda found: found["tracker"].pop("refused"),
+    lambda found: found["segments"].pop("prediction"),
+    lambda found: _shortened(found["segments"]["prediction"], "thermometer"),
+    lambda found: _shortened(found["segments"]["prediction"], "uncertainty"),
 ])  # fmt: skip
 def test_a_checkpoint_of_another_layout_is_not_continued(recording, broken):
     config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
@@ -143,7 +144,7 @@ def test_a_checkpoint_of_another_layout_is_not_continued(recording, broken):
     list(run)
     write_checkpoint(recording / "checkpoint.npz", kept[-1])
     found = read_checkpoint(recording / "checkpoint.npz")
-    broken(found["tracker"])
+    broken(found)
     with pytest.raises(ConfigError, match="the checkpoint is not laid out as this version of driftlab writes it"):
         list(Run(config, RunLog(), resume=found))
 
