@@ -63,8 +63,9 @@ paper: $(VENV)/ready
 turntable: $(VENV)/ready
 	$(VENV)/bin/python examples/11_turntable/run.py
 
-# the tables of docs/reference/performance.md, side by side with filterpy, Eigen and polars (fifteen minutes, 10 GB of disk)
+# the tables of docs/reference/performance.md, side by side with other filters and polars (fifteen minutes, 10 GB of disk)
 bench: $(VENV)/ready
+	$(VENV)/bin/$(PIP_INSTALL) --editable '.[peers]'
 	$(VENV)/bin/python benchmarks/run_all.py
 	# from the last byte of a frame to the estimate, at 1 kHz through a pty (two minutes)
 	$(VENV)/bin/python benchmarks/live_latency.py
@@ -89,7 +90,7 @@ $(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
 # programs that tests run, from Debian, where one is missing (as root): a browser that looks at pages, compilers and an
 # emulator for C code, Octave for .mat files
 TOOLS := gcc:gcc g++:g++ arm-none-eabi-gcc:gcc-arm-none-eabi qemu-arm:qemu-user octave-cli:octave pdftotext:poppler-utils
-BESIDE := fonts-dejavu-core libc6-dev libnewlib-arm-none-eabi
+BESIDE := fonts-dejavu-core libc6-dev libeigen3-dev libnewlib-arm-none-eabi
 tools:
 	@missing="$$(for tool in $(TOOLS); do command -v $${tool%%:*} >/dev/null || echo $${tool##*:}; done)"; \
 	command -v chromium chromium-browser google-chrome >/dev/null || missing="$$missing chromium"; \

@@ -8,7 +8,18 @@ from pathlib import Path
 
 from common import machine
 
-NAMES = ("install_size", "methods", "accuracy", "streaming", "growth", "explain", "dataflash", "end_to_end", "fleet")
+NAMES = (
+    "install_size",
+    "methods",
+    "peers",
+    "accuracy",
+    "streaming",
+    "growth",
+    "explain",
+    "dataflash",
+    "end_to_end",
+    "fleet",
+)
 
 
 def main() -> None:

@@ -153,6 +153,8 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
     text += f" (two sigma); with the bias alone taken off, up to {number(alone)} {shown} of it were wrong."
     if np.any(fit.free & ~fit.observable):
         text += " Terms that are not observable count as 1 % or 10 mrad."
+    if not fit.has_bias:
+        return f"{text} The bias is that of the map which the config names."
     hour, hourly = HOURLY[unit.si]
     level = 2 * float(np.max(sigma[list(BIAS)])) * hour
     return f"{text} The bias adds up to {number(level)} {hourly} (two sigma), and what it wanders afterwards."
@@ -168,7 +170,7 @@ def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
 
     bias = Chart(axis_panels(tuple(AXES), lines, "bias", unit.shown), TEMPERATURE, "Bias", "Bands: two sigma.")
     strained = [_sensitivity_chart(fit, unit)] if len(fit.names) > len(TERMS) else []
-    return [chart(fit, unit), bias, *strained, _residual_chart(fit, unit)]
+    return [chart(fit, unit), *([bias] if fit.has_bias else []), *strained, _residual_chart(fit, unit)]
 
 
 def _sensitivity_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
@@ -231,7 +233,7 @@ def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Seque
     terms = "scale factor, misalignment and g-sensitivity" if strained else "scale factor and misalignment"
     return page(
         "triad",
-        title=f"Bias, {terms} of the {channel}",
+        title=f"{'Bias, s' if fit.has_bias else 'S'}{terms[1:]} of the {channel}",
         lead=lead,
         sheet=sheet,
         result=result(fit, unit, channel),

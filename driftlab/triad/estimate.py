@@ -6,13 +6,14 @@ n coefficients, q terms, N temperatures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.triad.model import GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
+from driftlab.triad.model import BIAS, GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, MatrixCurve, TriadInput, TriadMatrix
 
@@ -34,7 +35,7 @@ class TriadFit:
     usual : (q,) array
         Sizes of the terms of a usual unit, beside which a deviation is large or small.
     free : (q,) array of bool
-        Terms that were looked for.
+        Terms that were looked for, and are of the map.
     observable : (q,) array of bool
         Terms that the stimulus shows; the others are zero.
     unobservable_changes : (q,) array of bool
@@ -73,6 +74,17 @@ class TriadFit:
     def names(self) -> tuple[str, ...]:
         """Names of the q terms."""
         return (*TERMS, *SENSITIVITIES)[: len(self.free)]
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether the bias is of the map."""
+        return bool(np.any(self.free[list(BIAS)]))
+
+    def without_bias(self) -> Self:
+        """Return the fit for a map whose bias is another's: that of these equations is none of its terms."""
+        free = self.free.copy()
+        free[list(BIAS)] = False
+        return replace(self, free=free, level=0.0)
 
     @cached_property
     def grid(self) -> Array:

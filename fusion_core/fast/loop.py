@@ -61,11 +61,13 @@ class SampleStep(NamedTuple):
     """The step to a sample and its measurement, group by group."""
 
     F: Array  # (G, s, s)
+    F_t: Array  # (G, s, s) transposed
     Q: Array  # (G, s, s)
     H: Array  # (G, c, s)
     u: Array  # (G, s)
     x: Array  # (s,) predicted, of one group
     w: Array  # (s,) scratch
+    q: Array  # (s,) scratch
 
 
 class InnovationSums(NamedTuple):
@@ -92,6 +94,8 @@ class SampleArrays(NamedTuple):
     root: Array  # (N, G, c) one over the deviation of its innovation; 0 where nothing was measured
 
 
+Four = tuple[float, float, float, float]
+ONE, TWO, THREE, FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
 
 
@@ -125,7 +129,7 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
         for i in range(len(places.s)):
             for j in range(len(places.s)):
                 if F_anew and states[i] < n and states[j] < n:
-                    step.F[g, i, j] = model.F[k, states[i], states[j]]
+                    step.F[g, i, j] = step.F_t[g, j, i] = model.F[k, states[i], states[j]]
                 if Q_anew and j <= i and states[i] < n and states[j] < n:
                     step.Q[g, i, j] = model.Q[k, states[i], states[j]]
                     symmetric &= step.Q[g, i, j] == model.Q[k, states[j], states[i]]
@@ -138,19 +142,46 @@ def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bo
 
 
 @inlined
-def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array) -> None:
-    """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored."""
+def four_sums(s: Size, a: Array, B: Array, j: int, sums: Four) -> Four:
+    """Return four sums with the products of a (s,) and columns j to j + 3 of B (s, s) added, in the states' order.
+
+    None waits for another, and a processor does them as one.
+    """
+    a_0, a_1, a_2, a_3 = sums
+    for k in range(len(s)):
+        f = a[k]
+        a_0, a_1 = a_0 + f * B[k, j], a_1 + f * B[k, j + ONE]
+        a_2, a_3 = a_2 + f * B[k, j + TWO], a_3 + f * B[k, j + THREE]
+    return a_0, a_1, a_2, a_3
+
+
+@inlined
+def predict(
+    s: Size, x: Array, P: Array, F: Array, F_t: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array
+) -> None:
+    """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored; F_t is F'."""
     for i in range(len(s)):
-        total = u[i]
+        total, row = u[i], F[i]
         for j in range(len(s)):
-            total += F[i, j] * x[j]
+            total += row[j] * x[j]
         x_new[i] = total
-        for j in range(len(s)):
+        for b in range(len(s) // 4):
+            j = FOUR * np.uint64(b)
+            w[j], w[j + ONE], w[j + TWO], w[j + THREE] = four_sums(s, row, P, j, (0.0, 0.0, 0.0, 0.0))
+        for j in range(len(s) // 4 * 4, len(s)):
             total = 0.0
             for k in range(len(s)):
-                total += F[i, k] * P[k, j]
+                total += row[k] * P[k, j]
             w[j] = total
-        for j in range(i + 1):
+        for b in range((i + 1) // 4):
+            j = FOUR * np.uint64(b)
+            noise = Q[i, j], Q[i, j + ONE], Q[i, j + TWO], Q[i, j + THREE]
+            sums = four_sums(s, w, F_t, j, noise)
+            P_new[i, j] = P_new[j, i] = sums[0]
+            P_new[i, j + ONE] = P_new[j + ONE, i] = sums[1]
+            P_new[i, j + TWO] = P_new[j + TWO, i] = sums[2]
+            P_new[i, j + THREE] = P_new[j + THREE, i] = sums[3]
+        for j in range((i + 1) // 4 * 4, i + 1):
             total = Q[i, j]
             for k in range(len(s)):
                 total += w[k] * F[j, k]
@@ -158,36 +189,57 @@ def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Ar
 
 
 @inlined
-def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
+def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array, q: Array) -> tuple[float, float]:
     """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s, NaN where P is too wide.
 
-    Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored; p (s,) is left behind::
+    Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored; p and q (s,) are left behind::
 
         p = P h',  s = h p + r,  K = p / s
-        B = P - K p',  P = B - (B h') K' + K r K'
+        B = P - K p',  q = B h',  P = B - q K' + K r K'
     """
-    y, S, widest = z, r, 0.0
-    for i in range(len(s)):
+    for b in range(len(s) // 4):
+        i = FOUR * np.uint64(b)
+        p[i], p[i + ONE], p[i + TWO], p[i + THREE] = four_sums(s, h, P, i, (0.0, 0.0, 0.0, 0.0))
+    for i in range(len(s) // 4 * 4, len(s)):
         total = 0.0
         for j in range(len(s)):
             total += P[i, j] * h[j]
         p[i] = total
-        S += h[i] * total
+    y, S, widest = z, r, 0.0
+    for i in range(len(s)):
+        S += h[i] * p[i]
         y -= h[i] * x[i]
         widest += h[i] * h[i] * P[i, i]
     inverse = 1.0 / S if widest <= WIDE * r else np.nan
+    covariance_left(s, P, h, p, inverse, q)
     for i in range(len(s)):
         K_i = p[i] * inverse
         x[i] += K_i * y
-        q = 0.0
-        for j in range(len(s)):
-            q += (P[i, j] - K_i * p[j]) * h[j]
-        surplus = (r * K_i - q) * inverse - K_i  # of row i: -K_i but for rounding
+        surplus = (r * K_i - q[i]) * inverse - K_i  # of row i: -K_i but for rounding
         for j in range(i, len(s)):
             P[i, j] += surplus * p[j]
         for j in range(i):
             P[i, j] = P[j, i]
     return y, inverse
+
+
+@inlined
+def covariance_left(s: Size, P: Array, h: Array, p: Array, inverse: float, q: Array) -> None:
+    """Do q = (P - K p') h', the covariance of the states with z that is left, with K = p `inverse`."""
+    for b in range(len(s) // 4):
+        i = FOUR * np.uint64(b)
+        a_0 = a_1 = a_2 = a_3 = 0.0
+        K_0, K_1, K_2, K_3 = p[i] * inverse, p[i + ONE] * inverse, p[i + TWO] * inverse, p[i + THREE] * inverse
+        for j in range(len(s)):
+            f, c = p[j], h[j]
+            a_0, a_1 = a_0 + (P[j, i] - K_0 * f) * c, a_1 + (P[j, i + ONE] - K_1 * f) * c
+            a_2, a_3 = a_2 + (P[j, i + TWO] - K_2 * f) * c, a_3 + (P[j, i + THREE] - K_3 * f) * c
+        q[i], q[i + ONE], q[i + TWO], q[i + THREE] = a_0, a_1, a_2, a_3
+    for i in range(len(s) // 4 * 4, len(s)):
+        K_i, total = p[i] * inverse, 0.0
+        for j in range(len(s)):
+            total += (P[i, j] - K_i * p[j]) * h[j]
+        q[i] = total
 
 
 @inlined
@@ -209,7 +261,7 @@ def measure(
         h = step.H[g, c]
         for j in range(len(s)):
             innovation -= h[j] * step.x[j]
-        y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w)
+        y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w, step.q)
         white = y * np.sqrt(inverse)
         results.y[k, row], results.white[k, row] = innovation, white
         if len(places.gains):
@@ -237,18 +289,18 @@ def recursive(
     x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
     x, P = x.copy(), P.copy()
     F, H = np.zeros((G, s, s)), np.zeros((G, len(places.c), s))
-    step = SampleStep(F, F.copy(), H, np.zeros((G, s)), np.zeros(s), np.zeros(s))
+    step = SampleStep(F, F.copy(), F.copy(), H, np.zeros((G, s)), np.zeros(s), np.zeros(s), np.zeros(s))
     for k in range(len(data.z)):
         sums = InnovationSums(0.0, 0.0, 1.0, 0)
         for g in range(G):
             if not gather(places, g, model, k, step) and uneven(model.Q[k]):
                 return x, P, k
-            predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
+            predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
             sums = measure(places, g, model, data, k, x_[g], P_[g], step, sums, results)
         used = sums.dof > 0 and sums.nis <= data.gates[sums.dof]
         if not used and sums.dof > 0:
             for g in range(G):
-                predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
+                predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
         x, P, x_, P_ = x_, P_, x, P
         log_det = sums.log_det - np.log(sums.inverse)
         check = sums.nis + log_det
@@ -288,14 +340,14 @@ def single(
     if not ordinary:
         return False
     w, x_, P_ = of_x[1], of_x[2], of_x[3:]
-    predict(x, x, P, F, Q, u, x_, P_, w)
+    predict(x, x, P, F, F.T, Q, u, x_, P_, w)
     for i in range(m):
         of_z[0, i] = z[i]
         for j in range(n):
             of_z[0, i] -= H[i, j] * x_[j]
     sums[0] = sums[1] = 0.0
     for i in range(m):
-        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w)
+        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w, of_x[0])
         of_z[1, i] = y * np.sqrt(inverse)
         sums[0] += of_z[1, i] ** 2
         sums[1] -= np.log(inverse)
@@ -314,15 +366,15 @@ def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Arr
     its innovation (N, D, c), and log_det (N, D).
     """
     s = P.shape[2]
-    nothing, p, w = np.zeros(s), np.empty(s), np.empty(s)
+    nothing, p, w, q = np.zeros(s), np.empty(s), np.empty(s), np.empty(s)
     x, u, log_det = np.zeros(s), np.zeros(s), np.zeros((N, len(P)))
     all_P, all_K, root = np.empty((N, *P.shape)), np.empty((N, *H.shape)), np.empty((N, *r.shape))
     for k in range(N):
         for g in range(len(P)):
             before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
-            predict(x, nothing, before, F[g], Q[g], u, x, after, w)
+            predict(x, nothing, before, F[g], F[g].T, Q[g], u, x, after, w)
             for i in range(H.shape[1]):
-                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p)[1]
+                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p, q)[1]
                 for j in range(s):
                     all_K[k, g, i, j] = p[j] * inverse
                 root[k, g, i] = np.sqrt(inverse)

@@ -147,6 +147,8 @@ def test_without_the_bias_that_of_the_configs_map_stays(folder, kind, suffix, mo
     asked = ["fit-map", "both.yaml", *more, "--terms"]
     result = run(*asked, "scale,misalignment", "--out", f"whole.{suffix}", cwd=folder)
     assert result.returncode == 0, result.stderr
+    assert "bias x" not in result.stdout
+    assert "The bias is that of the map which the config names." in (folder / "whole.report.html").read_text()
     whole = read_map(folder / f"whole.{suffix}")
     T = np.linspace(*known.domain, 20)
     np.testing.assert_array_equal(whole.bias(T), known.bias(T))
