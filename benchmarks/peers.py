@@ -1,4 +1,4 @@
-"""The filter beside other packages, each on its own ground (`pip install .[peers]`, a gigabyte).
+"""The filter beside other packages, each on its own ground (`pip install .[peers]`, several gigabytes: torch).
 
 The models are constant, the peers' results are held against ours first. Of a batch the peers do one time step of all
 series at once; ours are one series after the other.

@@ -9,17 +9,9 @@ from pathlib import Path
 from common import machine
 
 NAMES = (
-    "install_size",
-    "methods",
-    "peers",
-    "accuracy",
-    "streaming",
-    "growth",
-    "explain",
-    "dataflash",
-    "end_to_end",
+    "install_size", "methods", "peers", "accuracy", "streaming", "growth", "explain", "dataflash", "end_to_end",
     "fleet",
-)
+)  # fmt: skip
 
 
 def main() -> None:

@@ -95,7 +95,6 @@ class SampleArrays(NamedTuple):
 
 
 Four = tuple[float, float, float, float]
-ONE, TWO, THREE, FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
 
 
@@ -150,8 +149,8 @@ def four_sums(s: Size, a: Array, B: Array, j: int, sums: Four) -> Four:
     a_0, a_1, a_2, a_3 = sums
     for k in range(len(s)):
         f = a[k]
-        a_0, a_1 = a_0 + f * B[k, j], a_1 + f * B[k, j + ONE]
-        a_2, a_3 = a_2 + f * B[k, j + TWO], a_3 + f * B[k, j + THREE]
+        a_0, a_1 = a_0 + f * B[k, j], a_1 + f * B[k, j + 1]
+        a_2, a_3 = a_2 + f * B[k, j + 2], a_3 + f * B[k, j + 3]
     return a_0, a_1, a_2, a_3
 
 
@@ -166,21 +165,21 @@ def predict(
             total += row[j] * x[j]
         x_new[i] = total
         for b in range(len(s) // 4):
-            j = FOUR * np.uint64(b)
-            w[j], w[j + ONE], w[j + TWO], w[j + THREE] = four_sums(s, row, P, j, (0.0, 0.0, 0.0, 0.0))
+            j = 4 * b
+            w[j], w[j + 1], w[j + 2], w[j + 3] = four_sums(s, row, P, j, (0.0, 0.0, 0.0, 0.0))
         for j in range(len(s) // 4 * 4, len(s)):
             total = 0.0
             for k in range(len(s)):
                 total += row[k] * P[k, j]
             w[j] = total
         for b in range((i + 1) // 4):
-            j = FOUR * np.uint64(b)
-            noise = Q[i, j], Q[i, j + ONE], Q[i, j + TWO], Q[i, j + THREE]
+            j = 4 * b
+            noise = Q[i, j], Q[i, j + 1], Q[i, j + 2], Q[i, j + 3]
             sums = four_sums(s, w, F_t, j, noise)
             P_new[i, j] = P_new[j, i] = sums[0]
-            P_new[i, j + ONE] = P_new[j + ONE, i] = sums[1]
-            P_new[i, j + TWO] = P_new[j + TWO, i] = sums[2]
-            P_new[i, j + THREE] = P_new[j + THREE, i] = sums[3]
+            P_new[i, j + 1] = P_new[j + 1, i] = sums[1]
+            P_new[i, j + 2] = P_new[j + 2, i] = sums[2]
+            P_new[i, j + 3] = P_new[j + 3, i] = sums[3]
         for j in range((i + 1) // 4 * 4, i + 1):
             total = Q[i, j]
             for k in range(len(s)):
@@ -198,8 +197,8 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array,
         B = P - K p',  q = B h',  P = B - q K' + K r K'
     """
     for b in range(len(s) // 4):
-        i = FOUR * np.uint64(b)
-        p[i], p[i + ONE], p[i + TWO], p[i + THREE] = four_sums(s, h, P, i, (0.0, 0.0, 0.0, 0.0))
+        i = 4 * b
+        p[i], p[i + 1], p[i + 2], p[i + 3] = four_sums(s, h, P, i, (0.0, 0.0, 0.0, 0.0))
     for i in range(len(s) // 4 * 4, len(s)):
         total = 0.0
         for j in range(len(s)):
@@ -227,14 +226,14 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array,
 def covariance_left(s: Size, P: Array, h: Array, p: Array, inverse: float, q: Array) -> None:
     """Do q = (P - K p') h', the covariance of the states with z that is left, with K = p `inverse`."""
     for b in range(len(s) // 4):
-        i = FOUR * np.uint64(b)
+        i = 4 * b
         a_0 = a_1 = a_2 = a_3 = 0.0
-        K_0, K_1, K_2, K_3 = p[i] * inverse, p[i + ONE] * inverse, p[i + TWO] * inverse, p[i + THREE] * inverse
+        K_0, K_1, K_2, K_3 = p[i] * inverse, p[i + 1] * inverse, p[i + 2] * inverse, p[i + 3] * inverse
         for j in range(len(s)):
             f, c = p[j], h[j]
-            a_0, a_1 = a_0 + (P[j, i] - K_0 * f) * c, a_1 + (P[j, i + ONE] - K_1 * f) * c
-            a_2, a_3 = a_2 + (P[j, i + TWO] - K_2 * f) * c, a_3 + (P[j, i + THREE] - K_3 * f) * c
-        q[i], q[i + ONE], q[i + TWO], q[i + THREE] = a_0, a_1, a_2, a_3
+            a_0, a_1 = a_0 + (P[j, i] - K_0 * f) * c, a_1 + (P[j, i + 1] - K_1 * f) * c
+            a_2, a_3 = a_2 + (P[j, i + 2] - K_2 * f) * c, a_3 + (P[j, i + 3] - K_3 * f) * c
+        q[i], q[i + 1], q[i + 2], q[i + 3] = a_0, a_1, a_2, a_3
     for i in range(len(s) // 4 * 4, len(s)):
         K_i, total = p[i] * inverse, 0.0
         for j in range(len(s)):
