@@ -63,9 +63,9 @@ paper: $(VENV)/ready
 turntable: $(VENV)/ready
 	$(VENV)/bin/python examples/11_turntable/run.py
 
-# the tables of docs/reference/performance.md, side by side with other filters and polars (fifteen minutes, 10 GB of disk)
+# the tables of docs/reference/performance.md, side by side with other filters and polars (fifteen minutes, 10 GB of disk;
+# more of them after pip install '.[peers]', which is six gigabytes for torch)
 bench: $(VENV)/ready
-	$(VENV)/bin/$(PIP_INSTALL) --editable '.[peers]'
 	$(VENV)/bin/python benchmarks/run_all.py
 	# from the last byte of a frame to the estimate, at 1 kHz through a pty (two minutes)
 	$(VENV)/bin/python benchmarks/live_latency.py

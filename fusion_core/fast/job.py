@@ -24,6 +24,7 @@ from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 DETOUR = 256  # samples of recursion once one is refused: others are often near
 SPAN = 16_384  # samples with steady gains at first; each further stretch is longer
+NARROW = 8  # states of a group for the tuples of `steady`
 
 
 def run(
@@ -170,7 +171,8 @@ class Job:
             x_lanes, y, white = out.x.reshape(x_lanes.shape), out.y.reshape(z.shape), out.white.reshape(z.shape)
         lanes = out._replace(x=x_lanes, y=y, white=white)
         x = self.x.T.copy()
-        steady(groups.size, x, known.F, known.H, tuple(gains.kind.tolist()), gains.K, gains.root, u, z, lanes)
+        run_steady = steady if len(groups.size[0]) <= NARROW else steady_of_many
+        run_steady(groups.size, x, known.F, known.H, tuple(gains.kind.tolist()), gains.K, gains.root, u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
@@ -246,4 +248,38 @@ def steady(
             for i in range(len(s)):
                 x[i, g] = after[i]
                 out.x[k, i, g] = after[i]
+        out.nis[k] = nis
+
+
+@compiled
+def steady_of_many(
+    size: tuple[Size, Size, Size], x: Array, F: Array, H: Array, kind: tuple[int, ...], K: Array, root: Array,
+    u: Array, z: Array, out: SampleArrays,
+) -> None:  # fmt: skip
+    """Do the same as `steady` with arrays, for groups of more states than tuples are good for."""
+    s, c, G = size
+    before, after, turned = np.empty(len(s)), np.empty(len(s)), np.ascontiguousarray(F.transpose(0, 2, 1))
+    for k in range(len(z)):
+        k_u, k_K = min(k, len(u) - 1), min(k, len(K) - 1)
+        nis = 0.0
+        for g in range(len(G)):
+            for i in range(len(s)):
+                before[i] = u[k_u, i, g]
+            for j in range(len(s)):
+                x_j = x[j, g]
+                for i in range(len(s)):
+                    before[i] += turned[g, j, i] * x_j
+            after[:] = before
+            for i in range(len(c)):
+                innovation = y = z[k, i, g]
+                for j in range(len(s)):
+                    innovation -= H[g, i, j] * before[j]
+                    y -= H[g, i, j] * after[j]
+                white = y * root[k_K, kind[g], i]
+                out.y[k, i, g], out.white[k, i, g] = innovation, white
+                nis += white * white
+                for j in range(len(s)):
+                    after[j] += K[k_K, kind[g], i, j] * y
+            for i in range(len(s)):
+                x[i, g] = out.x[k, i, g] = after[i]
         out.nis[k] = nis

@@ -139,6 +139,26 @@ def test_the_recursion_equals_filterpy():
         assert np.max(np.abs(ours.sigma[k] / sigma - 1)) < 1e-9
 
 
+@pytest.mark.parametrize("method", ["recursive", "steady"])
+@pytest.mark.parametrize(("n", "m"), [(5, 2), (13, 6)])
+def test_states_that_are_all_coupled_equal_filterpy(n, m, method):
+    """Fours of sums and what is left of them; gains that change, and those that stay."""
+    rng, N = np.random.default_rng(n), 1200
+    F, H = 0.97 * np.linalg.qr(rng.normal(size=(n, n)))[0], rng.normal(size=(m, n))
+    Q, R = 0.01 * np.eye(n), np.diag(rng.uniform(0.5, 2.0, m))
+    u, z = simulate(F, Q, H, R, np.eye(n), N, rng)
+    used = np.ones(N, bool)
+    ours = estimate(State(np.zeros(n), np.eye(n)), Transition(F, Q, u), Measurement(z, H, R, used), method=method)
+    theirs = KalmanFilter(dim_x=n, dim_z=m, dim_u=n)
+    theirs.x, theirs.P, theirs.F, theirs.Q, theirs.H, theirs.R = np.zeros((n, 1)), np.eye(n), F, Q, H, R
+    for k in range(N):
+        theirs.predict(u=u[k][:, None], B=np.eye(n))
+        theirs.update(z[k][:, None])
+        sigma = np.sqrt(np.diag(theirs.P))
+        assert np.max(np.abs(ours.x[k] - theirs.x[:, 0]) / sigma) < 1e-9
+        assert np.max(np.abs(ours.sigma[k] / sigma - 1)) < 1e-9
+
+
 @pytest.mark.parametrize("rate_variance", [1e-12, 1e-8, 1e-4])
 def test_steady_gains_equal_the_recursion(rate_variance):
     F, Q, H, R = twelve()
