@@ -165,10 +165,12 @@ def count(cases):
             fit = fitted(seed).fit
             z.append(((fit.terms.at(AT) - truth) / fit.sigma(AT))[:, fit.free])
             largest = max(largest, float(np.max(fit.sigma(AT)[:, 3:12])))
-        z = np.abs(np.array(z))
+        z, bias = np.abs(np.array(z)), int(np.sum(fit.free[:3]))
+        parts = {"bias": z[:, :, :bias], "the others": z[:, :, bias:]}
+        shares = "; ".join(f"{of} {np.mean(z < 1):.1%}, {np.mean(z < 1.96):.1%}" for of, z in parts.items())
         print(
-            f"{name}: {SEEDS} seeds, {z.shape[2]} terms at {len(AT)} temperatures: within one sigma "
-            f"{np.mean(z < 1):.1%}, within 1.96 {np.mean(z < 1.96):.1%}; largest sigma of M {largest * 1e6:.0f} ppm"
+            f"{name}: {SEEDS} seeds, {z.shape[2]} terms at {len(AT)} temperatures, within one and 1.96 sigma: "
+            f"{shares}; largest sigma of M {largest * 1e6:.0f} ppm"
         )
 
 
