@@ -18,7 +18,8 @@ from common import Row, limit, show
 from recording import write_config, write_csv, write_hdf5, write_map
 
 HERE = Path(__file__).parent
-STAGES = ("start", "read", "condition", "temperature rate", "map", "filter", "write", "report", "rest", "wall")
+STAGES = ("start", "read", "condition", "temperature rate", "map", "filter", "deviations", "write", "report", "digest",
+          "rest", "wall")  # fmt: skip
 
 
 def measured(command: list[str]) -> tuple[float, float]:

@@ -92,6 +92,7 @@ def main() -> None:
     timed(run, "with_rate", "temperature rate")
     timed(tracker, "bias_steps", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
+    timed(tracker.Segments, "segment", "deviations")
     for name in ("append", "flush", "close", "_put_all"):
         timed(GrowingFile, name, "write")
     for owner, names in (

@@ -105,6 +105,7 @@ class Job:
         self.groups, self.model, self.data = groups, model, data
         states, rows = groups.states.astype(np.uint64), groups.rows.astype(np.uint64)
         self.places = Places(states, rows, *groups.size[:2], (0.0,) if keep_K else ())
+        self.fours = True if len(self.places.s) >= 4 else None
         self.complete = bool(data.used.all())
         self.x, self.P = self._by_groups(state)
         (N, m), n = data.z.shape, len(state.x)
@@ -120,11 +121,11 @@ class Job:
         at = start
         while at < stop:
             x, P, given = self.x, self.P, self._part(at, stop)
-            self.x, self.P, done = recursive(self.places, x, P, *given)
+            self.x, self.P, done = recursive(self.places, x, P, *given, self.fours)
             if at + done < stop:  # not finite after it, or P is too wide for it
                 covariance("Q", self.model.Q[min(at + done, len(self.model.Q) - 1)], sample=at + done)
                 if done:
-                    x, P, _ = recursive(self.places, x, P, *self._part(at, at + done))
+                    x, P, _ = recursive(self.places, x, P, *self._part(at, at + done), self.fours)
                 done += self._wide(x, P, at + done)
             at += done
         return at

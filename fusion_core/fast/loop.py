@@ -156,31 +156,31 @@ def four_sums(s: Size, a: Array, B: Array, j: int, sums: Four) -> Four:
 
 @inlined
 def predict(
-    s: Size, x: Array, P: Array, F: Array, F_t: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array
-) -> None:
-    """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored; F_t is F'."""
+    s: Size, x: Array, P: Array, F: Array, F_t: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array,
+    fours: bool | None,
+) -> None:  # fmt: skip
+    """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored; F_t is F', which only `fours` need."""
     for i in range(len(s)):
-        total, row = u[i], F[i]
+        total, row, done = u[i], F[i], 0
         for j in range(len(s)):
             total += row[j] * x[j]
         x_new[i] = total
-        for b in range(len(s) // 4):
-            j = 4 * b
-            w[j], w[j + 1], w[j + 2], w[j + 3] = four_sums(s, row, P, j, (0.0, 0.0, 0.0, 0.0))
-        for j in range(len(s) // 4 * 4, len(s)):
+        if fours is not None:
+            done = len(s) // 4 * 4
+            for j in range(0, done, 4):
+                w[j], w[j + 1], w[j + 2], w[j + 3] = four_sums(s, row, P, j, (0.0, 0.0, 0.0, 0.0))
+        for j in range(done, len(s)):
             total = 0.0
             for k in range(len(s)):
                 total += row[k] * P[k, j]
             w[j] = total
-        for b in range((i + 1) // 4):
-            j = 4 * b
-            noise = Q[i, j], Q[i, j + 1], Q[i, j + 2], Q[i, j + 3]
-            sums = four_sums(s, w, F_t, j, noise)
-            P_new[i, j] = P_new[j, i] = sums[0]
-            P_new[i, j + 1] = P_new[j + 1, i] = sums[1]
-            P_new[i, j + 2] = P_new[j + 2, i] = sums[2]
-            P_new[i, j + 3] = P_new[j + 3, i] = sums[3]
-        for j in range((i + 1) // 4 * 4, i + 1):
+        if fours is not None:
+            done = (i + 1) // 4 * 4
+            for j in range(0, done, 4):
+                sums = four_sums(s, w, F_t, j, (Q[i, j], Q[i, j + 1], Q[i, j + 2], Q[i, j + 3]))
+                P_new[i, j], P_new[i, j + 1], P_new[i, j + 2], P_new[i, j + 3] = sums
+                P_new[j, i], P_new[j + 1, i], P_new[j + 2, i], P_new[j + 3, i] = sums
+        for j in range(done, i + 1):
             total = Q[i, j]
             for k in range(len(s)):
                 total += w[k] * F[j, k]
@@ -188,7 +188,9 @@ def predict(
 
 
 @inlined
-def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array, q: Array) -> tuple[float, float]:
+def correct(
+    s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array, q: Array, fours: bool | None
+) -> tuple[float, float]:
     """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s, NaN where P is too wide.
 
     Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored; p and q (s,) are left behind::
@@ -196,10 +198,12 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array,
         p = P h',  s = h p + r,  K = p / s
         B = P - K p',  q = B h',  P = B - q K' + K r K'
     """
-    for b in range(len(s) // 4):
-        i = 4 * b
-        p[i], p[i + 1], p[i + 2], p[i + 3] = four_sums(s, h, P, i, (0.0, 0.0, 0.0, 0.0))
-    for i in range(len(s) // 4 * 4, len(s)):
+    done = 0
+    if fours is not None:
+        done = len(s) // 4 * 4
+        for i in range(0, done, 4):
+            p[i], p[i + 1], p[i + 2], p[i + 3] = four_sums(s, h, P, i, (0.0, 0.0, 0.0, 0.0))
+    for i in range(done, len(s)):
         total = 0.0
         for j in range(len(s)):
             total += P[i, j] * h[j]
@@ -210,10 +214,15 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array,
         y -= h[i] * x[i]
         widest += h[i] * h[i] * P[i, i]
     inverse = 1.0 / S if widest <= WIDE * r else np.nan
-    covariance_left(s, P, h, p, inverse, q)
+    if fours is not None:
+        covariance_left(s, P, h, p, inverse, q)
     for i in range(len(s)):
         K_i = p[i] * inverse
         x[i] += K_i * y
+        if i >= done:
+            q[i] = 0.0
+            for j in range(len(s)):
+                q[i] += (P[i, j] - K_i * p[j]) * h[j]
         surplus = (r * K_i - q[i]) * inverse - K_i  # of row i: -K_i but for rounding
         for j in range(i, len(s)):
             P[i, j] += surplus * p[j]
@@ -224,9 +233,8 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array,
 
 @inlined
 def covariance_left(s: Size, P: Array, h: Array, p: Array, inverse: float, q: Array) -> None:
-    """Do q = (P - K p') h', the covariance of the states with z that is left, with K = p `inverse`."""
-    for b in range(len(s) // 4):
-        i = 4 * b
+    """Do q = (P - K p') h', the covariance of the states with z that is left, with K = p `inverse`, in whole fours."""
+    for i in range(0, len(s) // 4 * 4, 4):
         a_0 = a_1 = a_2 = a_3 = 0.0
         K_0, K_1, K_2, K_3 = p[i] * inverse, p[i + 1] * inverse, p[i + 2] * inverse, p[i + 3] * inverse
         for j in range(len(s)):
@@ -234,17 +242,12 @@ def covariance_left(s: Size, P: Array, h: Array, p: Array, inverse: float, q: Ar
             a_0, a_1 = a_0 + (P[j, i] - K_0 * f) * c, a_1 + (P[j, i + 1] - K_1 * f) * c
             a_2, a_3 = a_2 + (P[j, i + 2] - K_2 * f) * c, a_3 + (P[j, i + 3] - K_3 * f) * c
         q[i], q[i + 1], q[i + 2], q[i + 3] = a_0, a_1, a_2, a_3
-    for i in range(len(s) // 4 * 4, len(s)):
-        K_i, total = p[i] * inverse, 0.0
-        for j in range(len(s)):
-            total += (P[i, j] - K_i * p[j]) * h[j]
-        q[i] = total
 
 
 @inlined
 def measure(
     places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: SampleStep,
-    sums: InnovationSums, results: SampleArrays,
+    sums: InnovationSums, results: SampleArrays, fours: bool | None,
 ) -> InnovationSums:  # fmt: skip
     """Correct x and P of group g, as predicted, with its measurement at sample k; return the new sums."""
     s, m = places.s, np.uint64(data.z.shape[1])
@@ -260,7 +263,7 @@ def measure(
         h = step.H[g, c]
         for j in range(len(s)):
             innovation -= h[j] * step.x[j]
-        y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w, step.q)
+        y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w, step.q, fours)
         white = y * np.sqrt(inverse)
         results.y[k, row], results.white[k, row] = innovation, white
         if len(places.gains):
@@ -277,12 +280,13 @@ def measure(
 
 @compiled
 def recursive(
-    places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays
+    places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays, fours: bool | None
 ) -> tuple[Array, Array, int]:
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
     The third that is returned is the first sample after which anything is not finite, or N. The gate looks at all
-    groups: each is predicted and corrected, and what was predicted stands where it refuses.
+    groups: each is predicted and corrected, and what was predicted stands where it refuses. `fours` is None for groups
+    of fewer than four states: the compiler leaves out then what only many need.
     """
     (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
     x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
@@ -294,12 +298,12 @@ def recursive(
         for g in range(G):
             if not gather(places, g, model, k, step) and uneven(model.Q[k]):
                 return x, P, k
-            predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
-            sums = measure(places, g, model, data, k, x_[g], P_[g], step, sums, results)
+            predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w, fours)
+            sums = measure(places, g, model, data, k, x_[g], P_[g], step, sums, results, fours)
         used = sums.dof > 0 and sums.nis <= data.gates[sums.dof]
         if not used and sums.dof > 0:
             for g in range(G):
-                predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
+                predict(places.s, x[g], P[g], step.F[g], step.F_t[g], step.Q[g], step.u[g], x_[g], P_[g], step.w, fours)
         x, P, x_, P_ = x_, P_, x, P
         log_det = sums.log_det - np.log(sums.inverse)
         check = sums.nis + log_det
@@ -339,14 +343,14 @@ def single(
     if not ordinary:
         return False
     w, x_, P_ = of_x[1], of_x[2], of_x[3:]
-    predict(x, x, P, F, F.T, Q, u, x_, P_, w)
+    predict(x, x, P, F, F, Q, u, x_, P_, w, None)
     for i in range(m):
         of_z[0, i] = z[i]
         for j in range(n):
             of_z[0, i] -= H[i, j] * x_[j]
     sums[0] = sums[1] = 0.0
     for i in range(m):
-        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w, of_x[0])
+        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w, of_x[0], None)
         of_z[1, i] = y * np.sqrt(inverse)
         sums[0] += of_z[1, i] ** 2
         sums[1] -= np.log(inverse)
@@ -371,9 +375,9 @@ def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Arr
     for k in range(N):
         for g in range(len(P)):
             before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
-            predict(x, nothing, before, F[g], F[g].T, Q[g], u, x, after, w)
+            predict(x, nothing, before, F[g], F[g], Q[g], u, x, after, w, None)
             for i in range(H.shape[1]):
-                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p, q)[1]
+                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p, q, None)[1]
                 for j in range(s):
                     all_K[k, g, i, j] = p[j] * inverse
                 root[k, g, i] = np.sqrt(inverse)
