@@ -192,8 +192,7 @@ def fit_triad_map(
         gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,
         None if walk is None else float(np.max(walk)), None if law is None else law.prior(),
     )  # fmt: skip
-    if known is not None:
-        fit = fit.without_bias()
+    fit = fit if known is None else fit.without_bias()
     fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
     result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, levelled=known is None, law=law)
     if out is not None:

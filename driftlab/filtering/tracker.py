@@ -203,7 +203,7 @@ class Tracker:
 
 
 class Segments:
-    """What is said of filtered epochs: motion, the bias and its prediction with all parts of their deviations."""
+    """Motion, bias and prediction of filtered epochs, with all parts of their deviations."""
 
     def __init__(self, plan: RunSetup, journal: RunLog) -> None:
         self.model = plan.model

@@ -77,7 +77,7 @@ class TriadFit:
 
     @property
     def has_bias(self) -> bool:
-        """Whether the bias is of the map."""
+        """True where the bias of the map is of this fit."""
         return bool(np.any(self.free[list(BIAS)]))
 
     def without_bias(self) -> Self:

@@ -48,7 +48,7 @@ class CurveTable:
         return table if np.all(exact) else None
 
     def covers(self, T: Array) -> bool:
-        """Return whether all temperatures (N,), of which there is at least one, are within the domain."""
+        """Return True if all of one temperature or more (N,) are within the domain."""
         return bool(self.low <= T.min() and T.max() <= self.high)
 
     def at(self, T: Array) -> Array:

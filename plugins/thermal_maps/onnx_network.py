@@ -118,7 +118,7 @@ class OnnxMap(contracts.FittedMap):
         return self._asked(T)
 
     def _asked(self, T: Array) -> Array:
-        """Return what the graph gives at T, as onnxruntime works it out."""
+        """Return the output (N, d) of the graph at T (N,), by onnxruntime."""
         N, d = len(T), self.record.d
         try:
             session, name, numbers, flat = self._session

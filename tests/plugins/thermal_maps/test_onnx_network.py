@@ -9,6 +9,7 @@ from fusion_core.errors import (
     MapError,
 )
 from fusion_plugins.thermal_maps import onnx_graph
+from fusion_plugins.thermal_maps.curve_table import CurveTable
 from fusion_plugins.thermal_maps.onnx_network import OnnxMap, OnnxNetwork
 
 
@@ -207,3 +208,23 @@ def test_a_graph_with_weights_that_are_not_numbers_is_refused(tmp_path):
         MapError, match=r"other.onnx gives a bias that is not a finite number at T = .* expected rad/s; ref"
     ):
         OnnxNetwork().read(path)
+
+
+@pytest.mark.parametrize("target", ["bias", "slope"])
+def test_many_temperatures_are_as_the_graph_has_them(target):
+    """They come from a table, which is tried halfway between its nodes; here it is tried anywhere."""
+    fitted = OnnxNetwork(starts=1, target=target).fit(*soak(smooth), {})
+    low, high = fitted.domain
+    at = np.concatenate([[low, high], np.random.default_rng(0).uniform(low, high, 5000)])
+    assert fitted._table is not None
+    few = np.concatenate([fitted._run(part) for part in np.array_split(at, 10)])
+    np.testing.assert_allclose(fitted._run(at), few, rtol=0, atol=2e-13 * np.abs(few).max())
+
+
+@pytest.mark.parametrize("curve", [
+    lambda T: np.abs(T[:, None] - 20.0003),  # a kink
+    lambda T: np.tanh((T[:, None] - 20) / 0.01),  # steeper than the nodes are near
+    lambda T: np.float32(np.sin(T[:, None] / 10)).astype(np.float64),  # seven digits
+])  # fmt: skip
+def test_a_curve_that_is_not_smooth_has_no_table(curve):
+    assert CurveTable.of(curve, (-20.0, 60.0)) is None
