@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from driftlab.commands.console import print_verdict, say, say_lines, terminal
@@ -67,12 +68,9 @@ class TriadMapResult(Result):
         fit: TriadFit,
         fitted: FittedMap,
         faults: Faults,
-        *,
-        levelled: bool = True,
         law: TermsLaw | None = None,
     ) -> None:
-        self.config, self.recordings, self.levelled = config, list(recordings) or None, levelled
-        self.law = law
+        self.config, self.recordings, self.law = config, list(recordings) or None, law
         self.fit, self.map, self.faults = fit, fitted, faults
         self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
         self.measured = of_map(fitted, self.unit)
@@ -127,10 +125,10 @@ class TriadMapResult(Result):
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
-        measured = {name: one for name, one in self.measured.items() if not self.levelled or name not in none}
+        measured = {name: one for name, one in self.measured.items() if not (self.fit.has_bias and name in none)}
         return Certificate(
             "fit-map", self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
-            levelled=self.levelled, remarks=words.verdict(self.fit),
+            levelled=self.fit.has_bias, remarks=words.verdict(self.fit),
         )  # fmt: skip
 
 
@@ -184,20 +182,25 @@ def fit_triad_map(
     if "g_sensitivity" in names and own.filter is not None and own.filter.tracked.channel != "gyro":
         raise ConfigError(f"--terms g_sensitivity: is a gyro's, not one of {own.filter.tracked.channel}; leave it out")
     gathered = stimulus_of(own, recordings, faults)
-    wanted = np.zeros(len(TERMS) + len(SENSITIVITIES) * ("g_sensitivity" in names), dtype=bool)
-    for name in ("bias", *names):
-        wanted[ASKED[name]] = True
-    walk = (gathered.sensor.bias.as_random_walk() or {}).get("walk")
+    walk, size = (gathered.sensor.bias.as_random_walk() or {}).get("walk"), USUAL_BIAS.get(gathered.sensor.unit, 1.0)
     fit = fit_triad(
-        gathered.stimulus, settings, USUAL_BIAS.get(gathered.sensor.unit, 1.0), wanted,
+        gathered.stimulus, settings, size, _wanted(names),
         None if walk is None else float(np.max(walk)), None if law is None else law.prior(),
     )  # fmt: skip
     fit = fit if known is None else fit.without_bias()
     fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
-    result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, levelled=known is None, law=law)
+    result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, law)
     if out is not None:
         result.save(out, report=report, certificate=certificate)
     return result
+
+
+def _wanted(names: Collection[str]) -> NDArray[np.bool_]:
+    """Return the terms (12 or 21,) of some groups, and the bias."""
+    wanted = np.zeros(len(TERMS) + len(SENSITIVITIES) * ("g_sensitivity" in names), dtype=bool)
+    for name in ("bias", *names):
+        wanted[ASKED[name]] = True
+    return wanted
 
 
 def names_of_terms(terms: str, known: Collection[str] = GROUPS) -> list[str]:
