@@ -3,10 +3,11 @@
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
-from driftlab.recordings.prefetch import prefetch
+from driftlab.recordings.prefetch import aside, prefetch
 
 
 def test_the_same_items_in_the_same_order():
@@ -57,3 +58,24 @@ for item in prefetch(made()):
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout) == (1, "closed\n")
+
+
+def test_what_is_done_aside_is_in_order_and_its_error_comes_back():
+    """No more than `depth` of them wait, so that a slow one holds up who asks, and no memory grows."""
+    done, go, waiting = [], threading.Event(), []
+
+    def slow(item):
+        go.wait(10)
+        done.append(item)
+
+    with aside(depth=2) as do:
+        asked = threading.Thread(target=lambda: [waiting.append(do(slow, k)) for k in range(5)])
+        asked.start()
+        time.sleep(0.2)
+        assert len(waiting) == 2
+        go.set()
+        asked.join(10)
+    assert done == [0, 1, 2, 3, 4]
+
+    with pytest.raises(ZeroDivisionError), aside() as do:
+        do(lambda item: 1 / item, 0)
