@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3709
+    assert 0 < count <= 3712
 
 
 def imports():
@@ -277,7 +277,7 @@ BUDGET = {
     "driftlab/triad": 593,
     "fusion_core": 1855,
     "fusion_core/contracts": 1955,
-    "fusion_core/fast": 819,
+    "fusion_core/fast": 822,
     "fusion_core/host": 748,
     "fusion_core/testing": 1002,
     "fusion_core/thermal": 1053,

@@ -233,7 +233,7 @@ def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Seque
     terms = "scale factor, misalignment and g-sensitivity" if strained else "scale factor and misalignment"
     return page(
         "triad",
-        title=f"{'Bias, s' if fit.has_bias else 'S'}{terms[1:]} of the {channel}",
+        title=f"{', '.join(['bias'] * fit.has_bias + [terms]).capitalize()} of the {channel}",
         lead=lead,
         sheet=sheet,
         result=result(fit, unit, channel),
