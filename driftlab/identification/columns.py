@@ -22,12 +22,12 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from driftlab.identification.records import Evidence, map_inputs
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
-from fusion_core.fast import compiled
+from fusion_core.fast import compiled, inlined
 
 Indices = NDArray[np.intp]
 
@@ -69,13 +69,17 @@ class NormalEquations:
 
     def solve(self, b: Array) -> Array:
         """Return x (k,) or (k, p) of A x = b; what A does not determine is nearly zero."""
+        return np.asarray(cho_solve((self._root(), False), b, check_finite=False))
+
+    def _root(self) -> Array:
+        """Return U (k, k) with U' U = A and a tiny ridge; below its diagonal stands anything."""
         diagonal = np.diag_indices(len(self.A))
         tiny = TINY * max(float(np.mean(self.A[diagonal])), 1e-300) if len(self.A) else 0.0
         while True:
             A = self.A.copy()
             A[diagonal] += tiny
             try:
-                return np.asarray(cho_solve(cho_factor(A, check_finite=False), b, check_finite=False))
+                return np.asarray(cho_factor(A, overwrite_a=True, check_finite=False)[0])
             except LinAlgError:  # rounding made it indefinite
                 tiny *= 100
 
@@ -94,9 +98,12 @@ class NormalEquations:
         """Variances (k,) of the coefficients for noise of density 1."""
         return np.diag(self.solve(np.eye(len(self.A))))
 
-    def take_out(self, G: Array, cols: Indices) -> Array:
-        """Return the Schur complement of inner products G (K, K): the columns `cols`, which are these, taken out."""
-        return np.asarray(G - G[:, cols] @ self.solve(G[cols]))
+    def explained(self, products: Array) -> Array:
+        """Return V (K, k): V V' is what these columns explain of the inner products of others.
+
+        `products` (k, K) are those of these columns with the others.
+        """
+        return np.ascontiguousarray(solve_triangular(self._root(), products, trans=1, check_finite=False).T)
 
 
 def free_starts(
@@ -121,19 +128,28 @@ def free_starts(
     return sd, slow
 
 
+@inlined
+def _reduced(G: Array, V: Array, i: int, j: int) -> float:
+    """Return an entry of G - V V'."""
+    total = G[i, j]
+    for k in range(V.shape[1]):
+        total -= V[i, k] * V[j, k]
+    return float(total)
+
+
 @compiled
-def left_with_starts(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
+def left_with_starts(G: Array, V: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
     """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
 
-    R (K, K) holds inner products of all columns, y the signal's place. As `free_starts` and `NormalEquations.left`,
-    compiled: it is asked for tens of thousands of times.
+    G (K, K) holds inner products of all columns, V V' the part of them that the base explains (V (K, k)), y the
+    signal's place. As `free_starts` and `NormalEquations.left`, compiled: it is asked for tens of thousands of times.
     """
-    k, yy = len(cols), R[y, y]
+    k, yy = len(cols), _reduced(G, V, y, y)
     A, b = np.empty((k, k)), np.empty(k)
     for i in range(k):
-        b[i] = R[cols[i], y]
-        for j in range(k):
-            A[i, j] = R[cols[i], cols[j]]
+        b[i] = _reduced(G, V, cols[i], y)
+        for j in range(i + 1):
+            A[i, j] = A[j, i] = _reduced(G, V, cols[i], cols[j])
     level = np.trace(A) / max(k, 1)
     if k == 0 or level <= 0:
         return float(yy)
@@ -231,7 +247,10 @@ class EffectRegressors:
         self._complete()
         key, size = tuple(segments), self._known
         if rows is None and key not in self._sums:
-            self._sums[key] = self._gram[list(key), :size, :size].sum(axis=0)
+            total = np.zeros((size, size))
+            for segment in key:
+                total += self._gram[segment, :size, :size]
+            self._sums[key] = total
         if rows is None:
             return self._sums[key]
         columns = rows if columns is None else columns

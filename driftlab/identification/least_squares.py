@@ -58,6 +58,7 @@ class LeastSquares:
     smoothing: Array  # (d,) weight of the map's penalty, of its curves' own
     colour: Array  # (d,) density of the residual at low frequencies, over its mean square
     _fits: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)
+    _penalties: dict[bytes, Array] = field(default_factory=dict)  # of the map, their trace 1, by its columns
 
     def fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:
         """Fit a model on one axis over some segments."""
@@ -108,13 +109,14 @@ class LeastSquares:
         return np.concatenate([self.columns.of_map(effects), self.columns.levels, *own])
 
     def ridge(self, axis: int, fixed: Indices, G: Array) -> Array:
-        """Return the map's penalty (k, k) on the fixed columns, G the inner products of these, the first of all."""
-        ridge, q = np.zeros((len(fixed), len(fixed))), len(self.columns.penalty)
-        if q and np.any(self.columns.penalty):
+        """Return the map's penalty (q, q) on the first of the fixed columns, G the inner products of all of these."""
+        q = len(self.columns.penalty)
+        key = fixed[:q].tobytes()
+        if key not in self._penalties:
             scale = self.columns.scale[fixed[:q]]
             P = self.columns.penalty / np.outer(scale, scale)
-            ridge[:q, :q] = self.smoothing[axis] * float(np.trace(G[:q, :q])) / np.trace(P) * P
-        return ridge
+            self._penalties[key] = P / (float(np.trace(P)) or 1.0)
+        return np.asarray(self.smoothing[axis] * float(np.trace(G[:q, :q])) * self._penalties[key])
 
     def starts(self, term: Term, segments: Sequence[int]) -> Indices:
         """Return the columns of a term's unknown starts in the recordings of the segments."""

@@ -3,9 +3,9 @@
 Hyper-parameters by training error: which of a family's candidates fits some segments best beside a base.
 
 With base columns B (map, levels, effects that stay) taken out once, the sum of squares that any candidate leaves is a
-problem of its own few columns: the candidates' reduced inner products are the Schur complement::
+problem of its own few columns: of the candidates' reduced inner products, the Schur complement, only theirs::
 
-    R = G - G[:, B] (G[B, B] + K)^-1 G[B, :],    cost = R_yy - R_yc (R_cc + ridge)^-1 R_cy
+    R = G - V V',    V = G[:, B] U^-1,  U'U = G[B, B] + K,    cost = R_yy - R_yc (R_cc + ridge)^-1 R_cy
 
 A candidate that acts on the map's input has other map columns, and is fitted whole.
 """
@@ -168,15 +168,15 @@ class Tuning:
     def __init__(self, squares: LeastSquares, base: Model, segments: tuple[int, ...]) -> None:
         self.squares, self.base, self.segments = squares, base, segments
         self.axes, self.rows = range(len(squares.columns.y)), squares.rows(segments)
-        G = squares.columns.gram(segments)
-        self._reduced: list[Array] = []
+        self._G = G = squares.columns.gram(segments)
+        self._explained: list[Array] = []
         known: dict[bytes, Array] = {}
         for axis in self.axes:
             fit = squares.fit(base, axis, segments)
             key = fit.cols.tobytes() + fit.equations.A.tobytes()
             if key not in known:  # axes whose columns are alike share it
-                known[key] = fit.equations.take_out(G, fit.cols)
-            self._reduced.append(known[key])
+                known[key] = fit.equations.explained(G[fit.cols])
+            self._explained.append(known[key])
 
     def cost(self, terms: Sequence[Term]) -> float:
         """Return n/2 log of the sum of squares that the terms leave beside the base, summed over the axes (nats)."""
@@ -190,7 +190,8 @@ class Tuning:
         starts = [squares.starts(term, self.segments) for term in terms]
         cols = np.concatenate([*(columns.of(term.effect).columns[axis] for term in terms), *starts])
         sizes, colour = np.array([len(s) for s in starts]), float(squares.colour[axis])
-        return float(left_with_starts(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
+        base, y = self._explained[axis], int(columns.y[axis])
+        return float(left_with_starts(self._G, base, y, cols, sizes, self.rows, colour))
 
 
 def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:

@@ -160,11 +160,27 @@ def _one_step(x: Array, gain: float) -> Array:
 def fit_local_level(parts: Sequence[Array]) -> LocalLevel:
     """Return the noise of residuals, one (n,) a recording, that of least one-step error."""
 
-    def error(log_gain: float) -> float:
-        return float(np.mean(np.concatenate(one_step(parts, float(np.exp(log_gain)))) ** 2))
+    def errors(gains: Array) -> Array:
+        return np.asarray(sum(_squares(x, gains) for x in parts) / sum(len(x) - 1 for x in parts))
 
-    best = minimum_near(error, np.log(np.geomspace(MIN_GAIN, MAX_GAIN, 13)), xatol=0.02)
+    def error(log_gain: float) -> float:
+        return float(errors(np.array([np.exp(log_gain)]))[0])
+
+    grid = np.geomspace(MIN_GAIN, MAX_GAIN, 13)
+    best = minimum_near(error, np.log(grid), xatol=0.02, costs=errors(grid))
     return LocalLevel(float(np.exp(best)), max(error(best), 1e-300))
+
+
+@compiled
+def _squares(x: Array, gains: Array) -> Array:
+    """Return the sums of squares (G,) of the one-step errors of a signal (n,), predicted with each of the gains."""
+    sums, level = np.zeros(len(gains)), np.zeros(len(gains))
+    for k in range(1, len(x)):
+        value = x[k] - x[0]
+        for j in range(len(gains)):
+            sums[j] += (value - level[j]) ** 2
+            level[j] = gains[j] * value - (gains[j] - 1.0) * level[j]
+    return sums
 
 
 def effective(e: Array, s: Array, *, walking: bool) -> float:

@@ -233,11 +233,11 @@ def _likeliest(own: Array, u: Array) -> tuple[float, float]:
     return best * scale, scale
 
 
-def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5) -> float:
-    """Return the minimum of a cost, between the neighbours of the best place of a grid."""
+def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5, costs: Array | None = None) -> float:
+    """Return the minimum of a cost, between the neighbours of the best place of a grid, where it may be known."""
     from scipy.optimize import minimize_scalar
 
-    k = int(np.argmin([cost(float(x)) for x in grid]))
+    k = int(np.argmin([cost(float(x)) for x in grid] if costs is None else costs))
     bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
     return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
 

@@ -52,13 +52,14 @@ def test_given_coefficients_are_taken_off_the_signal():
     assert mine.left == pytest.approx(dense.left)
 
 
-def test_columns_taken_out_leave_the_products_of_residuals():
+def test_columns_explain_the_products_that_residuals_lack():
     Z, y = problem()
     both = np.column_stack([Z, y])
     cols = np.array([1, 2])
     left = both - both[:, cols] @ np.linalg.lstsq(both[:, cols], both, rcond=None)[0]
-    found = of(Z[:, cols], y).take_out(both.T @ both, cols)
-    np.testing.assert_allclose(found, left.T @ left, atol=1e-5)
+    G = both.T @ both
+    V = of(Z[:, cols], y).explained(G[cols])
+    np.testing.assert_allclose(G - V @ V.T, left.T @ left, atol=1e-5)
 
 
 def test_what_the_rows_do_not_determine_stays_small():
@@ -81,6 +82,6 @@ def test_the_compiled_twin_leaves_the_same(size):
         expected = equations.raised(np.append(np.zeros(4), np.full(2, slow / sd**2))).left
     else:
         expected = equations.restricted(np.arange(4)).left
-    found = left_with_starts(both.T @ both, 6, np.arange(6), sizes, len(y), 1.0)
+    found = left_with_starts(both.T @ both, np.zeros((7, 0)), 6, np.arange(6), sizes, len(y), 1.0)
     assert found == pytest.approx(expected, rel=1e-6)
     assert (sd > 0) == (size > 0)

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag, null_space
 from scipy.stats import multivariate_normal
 
-from driftlab.noise.local_level import LevelLikelihood, effective, fit_local_level
+from driftlab.noise.local_level import LevelLikelihood, effective, fit_local_level, one_step
 
 
 def test_the_restricted_likelihood_is_that_of_the_dense_distribution_of_all_contrasts():
@@ -68,3 +68,11 @@ def test_a_walk_has_few_independent_rows_for_what_is_slow():
     walk = np.cumsum(rng.normal(size=n))
     assert effective(walk, np.sin(2 * np.pi * np.arange(n) / n), walking=False) < 10
     assert effective(walk, rng.normal(size=n), walking=False) > n / 3
+
+
+def test_the_variance_is_the_mean_square_of_the_errors_at_the_gain():
+    rng = np.random.default_rng(5)
+    parts = [np.cumsum(rng.normal(0, 0.1, n)) + rng.normal(0, 1, n) for n in (900, 1400)]
+    found = fit_local_level(parts)
+    errors = np.concatenate(one_step(parts, found.gain))
+    assert found.variance == pytest.approx(np.mean(errors**2), rel=1e-12)
