@@ -13,7 +13,8 @@ import os
 import re
 import zlib
 from collections.abc import Collection, Mapping
-from io import BufferedReader
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ OWN = 64 * "0"  # in the place of a SHA-256 of the file itself
 SEAL, ZEROS = re.compile(rb"driftlab ([a-z-]{1,20}) [!-~]{1,80}, sha256:([0-9a-f]{64})"), OWN.encode()
 LONGEST = 200  # bytes of a seal, at least
 LARGE, BLOCK = 1 << 24, 1 << 18  # bytes of a file whose digest is one of sums, and of a block
+PART = 1 << 25  # bytes that a thread sums up
 SUMS = "sums:"  # how such a digest begins
 LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 
@@ -165,8 +167,9 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
     """
     try:
         with open(os.open(path, os.O_RDONLY | PLAIN), "rb") as file:
-            if sums or (sums is None and os.fstat(file.fileno()).st_size >= LARGE):
-                return SUMS + _sums(file)
+            size = os.fstat(file.fileno()).st_size
+            if sums or (sums is None and size >= LARGE):
+                return SUMS + _sums(path, size)
             if not own:
                 return hashlib.file_digest(file, "sha256").hexdigest()
             before, _, after = file.read(LARGEST).rpartition(own.encode())
@@ -175,14 +178,23 @@ def digest(path: Path, own: str = "", sums: bool | None = None) -> str:
         return ""
 
 
-def _sums(file: BufferedReader) -> str:
-    """Return the SHA-256 of the CRC-32 of each block of a file, and of the length of the file."""
-    whole, length, block = hashlib.sha256(), 0, memoryview(bytearray(BLOCK))
-    while count := file.readinto(block):
-        whole.update(zlib.crc32(block[:count]).to_bytes(4, "little"))
-        length += count
-    whole.update(length.to_bytes(8, "little"))
-    return whole.hexdigest()
+def _sums(path: Path, size: int) -> str:
+    """Return the SHA-256 of the CRC-32 of each block of a file, and of the length of the file, two parts at a time."""
+    with ThreadPoolExecutor(2) as pool:
+        parts = list(pool.map(partial(_sums_of_part, path), range(0, max(size, 1), PART)))
+    sums, lengths = zip(*parts, strict=True)
+    return hashlib.sha256(b"".join(sums) + sum(lengths).to_bytes(8, "little")).hexdigest()
+
+
+def _sums_of_part(path: Path, start: int) -> tuple[bytes, int]:
+    """Return the CRC-32 of each block of a part of a file, and the bytes that there are of it."""
+    sums, length, block = [], 0, memoryview(bytearray(BLOCK))
+    with open(os.open(path, os.O_RDONLY | PLAIN), "rb") as file:
+        file.seek(start)
+        while length < PART and (count := file.readinto(block)):
+            sums.append(zlib.crc32(block[:count]).to_bytes(4, "little"))
+            length += count
+    return b"".join(sums), length
 
 
 def document(path: Path) -> dict[str, Any]:
