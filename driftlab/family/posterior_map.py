@@ -23,6 +23,7 @@ from driftlab.family.unit_noise import Densities, densities_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
 from fusion_core.host.registry import registry
+from fusion_core.thermal.curve_error import modes_of_axes, six_digits
 from fusion_core.thermal.record_texts import recorded
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ GRID = 1  # temperatures an interval, at which the error is kept
 WIDER = 1.2  # times the family's walk, from which one that does not show is taken for the family's
 SPREAD = 0.1  # least of a family's spread of noise, logarithm
 CURVE = 4  # temperatures an interval, at which the curve is taken
-DIGITS = 6  # significant ones of a mode
 ROUNDING = 1e-5  # of the largest deviation, or of a variance
 LOST = 0.05  # of the variance at any temperature, with the modes that are left out
 
@@ -118,13 +118,11 @@ class UnitPosterior:
         T = np.linspace(*knots.domain, GRID * knots.intervals + 1)
         B, factor = knots.values(T), self.band.factor(T, knots.step)
         per_axis = [_modes(B, C) * own for C, own in zip(self.posterior.covariance, factor.T, strict=True)]
-        modes = np.zeros((max(map(len, per_axis)), len(T), len(per_axis)))
-        for axis, own in enumerate(per_axis):
-            modes[: len(own), :, axis] = own
+        modes = modes_of_axes(per_axis)
         curve = B @ self.posterior.c.T
         second = np.diff(curve, n=2, axis=0) / (T[1] - T[0]) ** 2
         bend = np.maximum(np.sqrt(np.mean(second**2, axis=0)), 8 * np.ptp(curve, axis=0) / (T[-1] - T[0]) ** 2)
-        return CurveError(T=tuple(T.tolist()), modes=_rounded(modes), bend=tuple(bend.tolist()))
+        return CurveError(T=tuple(T.tolist()), modes=six_digits(modes), bend=tuple(bend.tolist()))
 
 
 def posterior_of(family: Family, soaked: UnitInformation, lot: str = "") -> UnitPosterior:
@@ -188,11 +186,6 @@ def _settings(step: float) -> ThermalMap:
     settings = registry().classes(ThermalMap)[KIND].model_validate({"kind": KIND, "interval": f"{step} K"})
     assert isinstance(settings, ThermalMap)
     return settings
-
-
-def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:
-    """Return modes (r, G, d) as a file has them: a fleet has one for each unit."""
-    return tuple(tuple(tuple(float(f"{v:.{DIGITS}g}") for v in row) for row in mode) for mode in modes.tolist())
 
 
 def _modes(B: Array, C: Array) -> Array:

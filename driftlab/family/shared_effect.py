@@ -29,6 +29,7 @@ from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
+from driftlab.identification.acceptance import nats_of
 from driftlab.identification.result import described, parameters
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
@@ -301,8 +302,6 @@ def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, un
     Their means under their variances, or under their scatter where that is more; or, of as many as it takes, as the
     search weighs them.
     """
-    from scipy.stats import chi2
-
     n = len(units)
     c, w = c[units].reshape(n, -1), 1 / v[units].reshape(n, -1)
     W = w.sum(axis=0)
@@ -311,14 +310,14 @@ def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, un
     c, w, W = c[:, W > 0], w[:, W > 0], W[W > 0]
     m = (w * c).sum(axis=0) / W
     scatter = float(np.sum(w * (c - m) ** 2)) / ((n - 1) * len(W))
-    means = -float(chi2.logsf(float(np.sum(m**2 * W)) / max(scatter, 1.0), len(W)))
+    means = nats_of(float(np.sum(m**2 * W)) / max(scatter, 1.0), len(W))
     weighed = chances([Offer(effect, contrasts.c.shape[-1])], contrasts, units)[0][2]
     return max(means, weighed) - float(np.log(2))
 
 
 def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:
     """Return the probability that lots of one law differ as much: an F ratio an axis, weighted, all multiplied."""
-    from scipy.stats import chi2, f
+    from scipy.special import chdtrc, fdtrc
 
     n = len(c)
     c, v = c.reshape(n, -1), v.reshape(n, -1)
@@ -336,8 +335,8 @@ def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:
     if not np.any(used):
         return 1.0
     ratio = (total[0] / np.maximum(freedom[0], 1))[used] / (total[1] / np.maximum(freedom[1], 1))[used]
-    logs = np.maximum(f.logsf(ratio, freedom[0][used], freedom[1][used]), -700.0)
-    return float(chi2.sf(-2 * logs.sum(), 2 * len(logs)))
+    logs = np.log(np.maximum(fdtrc(freedom[0][used], freedom[1][used], ratio), 1e-304))
+    return float(chdtrc(2 * len(logs), -2 * logs.sum()))
 
 
 def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list[str]:

@@ -36,6 +36,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.partitions import Partitions, UnitOfLot
 from driftlab.family.unit_information import UnitInformation
+from driftlab.identification.acceptance import nats_of
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
 from driftlab.identification.records import with_residuals
 from driftlab.identification.state import name_of
@@ -274,8 +275,6 @@ def _of_right_size(sample: Partitions[Sequence[UnitOfLot]], taken: Candidate, be
 
 def chances(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> list[tuple[float, float, float]]:
     """Return evidence of mean, of size and of both of each offer in some units, nats."""
-    from scipy.stats import chi2
-
     d, K = contrasts.c.shape[1:]
     c, information, placebos = contrasts.flat(units)
     z, noise = (values.reshape(d, K) for values in of_mean(c, variances(information, placebos), placebos))
@@ -285,7 +284,7 @@ def chances(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices)
         # of a lag the size is known; a walk has the course of any effect of time, of whatever sign
         one = offer.effect.acts_on_input or offer.effect.walks
         size = 0.0 if one else chance_of_sizes(sizes[:, own].ravel())
-        evidence.append((mean, size, mean if one else -float(chi2.logsf(2 * (mean + size), 4))))
+        evidence.append((mean, size, mean if one else nats_of(2 * (mean + size), 4)))
     return evidence
 
 
@@ -387,11 +386,11 @@ def mean_of(c: Array, v: Array, s2: Array) -> tuple[Array, Array, Array]:
 
 def scores(m: Array, sigma: Array, freedom: Array) -> Array:
     """Return means over their deviations as normal scores (K,): what is as unlikely as Student's t."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtri, stdtr
 
     ratio = np.where(sigma > 0, np.abs(m) / np.where(sigma > 0, sigma, 1.0), 0.0)
-    p = np.maximum(t.logsf(ratio, freedom), -700.0)
-    return np.asarray(np.sign(m) * np.maximum(norm.isf(np.exp(p)), 0.0))
+    p = np.maximum(stdtr(freedom, -ratio), 1e-304)
+    return np.asarray(np.sign(m) * np.maximum(-ndtri(p), 0.0))
 
 
 def of_mean(c: Array, v: Array, placebos: Array) -> tuple[Array, Array]:
@@ -409,33 +408,31 @@ def of_mean(c: Array, v: Array, placebos: Array) -> tuple[Array, Array]:
 
 def of_size(c: Array, information: Array, placebos: Array) -> Array:
     """Return normal scores (K,) of the squares of coefficients against those of the placebos of the same unit."""
-    from scipy.stats import f, norm
+    from scipy.special import fdtr, ndtri
 
     noise, freedom = noise_of(placebos)
     seen = (information > 0) & (freedom > 0)
     ratio = np.where(seen, c**2 * information / noise, 0.0)
-    p = np.clip(f.cdf(ratio, 1, np.maximum(freedom, 1.0)), 1e-9, 1 - 1e-9)
-    z = np.where(seen, norm.ppf(p), 0.0)
+    p = np.clip(fdtr(1, np.maximum(freedom, 1.0), ratio), 1e-9, 1 - 1e-9)
+    z = np.where(seen, ndtri(p), 0.0)
     n = seen.sum(axis=0)
     return np.where(n >= MIN_UNITS, z.sum(axis=0) / np.sqrt(np.maximum(n, 1)), 0.0)
 
 
 def chance_of_means(z: Array, noise: Array) -> float:
     """Return - log of the probability that scores of means (K,) are no more than chance, placebos' squares known."""
-    from scipy.stats import chi2
-
     held = z != 0
     if not np.any(held):
         return 0.0
-    return -float(chi2.logsf(np.sum(z[held] ** 2) / max(float(np.mean(noise[held])), 1.0), int(held.sum())))
+    return nats_of(float(np.sum(z[held] ** 2)) / max(float(np.mean(noise[held])), 1.0), int(held.sum()))
 
 
 def chance_of_sizes(z: Array) -> float:
     """Return - log of the probability that scores of sizes (K,) are no more than chance."""
-    from scipy.stats import norm
+    from scipy.special import log_ndtr
 
     held = z != 0
-    return -float(norm.logsf(np.sum(z[held]) / np.sqrt(held.sum()))) if np.any(held) else 0.0
+    return -float(log_ndtr(-np.sum(z[held]) / np.sqrt(held.sum()))) if np.any(held) else 0.0
 
 
 def gains(c: Array, v: Array, m: Array, s2: Array) -> Array:

@@ -72,11 +72,6 @@ class SharedEffects(BaseModel):
             return soaked
         return without_effects(soaked, lot, self.effects, self.noise.get(soaked.unit))
 
-    def of_unit(self, unit: str) -> SharedEffects:
-        """Return the effects with the sizes and the noise of one unit alone."""
-        own = {name: {unit: sizes[unit]} for name, sizes in self if name in ("of_units", "noise") and unit in sizes}
-        return self.model_copy(update={"of_units": {}, "noise": {}, **own})
-
 
 def find_common(units: FamilyUnits, *, bias_unit: str = "rad/s", sample: int = SAMPLE) -> SharedEffects:
     """Return the effects that units share; `sample` of them at most are searched.

@@ -48,7 +48,6 @@ class Coast:
 
     x: Array
     P: Array
-    t_0: float
     T_0: float  # degC; NaN where there is no thermometer
 
     def advance(self, N: int, step: Transition) -> tuple[Array, Array]:
@@ -329,7 +328,7 @@ class Prediction:
     def depart(self, state: State, T_0: float) -> None:
         """Begin to predict from the state at the end of the alignment, at T_0 in degC (NaN: not known)."""
         block = self.block
-        self.coast = Coast(state.x[block], state.P[block, block], self.first.t, T_0)
+        self.coast = Coast(state.x[block], state.P[block, block], T_0)
         self.uncertainty.depart(self.coast)
         self.departed = self.extrapolation.memory.last
 

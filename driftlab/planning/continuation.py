@@ -66,12 +66,6 @@ class RecordedSoak(SigmaCurve):
         return float(self.T.min()), float(self.T.max())
 
     @property
-    def share(self) -> float:
-        """Share of the range that was seen."""
-        low, high = self.seen
-        return max(min(high, self.chamber.high) - max(low, self.chamber.low), 0.0) / self.chamber.swing
-
-    @property
     def whole(self) -> bool:
         """True if the range was seen from end to end."""
         low, high = self.seen

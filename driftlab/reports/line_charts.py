@@ -18,6 +18,7 @@ from driftlab.spc.capability import D2, Capability
 from driftlab.spc.charts import D4, ControlChart, LineReport
 from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 NAMED = SERIES - 1  # units far off that a label names
 SHARES = (5, 25, 50, 75, 95)
@@ -59,7 +60,7 @@ def joint_charts(line: LineReport) -> list[Chart]:
     panels = []
     for joint in line.multivariate:
         place, out = (joint.at + 1).astype(np.float64), joint.beyond
-        drawn = np.union1d(np.linspace(0, len(place) - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(out))
+        drawn = _drawn(out)
         value, few = np.array([rounded(v, 4) for v in joint.value.tolist()]), np.unique([0, len(place) - 1])
         span = (0.0, 1.1 * float(max(np.percentile(joint.value, 100 * (1 - MANY)), 2 * np.max(joint.limit))))
         shown = np.minimum(value, span[1])
@@ -88,7 +89,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     def shown(values: Array) -> Array:
         return np.array([rounded(v, 4) for v in (np.asarray(values) * unit.factor).tolist()], dtype=np.float64)
 
-    drawn = _drawn(chart)
+    drawn = _drawn(chart.beyond)
     place = (chart.at + 1).astype(np.float64)
     few = np.unique(np.linspace(0, len(place) - 1, LIMITS).astype(int))
     out = np.flatnonzero(chart.beyond)
@@ -143,12 +144,9 @@ def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tupl
     return low - room, high + room
 
 
-def _drawn(chart: ControlChart) -> NDArray[np.intp]:
-    """Return the values that are drawn: all, or the alarms and an even sample."""
-    m = len(chart.at)
-    if m <= MAX_POINTS:
-        return np.arange(m)
-    return np.union1d(np.linspace(0, m - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(chart.beyond))
+def _drawn(out: Flags) -> NDArray[np.intp]:
+    """Return the values that are drawn, of which some are out (m,): all, or those and an even sample."""
+    return np.union1d(np.linspace(0, len(out) - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(out))
 
 
 def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:

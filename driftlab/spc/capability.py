@@ -163,7 +163,7 @@ def anderson_darling(x: Array) -> tuple[float, float]:
 
 def share_beyond(beyond: int, n: int) -> tuple[float, float]:
     """Return the 95 % interval of a share of which `beyond` of n were seen (Clopper and Pearson)."""
-    from scipy.stats import binomtest
+    from scipy.special import betaincinv
 
-    interval = binomtest(beyond, n).proportion_ci(method="exact")
-    return float(interval.low), float(interval.high)
+    low = betaincinv(beyond, n - beyond + 1, 0.025) if beyond else 0.0
+    return float(low), float(betaincinv(beyond + 1, n - beyond, 0.975)) if beyond < n else 1.0

@@ -87,8 +87,6 @@ class ControlChart:
     value : (m,) array
     scale : Scale
         In which the limits lie alike above and below.
-    normal : float
-        Probability of values as little normal in that scale about their stretches, if they were.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
@@ -116,7 +114,6 @@ class ControlChart:
     at: NDArray[np.intp]
     value: Array
     scale: ChartScale
-    normal: float
     basis: tuple[int, int]
     centre: float
     own: NDArray[np.float32]
@@ -415,16 +412,6 @@ def scale_of(values: Array, *, size: bool) -> ChartScale:
     lack = [1 - _straightness(scale.to(values)) for scale in some]
     best = int(np.argmin(lack))
     return some[best] if lack[best] < 0.5 * lack[0] and lack[0] > 0.005 else some[0]
-
-
-def normality(x: Array) -> float:
-    """Return the probability of values (n,) as little normal, if they were; one in a hundred at either end aside."""
-    from scipy.stats import shapiro
-
-    core = _core(x)
-    if len(core) < 8 or np.ptp(core) == 0:
-        return 1.0
-    return float(shapiro(core[:: max(len(core) // 2000, 1)]).pvalue)
 
 
 def _straightness(x: Array) -> float:

@@ -40,7 +40,6 @@ from driftlab.spc.charts import (
     TSquaredChart,
     far_out,
     in_control,
-    normality,
     scale_of,
 )
 from driftlab.spc.run_rules import RULES
@@ -160,11 +159,9 @@ def _control(
     law = in_control(x[start:stop], own[start:stop]) if frozen is None else frozen
     single = own.astype(np.float32)
     sigma = np.maximum(law.sigma(single.astype(np.float64)), 1e-100)  # of values that do not vary
-    flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
-        normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
-        centre=float(scale.back(np.array(law.centre))), own=single,
+        basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))), own=single,
         changes=_changes(level_steps, stretches, x, sigma, scale, at),
         lots=_lots(lots, x, sigma, law, scale, known=known is not None),
         trend=trend, law=law, rules=rules, phi=course.phi, frozen=known,

@@ -202,10 +202,10 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
 
 def _usual(line: LineReport) -> float:
     """Return the expected number of values of a line in control beyond three sigma, by limits of so many units."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtr, stdtr
 
     return sum(
-        len(c.at) * 2 * float(norm.sf(SIGMAS) if c.of_family else t.sf(SIGMAS, WORTH * (c.basis[1] - c.basis[0] - 1)))
+        len(c.at) * 2 * float(ndtr(-SIGMAS) if c.of_family else stdtr(WORTH * (c.basis[1] - c.basis[0] - 1), -SIGMAS))
         for c in line.controls
     )
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from driftlab.triad.model import BIAS, GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, MatrixCurve, TriadInput, TriadMatrix
+from fusion_core.thermal.curve_error import six_digits
 
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
@@ -130,10 +131,8 @@ class TriadFit:
         T = self.grid
         curve = self.terms.at(T)[:, part]
         bend = 8 * np.ptp(curve, axis=0) / np.ptp(T) ** 2
-        modes = [[[float(f"{v:.6g}") for v in row] for row in mode] for mode in self._joint_modes[:, :, part].tolist()]
-        return CurveError(
-            T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes), bend=tuple(bend.tolist())
-        )
+        modes = six_digits(self._joint_modes[:, :, part])
+        return CurveError(T=tuple(T.tolist()), modes=modes, bend=tuple(bend.tolist()))
 
     def matrix(self) -> TriadMatrix:
         """Return M over temperature as a map's record holds it."""

@@ -11,6 +11,7 @@ way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid point
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Self
 
@@ -48,6 +49,19 @@ Modes = tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
 def nested(modes: Array) -> Modes:
     """Return modes (r, G, d) as a record holds them."""
     return tuple(tuple(map(tuple, mode)) for mode in modes.tolist())
+
+
+def six_digits(modes: Array) -> Modes:
+    """Return modes (r, G, d) as a record holds them, to six digits: a fleet has a map of each unit."""
+    return tuple(tuple(tuple(float(f"{v:.6g}") for v in row) for row in mode) for mode in modes.tolist())
+
+
+def modes_of_axes(per_axis: Sequence[Array]) -> Array:
+    """Return the modes (r, G) of each axis as those of all (r, G, d)."""
+    modes = np.zeros((max(map(len, per_axis)), per_axis[0].shape[1], len(per_axis)))
+    for axis, of_axis in enumerate(per_axis):
+        modes[: len(of_axis), :, axis] = of_axis
+    return modes
 
 
 class CurveError(Frozen):

@@ -16,7 +16,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.errors import SingularFit
-from fusion_core.thermal.curve_error import CurveError, Misfit, nested
+from fusion_core.thermal.curve_error import CurveError, Misfit, modes_of_axes, nested
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.soak_noise import (
     MIN_BLOCKS,
@@ -79,7 +79,7 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     grid = np.asarray(error.T)
     more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
     modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    return fitted.noting(error=error.model_copy(update={"modes": (*modes_kept, *nested(_stacked(more)))}))
+    return fitted.noting(error=error.model_copy(update={"modes": (*modes_kept, *nested(modes_of_axes(more)))}))
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
@@ -149,16 +149,8 @@ def _joined(
 ) -> CurveError:
     """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
     hidden = [np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend) for low, high in holes]
-    modes = nested(np.concatenate([_stacked(per_axis), np.reshape(hidden, (-1, len(grid), len(bend)))]))
+    modes = nested(np.concatenate([modes_of_axes(per_axis), np.reshape(hidden, (-1, len(grid), len(bend)))]))
     return CurveError(T=tuple(grid.tolist()), modes=modes, bend=tuple(bend.tolist()), holes=holes, misfits=misfits)
-
-
-def _stacked(per_axis: Sequence[Array]) -> Array:
-    """Return the modes (r, G) of each axis as those of all (r, G, d)."""
-    modes = np.zeros((max(map(len, per_axis)), per_axis[0].shape[1], len(per_axis)))
-    for axis, of_axis in enumerate(per_axis):
-        modes[: len(of_axis), :, axis] = of_axis
-    return modes
 
 
 def _check_holes(kind: str, error: CurveError, swing: Array) -> None:

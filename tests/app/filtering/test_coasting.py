@@ -83,7 +83,7 @@ def test_the_mean_goes_on_with_its_drift():
     rng = np.random.default_rng(0)
     P, F, Q, C = drawn(3, False, True)
     u, x = rng.normal(size=(40, 4)), rng.normal(size=4)
-    coast = Coast(x, P, 0.0, 20.0)
+    coast = Coast(x, P, 20.0)
     step = Transition(F, Q, u, C)
     found = np.concatenate(
         [coast.advance(stop - start, part(step, start, stop))[0] for start, stop in ((0, 7), (7, 40))]
