@@ -253,8 +253,8 @@ def _misfit(
     """Return the part (p,) of the free curve that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
-    it can follow says nothing of its misfit. Of the finding, as chi-square with its degrees of freedom, the part that
-    noise and smoothing are expected to have is taken off.
+    it can follow says nothing of its misfit. Of each shape the share is returned that is no noise: where knots stand
+    near one another the free curve is hardly known, and what it shows there is none.
     """
     from scipy.special import chdtri
 
@@ -269,14 +269,27 @@ def _misfit(
     variances, U = np.linalg.eigh(expected)
     whole = np.sum((U.T @ operator @ noise.root) ** 2, axis=1)
     unfollowed = (variances > TAKEN**2 * whole) & (variances > NOTHING * variances[-1])
-    shape = (U.T @ curve)[unfollowed]
-    chi_square, freedom = float(np.sum(shape**2 / variances[unfollowed])), int(np.sum(unfollowed))
+    shape, variances = (U.T @ curve)[unfollowed], variances[unfollowed]
+    chi_square, freedom = float(np.sum(shape**2 / variances)), int(np.sum(unfollowed))
     if freedom == 0 or chi_square < chdtri(freedom, CHANCE):
         return nothing
     sigma = np.sqrt(np.clip(np.diagonal(expected), 0.0, None))
     k = int(np.argmax(np.abs(curve) - 2 * sigma))
     where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
-    return where, np.asarray(U[:, unfollowed] @ shape * np.sqrt(1 - freedom / chi_square))
+    return where, np.asarray(U[:, unfollowed] @ (shape * _share_of_misfit(shape, variances)))
+
+
+def _share_of_misfit(shape: Array, variances: Array) -> Array:
+    """Return the share of each shape (m,) that a misfit has, beside noise and smoothing of the variances (m,).
+
+    A misfit is as large in one shape as in another, of the likeliest variance: v in a finding that is misfit and noise
+    has the mean v / (v + variance) of it (C. N. Morris, Parametric empirical Bayes inference, J. Am. Stat. Assoc. 78
+    (1983) 47).
+    """
+    v = np.max(shape**2) * np.logspace(-6, 0, 121)[:, None]
+    cost = np.sum(np.log(v + variances) + shape**2 / (v + variances), axis=1)
+    likeliest = v[int(np.argmin(cost))]
+    return np.asarray(likeliest / (likeliest + variances))
 
 
 def _expected_to_be_left(contrasts: Contrasts, noise: BlockNoise, operator: Array, left: Array) -> Array:

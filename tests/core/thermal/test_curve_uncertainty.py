@@ -6,7 +6,7 @@ from doses import draws
 
 from fusion_core.errors import OutsideDomain, SingularFit
 from fusion_core.thermal.curve_error import CurveError
-from fusion_core.thermal.curve_uncertainty import find_holes
+from fusion_core.thermal.curve_uncertainty import _share_of_misfit, find_holes
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
 
@@ -307,3 +307,14 @@ def test_a_kind_that_is_too_stiff_for_the_same_curve_is_seen(maps):
     for seed in range(draws(2, 5)):
         fitted = maps.fit(*soak(wave(seed), seed, WIDE, 8.0, 7200, 0.03 * DEG_H, 10 * DEG_H), {})
         assert [misfit.axis for misfit in fitted.record.error.misfits] == [0, 1, 2]
+
+
+def test_of_a_finding_what_is_hardly_known_is_no_misfit():
+    """Of the variance that a misfit has in all shapes, a shape takes the less, the more noise is expected in it."""
+    shape, variances = np.array([8.0, -7.0, 6.0, -30.0]), np.array([1.0, 1.0, 4.0, 900.0])
+    share = _share_of_misfit(shape, variances)
+    assert np.all(np.diff(share) <= 0)
+    assert share[0] > 0.95
+    assert abs(share[3] * shape[3]) < 3.0
+    noise = np.random.default_rng(0).normal(size=40)
+    assert np.max(_share_of_misfit(noise, np.ones(40))) < 0.3
