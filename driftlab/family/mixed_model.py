@@ -58,6 +58,7 @@ Share = Annotated[float, Field(ge=0, le=1e30)]
 
 SAMPLE = 1500  # units that Sigma is of, where there are more
 MIN_UNITS = 3  # that saw a temperature, for it to be in the family's domain
+ENTERED = 0.199  # of an interval of the knots, for a unit to have seen it
 MIN_SHARE = 0.02  # of all units, likewise
 
 
@@ -83,8 +84,8 @@ def fit_family(
         was seen by MIN_UNITS of them.
     """
     units = in_partitions(units)
-    knots, axes, lots, lot = _survey(units)
-    knots = knots if start is None else start.knots
+    knots, axes, lots, lot, by_enough = _survey(units)
+    knots, seen = (knots, by_enough) if start is None else (start.knots, start.seen)
     n, d = len(units), len(axes)
     chosen = np.arange(n)
     if n > SAMPLE:
@@ -99,7 +100,7 @@ def fit_family(
     names = [soaked.unit for soaked, _ in units.chosen(chosen[low]).read()]
     return Family(
         channel=channel, bias_unit=bias_unit, axes=axes, first=knots.first, intervals=knots.intervals,
-        step=knots.step, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
+        step=knots.step, seen=seen, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
         mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
         Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, means),
         weights={name: w[k].tolist() for name, k in zip(names, low, strict=True)},
@@ -109,10 +110,10 @@ def fit_family(
 
 def _survey(
     units: Partitions[Sequence[UnitOfLot]],
-) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Index]:
+) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Index, tuple[float, float]]:
     """Return the knots over the temperatures that enough units saw, and the axes.
 
-    And of each lot its number and its units; and each unit's lot by number (n,).
+    And of each lot its number and its units; each unit's lot by number (n,); and these temperatures' ends, degC.
 
     Raises
     ------
@@ -123,9 +124,10 @@ def _survey(
         raise ValueError(f"a family of {len(units)} units; at least {MIN_UNITS} are needed to know how units differ")
     first = next(units.read())[0]
     axes, step = first.axes, first.knots.step
-    spans, places, columns = Counter[tuple[int, int]](), dict[str, int](), []
-    for own, lots in units.map(partial(_spans, axes, step)):
+    spans, places, columns, ranges = Counter[tuple[int, int]](), dict[str, int](), [], []
+    for own, lots, temperatures in units.map(partial(_spans, axes, step)):
         spans.update(own)
+        ranges.append(temperatures)
         columns.append(np.array([places.setdefault(lot, len(places)) for lot in lots]))
     numbers = numbered(places, len(units))
     lot = np.array([numbers[name] for name in places])[np.concatenate(columns)]
@@ -142,13 +144,20 @@ def _survey(
             "one range"
         )
     knots = SplineBasis(lowest + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
-    return knots, axes, {name: (numbers[name], int(counts[places[name]])) for name in numbers}, lot
+    lowest_first, highest_last = np.sort(np.concatenate(ranges), axis=0).T
+    enough_units = int(np.ceil(least))
+    seen_by_enough = float(lowest_first[enough_units - 1]), float(highest_last[-enough_units])
+    return knots, axes, {name: (numbers[name], int(counts[places[name]])) for name in numbers}, lot, seen_by_enough
 
 
 def _spans(
     axes: tuple[str, ...], step: float, units: Sequence[UnitOfLot]
-) -> tuple[Counter[tuple[int, int]], list[str]]:
-    """Return the number of units that saw each range of knots, by its first and its intervals, and each unit's lot."""
+) -> tuple[Counter[tuple[int, int]], list[str], Array]:
+    """Return the number of units that saw each range of knots, by its first and its intervals, and each unit's lot.
+
+    And the lowest and highest temperature (n, 2) of each.
+    An interval was seen that a unit went through by ENTERED: with less, the curve beyond is anything.
+    """
     spans, lots = Counter[tuple[int, int]](), []
     for soaked, lot in units:
         if soaked.axes != axes or soaked.knots.step != step:
@@ -156,9 +165,17 @@ def _spans(
                 f"unit {soaked.unit} has axes {', '.join(soaked.axes)} and knots {soaked.knots.step} K apart, others "
                 f"{', '.join(axes)} and {step} K; a family is of one type of unit, soaked alike"
             )
-        spans[soaked.knots.first, soaked.knots.intervals] += 1
+        spans[_seen(soaked)] += 1
         lots.append(lot)
-    return spans, lots
+    return spans, lots, np.array([soaked.seen for soaked, _ in units])
+
+
+def _seen(soaked: UnitInformation) -> tuple[int, int]:
+    """Return the first knot and the number of intervals that a unit saw; of less than one, what it was in."""
+    knots = soaked.knots
+    low, high = (T / knots.step for T in soaked.seen)
+    low, high = int(np.ceil(low - 1 + ENTERED)), int(np.floor(high + 1 - ENTERED))
+    return (low, high - low) if low < high else (knots.first, knots.intervals)
 
 
 def numbered(lots: Iterable[str], units: int) -> dict[str, int]:
@@ -292,6 +309,8 @@ class Family(BaseModel):
     channel, bias_unit : str
         Whose bias, and its SI unit.
     axes : tuple of str
+    seen : (low, high)
+        Temperatures that enough units entered, degC; None: the knots' domain.
     first, intervals, step : int, int, float
         Of the knots, over the temperatures that enough of the units saw: `first` times `step` is the lower end, degC.
     units, sampled : int
@@ -331,6 +350,7 @@ class Family(BaseModel):
     first: int
     intervals: int
     step: FiniteFloat
+    seen: tuple[FiniteFloat, FiniteFloat] | None = None
     units: Count
     sampled: Count
     mu: Numbers

@@ -44,7 +44,7 @@ from driftlab.family.outlier_tests import (
 from driftlab.family.partitions import FamilyUnits, in_partitions
 from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
-from driftlab.units import BiasUnit, axis_name, default_unit
+from driftlab.units import BiasUnit, axis_name, default_unit, number
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
@@ -237,14 +237,14 @@ class _Words:
         return bool(value) and abs(reason.off) < max(value)
 
     def _of_curve(self, name: str, reason: Reason, p: float, fine: tuple[str, ...]) -> Outlier:
-        called = " and ".join(self._axis(axis) for axis in reason.axes)
-        size, spread = (f"{value * self.unit.factor:.{n}g}" for value, n in ((abs(reason.off), 3), (reason.spread, 2)))
+        called, factor = " and ".join(self._axis(axis) for axis in reason.axes), self.unit.factor
+        size, spread = (number(value * factor) for value in (abs(reason.off), reason.spread))
         off = f"{size} {self.unit.shown}, the family's spread there is {spread}"
         sentence = {
             "sign": f"{called} is negated: with its sign reversed it is as the family",
             "swap": f"{called} are swapped: exchanged they are as the family",
             "scale": f"{called} is {reason.times:.3g} times what is usual: scale",
-            "level": f"{called} is off by {reason.off * self.unit.factor:.3g} {self.unit.shown}: level (the family's "
+            "level": f"{called} is off by {number(reason.off * factor)} {self.unit.shown}: level (the family's "
             f"spread is {spread})",
             "bump": f"{called} has a local deviation at {reason.T:.0f} °C as none of the others ({off})",
         }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} °C ({off})")
@@ -315,9 +315,9 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
             if abs(off[k, axis]) > max(sure[k, axis], MATTERS * spread[k, axis]):
                 called, T = family.axes[axis], float(peaks[k])
                 sentence = (
-                    f"lot {name}: {called} is off the other lots by {off[k, axis] * unit.factor:.3g} {unit.shown} at "
-                    f"{T:.0f} °C (its units spread by {spread[k, axis] * unit.factor:.2g}); its {lot.units} units are "
-                    "held against one another"
+                    f"lot {name}: {called} is off the other lots by {number(off[k, axis] * unit.factor)} {unit.shown} "
+                    f"at {T:.0f} °C (its units spread by {number(spread[k, axis] * unit.factor)}); its {lot.units} "
+                    "units are held against one another"
                 )
                 odd.append(LotOutlier(name, SHAPE, called, T, sentence))
     for name, axis, lot_name, times in tests.lots:

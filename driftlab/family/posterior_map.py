@@ -98,6 +98,8 @@ class UnitPosterior:
     def map(self, provenance: Mapping[str, str]) -> FittedMap:
         """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.
 
+        Straight on over what units entered beyond, as readings of a thermometer scatter about the ends of a soak.
+
         `provenance` says of its making, for the record.
         """
         family, knots = self.family, self.family.knots
@@ -105,7 +107,9 @@ class UnitPosterior:
             kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
             residual=self._residual(), samples=self.soaked.count, error=self._error(), provenance=recorded(provenance),
         )  # fmt: skip
-        return _settings(knots.step).from_curve(self.T, knots.values(self.T) @ self.posterior.c.T, record)
+        settings = _settings(knots.step)
+        fitted = settings.from_curve(self.T, knots.values(self.T) @ self.posterior.c.T, record)
+        return settings.over(fitted, family.seen or knots.domain)
 
     def _residual(self) -> tuple[float, ...]:
         """Return the rms (d,) of the residual of the map on the unit's own rows."""

@@ -36,6 +36,8 @@ class UnitInformation:
     axes : tuple of str
     knots : Knots
         Over the temperatures that the unit saw.
+    seen : (low, high)
+        These, degC.
     J, h : (d, q, q) and (d, q) arrays
         Information on the coefficients, and information times their values.
     count : int
@@ -49,6 +51,7 @@ class UnitInformation:
     unit: str
     axes: tuple[str, ...]
     knots: SplineBasis
+    seen: tuple[float, float]
     J: Array
     h: Array
     count: int
@@ -82,7 +85,7 @@ class UnitInformation:
                 N = X.T @ X
                 J[axis] += N[:q, :q]
                 h[axis] += N[:q, q]
-        return cls(unit, axes, knots, J, h, len(T), white, walk, tuple(parts))
+        return cls(unit, axes, knots, (float(T.min()), float(T.max())), J, h, len(T), white, walk, tuple(parts))
 
     def between(self, low: float, high: float) -> UnitInformation | None:
         """Return the information of the rows at temperatures from low to high, degC.
@@ -111,6 +114,7 @@ class UnitInformation:
             "unit": np.array(self.unit),
             "axes": np.array(self.axes),
             "knots": np.array([self.knots.first, self.knots.intervals, self.knots.step]),
+            "seen": np.array(self.seen),
             "count": np.array(self.count),
         }
         arrays |= {name: getattr(self, name) for name in ("J", "h", "white", "walk")}
@@ -132,7 +136,8 @@ class UnitInformation:
             own = {name: file[f"{k}/{name}"] for number, name in names if int(number) == k}
             channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
             recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
+        low, high = file["seen"].tolist()
         return cls(
             str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
-            file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
+            (low, high), file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
         )  # fmt: skip

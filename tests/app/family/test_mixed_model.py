@@ -164,3 +164,27 @@ def test_who_cannot_be_a_family_is_told() -> None:
         fit_family([*units, (other, "")])
     with pytest.raises(ValueError, match="soak units of one family alike"):
         fit_family(units).posterior(other)
+
+
+def test_what_units_hardly_entered_is_not_in_the_domain():
+    """Thermometers of coarse steps end a little beyond the range: no curve is known over the interval that follows."""
+    units = made.deal("polynomial", 12, 3, size=SIZE)
+    pairs = []
+    for unit, lot in soaked(units, 3):
+        (rows,) = unit.recordings
+        low, high = unit.knots.domain
+        wider = replace(rows, T=low - 0.2 + (high - low + 0.4) * (rows.T - rows.T.min()) / np.ptp(rows.T))
+        pairs.append((UnitInformation.of(unit.unit, unit.axes, [wider], unit.white, unit.walk, 2.5), lot))
+    assert pairs[0][0].knots.intervals == soaked(units, 3)[0][0].knots.intervals + 2
+    family = fit_family(pairs)
+    assert family.knots == soaked(units, 3)[0][0].knots
+    assert np.max(np.sqrt(np.diagonal(family.mu_covariance[0]))) < 3 * SIZE
+
+
+def test_units_soaked_within_less_than_an_interval_have_what_they_entered():
+    units = made.deal("polynomial", 6, 4, size=SIZE)
+    rows = [unit.soaked(4, ("x",)).recordings[0] for unit in units]
+    short = [replace(own, T=21.5 + 2.0 * (own.T - own.T.min()) / np.ptp(own.T)) for own in rows]
+    noise = np.array([SIZE]), np.array([1e-3 * SIZE])
+    family = fit_family([(UnitInformation.of(f"{k}", ("x",), [own], *noise, 2.5), "") for k, own in enumerate(short)])
+    assert family.knots.domain == (20.0, 25.0)
