@@ -152,7 +152,7 @@ def _of_its_dimension(name: Name, unit: str | None) -> Name:
     known = None if unit is None else known_unit(unit.split(" since ")[0])
     if unit is None or known is None or (name.quantity is not None and _understood(unit, name.quantity)):
         return name
-    unnamed = name.quantity is None and not NO_SENSOR.intersection(name.group)
+    unnamed = name.quantity in (None, "time") and not NO_SENSOR.intersection(name.group)  # T1 [°C] is no time
     return replace(name, quantity=quantity_of(known) if unnamed else None)
 
 

@@ -5,9 +5,9 @@
     block of bytes  ->  polars, where every line has as many fields as the header and every cell is a number
                     ->  else line by line, which is slow and says what is wrong, and where
 
-Lines that begin with `#` and blank lines are skipped, SKIPPED bytes of them at most; an empty cell is NaN. A last line
-that its writer did not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is
-standard input. Text in UTF-16 is turned into UTF-8 first.
+Lines that begin with `#` and blank lines are skipped, SKIPPED bytes of them at most; an empty cell is NaN, and so is
+one of the texts MISSING. A last line that its writer did not finish is left out and reported. A gzip archive of such a
+file is read as it is, and `-` is standard input. Text in UTF-16 is turned into UTF-8 first.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ FIRST = re.compile(rb"^(?!#)[^\S\n]*\S[^\n]*", re.M)  # line that is neither
 SEPARATORS = {",": ",", ";": ";", "\t": "\\t", "|": "|", " ": " "}  # and how each is shown
 BLANKS, EDGES = re.compile(rb"[ \t]+"), re.compile(rb"^[ \t]+|[ \t]+(?=\r?$)", re.M)
 MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}  # of encodings, at the beginning
+MISSING = ("n/a", "N/A", "NA", "#N/A", "null", "NULL", "None")  # texts of an empty cell
 COMMA = str.maketrans(",.", ".,")
 DAY = 86_400.0  # s
 GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
@@ -327,8 +328,11 @@ class CsvLines(Table):
         if rest:
             yield offset, rest, True
 
-    def _fast(self, block: bytes, at: dict[str, int]) -> dict[str, Array] | None:
-        """Parse a block with polars; None where a line or a cell is not as it should be."""
+    def _fast(self, block: bytes, at: dict[str, int], missing: Sequence[str] = ()) -> dict[str, Array] | None:
+        """Parse a block with polars; None where a line or a cell is not as it should be.
+
+        Cells of the texts `missing` are empty: a block is only then read with them when it cannot be read without.
+        """
         import polars as pl
 
         n = len(self.columns)
@@ -346,13 +350,14 @@ class CsvLines(Table):
                 comment_prefix="#",
                 schema={name: number if name in used - texts else pl.String for name in names},
                 decimal_comma=self.settings.decimal == ",",
+                null_values=list(missing) or None,
                 columns=sorted(used | {last, extra}, key=names.index),
             )[1:]
             if pointed:  # a cell with a point is no number then
                 cells = pl.col(sorted(used - texts)).str.strip_chars(" \t\r").str.replace(".", "?", literal=True)
                 frame = frame.with_columns(cells.str.replace(",", ".", literal=True).cast(pl.Float64))
         except pl.exceptions.PolarsError:
-            return None
+            return None if missing else self._fast(block, at, MISSING)
         whole = frame[last].null_count() == 0 and frame[extra].null_count() == len(frame) and b'"' not in block
         separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(self.separator))
         if not (whole and separators == (n - 1) * len(frame)) and self._lines(block) != len(frame):
@@ -398,7 +403,7 @@ class CsvLines(Table):
             texts = [" ".join(self._fields(lines[k])[at[part]] for part in self._parts(path)) for k in rows]
             values[path] = numbers_of(texts, form)
             for k, text, value in zip(rows, texts, values[path], strict=True):
-                if np.isnan(value) and text.strip():
+                if np.isnan(value) and text.strip() not in ("", *MISSING):
                     raise BadValue(
                         f"{self.path}: line {where(k)}, column '{path}': '{text[:40]}' is not a date as '{form}'; "
                         "correct it, or source.dates"
@@ -464,14 +469,14 @@ class _Clock:
 
 
 def _number(cell: str) -> float | None:
-    """Return the number in a cell, NaN where it is empty, None where there is something else."""
+    """Return the number in a cell, NaN where it is empty or says so, None where there is something else."""
     if "_" in cell or not cell.isascii():  # which Python takes for part of a number
         return None
     cell = cell.strip()
     if cell[:1] in ("+", "-"):
         cell = cell[0] + cell[1:].lstrip(" ")  # a sign in a place of its own
     try:
-        return float(cell) if cell.strip() else np.nan
+        return np.nan if cell in ("", *MISSING) else float(cell)
     except ValueError:
         return None
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 SEPARATORS = ("\t", ";", ",", "|", " ")
+NOTHING = "".join(SEPARATORS) + "\r\n"  # of a line without a value
 SAMPLE = 400  # lines that are looked at, behind a preamble of at most as many
 NUMBER = {
     sign: re.compile(
@@ -105,12 +106,12 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
 
 
 def _longest_run(rows: Sequence[int], lines: Sequence[str]) -> int:
-    """Return the first of the most rows that nothing but blank lines and comments are between."""
+    """Return the first of the most rows that nothing but lines without a value and comments are between."""
     begin, best, longest = 0, 0, 0
     above = {line.strip() for line in lines[: rows[0]]}  # where the names are: a logger writes them again as it begins
     for k in range(1, len(rows) + 1):
         between = lines[rows[k - 1] + 1 : rows[k]] if k < len(rows) else ["-"]
-        if any(line.strip() and not line.startswith("#") and line.strip() not in above for line in between):
+        if any(line.strip(NOTHING) and not line.startswith("#") and line.strip() not in above for line in between):
             if k - begin > longest:
                 best, longest = rows[begin], k - begin
             begin = k

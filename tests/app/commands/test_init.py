@@ -498,3 +498,40 @@ def test_a_comma_before_three_digits_may_part_thousands(tmp_path, number, guesse
     (tmp_path / "rec.csv").write_text("t;gx;gy;gz\n" + "".join(f"{k};{row}\n" for k, row in enumerate(rows)))
     assert ("# guess: all commas have three digits behind" in init(tmp_path / "rec.csv").text) == guessed
     assert "# guess: all commas" not in init(tmp_path / "rec.csv", decimal="comma").text
+
+
+def test_a_row_without_a_value_does_not_hide_the_names(tmp_path):
+    file = tmp_path / "rec.csv"
+    pl.DataFrame(table(LOGS["spoken"], "deg/s", "g", "ms")).write_csv(file)
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines[:51], "," * lines[0].count(","), *lines[51:]]) + "\n")
+    done = init(file, out=tmp_path / "rec.yaml")
+    assert not done.problems
+    gyro = samples(tmp_path / "rec.yaml")["gyro"]
+    np.testing.assert_allclose(np.delete(gyro, 50, 0), UNIT.gyro, atol=1e-12)
+
+
+def test_a_line_of_units_says_which_column_is_the_thermometer(tmp_path):
+    """T1 alone may be a time."""
+    file = tmp_path / "rec.csv"
+    rows = np.column_stack([UNIT.t, np.rad2deg(UNIT.gyro), UNIT.temperature])
+    text = "\n".join(",".join(f"{v:.9g}" for v in row) for row in rows.tolist())
+    file.write_text(f"clock,GX,GY,GZ,T1\ns,°/s,°/s,°/s,°C\n{text}\n")
+    done = init(file, out=tmp_path / "rec.yaml")
+    assert not done.problems
+    np.testing.assert_allclose(samples(tmp_path / "rec.yaml")["temperature"], UNIT.temperature, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cell", ["n/a", "NA", "null"])
+def test_a_cell_that_says_it_is_empty_is_empty(tmp_path, cell):
+    file = tmp_path / "rec.csv"
+    pl.DataFrame(table(LOGS["spoken"], "deg/s", "g", "ms")).write_csv(file)
+    lines = file.read_text().splitlines()
+    cells = lines[300].split(",")
+    lines[300] = ",".join([*cells[:2], cell, *cells[3:]])
+    file.write_text("\n".join(lines) + "\n")
+    done = init(file, out=tmp_path / "rec.yaml")
+    assert not done.problems
+    gyro = samples(tmp_path / "rec.yaml")["gyro"]
+    assert np.argwhere(np.isnan(gyro)).tolist() == [[299, 1]]
+    np.testing.assert_allclose(np.delete(gyro, 299, 0), np.delete(UNIT.gyro, 299, 0), atol=1e-12)
