@@ -89,7 +89,7 @@ def number(value: float, *, zeros: bool = False, missing: str = "") -> str:
     """
     if missing and not math.isfinite(value):
         return missing
-    if not value < 1000:
+    if not abs(value) < 1000:
         return f"{value:.0f}"
     return f"{value:#.3g}".rstrip(".") if zeros else f"{value:.3g}"
 

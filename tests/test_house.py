@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3712
+    assert 0 < count <= 3720
 
 
 def imports():
@@ -259,36 +259,36 @@ BUDGET = {
     "driftlab": 633,
     "driftlab/commands": 3755,
     "driftlab/evaluation": 1466,
-    "driftlab/family": 3257,
-    "driftlab/filtering": 1246,
-    "driftlab/identification": 2155,
+    "driftlab/family": 3265,
+    "driftlab/filtering": 1245,
+    "driftlab/identification": 2170,
     "driftlab/live": 848,
     "driftlab/maps": 1789,
-    "driftlab/noise": 1199,
-    "driftlab/planning": 1263,
+    "driftlab/noise": 1211,
+    "driftlab/planning": 1259,
     "driftlab/production": 3155,
     "driftlab/products": 6,
     "driftlab/recordings": 456,
-    "driftlab/reports": 3507,
+    "driftlab/reports": 3506,
     "driftlab/soak": 658,
-    "driftlab/spc": 1524,
+    "driftlab/spc": 1517,
     "driftlab/starter": 850,
-    "driftlab/storage": 1269,
-    "driftlab/triad": 593,
+    "driftlab/storage": 1278,
+    "driftlab/triad": 592,
     "fusion_core": 1855,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 822,
     "fusion_core/host": 748,
     "fusion_core/testing": 1002,
-    "fusion_core/thermal": 1053,
+    "fusion_core/thermal": 1061,
     "fusion_core/units": 431,
     "plugins": 302,
     "plugins/bias_models": 254,
-    "plugins/effects": 748,
+    "plugins/effects": 750,
     "plugins/exporters": 1754,
     "plugins/framings": 641,
     "plugins/measurement_models": 774,
-    "plugins/sources": 5311,
+    "plugins/sources": 5314,
     "plugins/stimuli": 288,
     "plugins/thermal_maps": 897,
 }

@@ -320,7 +320,8 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
     if verdict.word == "nothing_missing":
-        lines.append(f"no effect of {search.tried} candidates has enough evidence, and what is left looks like noise")
+        left = "it may be what is named above" if verdict.promising else "what is left looks like noise"
+        lines.append(f"no effect of {search.tried} candidates has enough evidence, and {left}")
     return lines
 
 

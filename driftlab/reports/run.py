@@ -94,8 +94,9 @@ def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[
     axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
     result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
     of = axis and f" of {scores.axes[unsure]}"
-    trust = f"its sigma{of} there, {unit.number(sigma)} {unit.shown}, " + (
-        "covers the error" if ratio <= REFUTED else f"is too small by {ratio:.1f} times: widen walk or map"
+    verdict = "a right sigma allows" if ratio <= REFUTED else "is too much: widen walk or map"
+    trust = (
+        f"its sigma{of} there is {unit.number(sigma)} {unit.shown}, the error {ratio:.1f} times that, which {verdict}"
     )
     turned = f"{name} without updates turn the heading by {np.rad2deg(scores.heading[name]):.2g} deg; " * heading
     return f"{result}.", f"{turned}{trust}."

@@ -12,6 +12,7 @@ from driftlab.family.record import FIGURES, figure_name
 from driftlab.spc.acknowledgements import Alarm
 from driftlab.spc.capability import WORTH
 from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
+from driftlab.units import number
 
 if TYPE_CHECKING:
     from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
@@ -74,8 +75,8 @@ def alarms(line: LineReport) -> dict[int, list[Alarm]]:
         for k in np.flatnonzero(chart.beyond & chart.of_family).tolist():
             value, low, high = (values[k] * unit.factor for values in (chart.value, *limits))
             low = low if chart.quantity == "level" else max(low, 0.0)
-            about = f"{_called(chart)} {value:.3g} {unit.shown}"
-            alarm = Alarm(about, f"{about}, limits {low:.3g} to {high:.3g}")
+            about = f"{_called(chart)} {number(value)} {unit.shown}"
+            alarm = Alarm(about, f"{about}, limits {number(low)} to {number(high)}")
             found.setdefault(int(chart.at[k]), []).append(alarm)
         begun = {"the EWMA leaves its limits here": chart.drifting & chart.of_family, **chart.patterns}
         for what, where in begun.items():
@@ -147,7 +148,7 @@ def by_how_much(line: LineReport, chart: ControlChart, change: StepChange | Tren
     way = "rose" if change.after > change.before else "fell"
     unit = line.shown(chart.quantity)
     if chart.quantity == "level" or change.before <= 0:
-        return f"{way} by {abs(change.after - change.before) * unit.factor:.3g} {unit.shown}"
+        return f"{way} by {number(abs(change.after - change.before) * unit.factor)} {unit.shown}"
     share = 100 * abs(change.after / change.before - 1)
     return f"{way} by {share:.{0 if share >= 10 else 1}f} %"
 
@@ -186,7 +187,8 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
     if counted:  # else the units beyond frozen limits are
         lines.append(
-            f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
+            f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would, "
+            "its sigma being known no better than from these units."
         )
     alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
     if alike:
@@ -228,7 +230,7 @@ def _limits(line: LineReport) -> list[str]:
             )
             text = f"{limit}: {worst.axis} is worst{since}, {indices}, {worst.beyond:,} of {worst.n:,} units above"
         else:
-            share = f"{100 * worst.share_low:.2g} to {100 * worst.share_high:.2g} %"
+            share = f"{100 * worst.share_low:.3g} to {100 * worst.share_high:.3g} %"
             above = f"{worst.beyond:,} of {worst.n:,} units above (95 %: {share})"
             text = f"{limit}: {worst.axis} is worst{since}, {above}"
         reasons = "; ".join(

@@ -116,7 +116,7 @@ class Yield:
         whole = self.whole
         if not whole.reasons:
             return []
-        first = ", ".join(f"{reason} {count:,}" for reason, count in [*whole.reasons.items()][:3])
+        first = ", ".join(f"{reason} ({count:,})" for reason, count in [*whole.reasons.items()][:3])
         more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
         lines = [f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}; not accepted: {first}{more}"]
         for column, groups in self.by.items():
@@ -165,7 +165,7 @@ def reasons(record: UnitRecord) -> list[str]:
     """
     if record.state == "failed":
         text = re.sub(r"^\S*[/\\]\S*: ", "", record.error.partition(";")[0]).replace(record.unit, "…")
-        text = re.sub(r"[^\s:;,]*[/\\][^\s:;,]*", "…", text)
+        text = re.sub(r"[^\s:;,'\"]*[/\\][^\s:;,'\"]*\.\w+", "…", text)
         text = re.sub(r"[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?", "…", text)
         return [f"not calibrated: {re.sub('(… ?)+', '… ', text).strip() or 'no reason given'}"]
     if worst(record.limits) in (None, "pass"):

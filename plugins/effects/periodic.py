@@ -80,6 +80,8 @@ def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
     whole = float(np.ptp(t))
     steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MAX_FREQUENCIES)
     f = 1 / period + np.linspace(-1, 1, 2 * steps + 1) / longest
+    if not np.any(f * longest >= _CYCLES):  # gaps at the beginning: the step is no longer that of most rows
+        return period
     f = f[f * longest >= _CYCLES]
     t = t - t.mean()
     power = [float(np.sum(np.abs(np.exp(-2j * np.pi * frequency * t) @ e) ** 2)) for frequency in f]

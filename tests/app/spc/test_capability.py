@@ -146,5 +146,5 @@ def test_an_index_of_a_normal_line_is_there_and_in_json():
 def test_the_worst_axis_is_the_one_with_most_units_above_where_it_has_no_index():
     every_second = [("noise", "x", k, k + 1, 8.0) for k in range(0, 200, 2)]  # two more are by chance
     found = line_of(line(200, 5, planted=every_second), NOISE)
-    assert "x is worst, 102 of 200 units above (95 %: 44 to 58 %)" in found.sentences[-1]
+    assert "x is worst, 102 of 200 units above (95 %: 43.9 to 58.1 %)" in found.sentences[-1]
     assert "no index of x: not normal" in found.sentences[-1]

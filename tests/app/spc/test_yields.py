@@ -39,8 +39,8 @@ def test_yield_and_reasons_of_the_whole():
     assert found.covered == (3, 4, 6)  # one has two of them
     interval = stats.binomtest(14, 20).proportion_ci(method="exact")
     assert whole.interval == pytest.approx((interval.low, interval.high))
-    said = "yield: 14 of 20 units, 70 % (95 %: 45.7 to 88.1 %); not accepted: noise above limit 3, residual undecided 2"
-    assert found.sentences()[0].startswith(said)
+    share, why = "70 % (95 %: 45.7 to 88.1 %)", "noise above limit (3), residual undecided (2)"
+    assert found.sentences()[0].startswith(f"yield: 14 of 20 units, {share}; not accepted: {why}")
 
 
 def test_errors_that_differ_in_names_and_numbers_are_one_reason():

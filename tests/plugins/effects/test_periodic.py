@@ -24,6 +24,16 @@ def test_periodic_finds_a_line_in_noise():
     assert list(Periodic().proposals([silent])) == []
 
 
+def test_gaps_at_the_beginning_leave_a_proposal():
+    """The first rows are further apart than most: a slow line by their step is one of too few cycles by the clock."""
+    rows = np.arange(800)
+    t = np.cumsum(np.where(rows < 120, 4.0, 1.0))
+    residual = np.sin(2 * np.pi * 10.5 * rows / 800)[:, None] * np.ones(3)
+    periods = [c.period for c in Periodic().proposals([Chunk(t, {"residual": residual})])]
+    assert periods
+    assert np.all(np.isfinite(periods))
+
+
 def test_periodic_is_a_line_of_any_phase():
     t = 40 + np.arange(500) * 0.5
     B = on_one_axis(Periodic(period="97 s"), Chunk(t))
