@@ -261,7 +261,7 @@ BUDGET = {
     "driftlab/evaluation": 1466,
     "driftlab/family": 3265,
     "driftlab/filtering": 1245,
-    "driftlab/identification": 2170,
+    "driftlab/identification": 2172,
     "driftlab/live": 848,
     "driftlab/maps": 1789,
     "driftlab/noise": 1211,

@@ -26,7 +26,7 @@ from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.records import Evidence, Progress, Record, row_starts
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, contains, tried
-from driftlab.noise.local_level import LocalLevel, one_step
+from driftlab.noise.local_level import LocalLevel, one_step, whitened
 from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
@@ -205,7 +205,6 @@ SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the t
 SLOW = 120.0  # s: a residual over means of that length spoils a coast
 MATTERS = 0.5  # of the error on left-out parts
 MAX_NATS = 700.0  # exp of minus that is nearly the least number of a computer
-SETTLE = 3  # rows of a recording whose average is not yet of many
 
 
 @dataclass(frozen=True)
@@ -249,12 +248,21 @@ def structures(search: Search, error: Array) -> list[Structure]:
 
 
 def _white(search: Search, parts: list[Array]) -> list[Array]:
-    """Return the one-step errors (n', d) of the residual (n, d) of each recording, in their deviation."""
-    axes = [
-        [e[SETTLE:] / np.sqrt(noise.variance) for e in one_step([part[:, axis] for part in parts], noise.gain)]
-        for axis, noise in enumerate(search.noises)
+    """Return the normalised innovations (n - 1, d) of the residual (n, d) of each recording, by its noise."""
+    return [
+        np.stack([innovations(part[:, axis], noise) for axis, noise in enumerate(search.noises)], axis=1)
+        for part in parts
     ]
-    return [np.stack(errors, axis=1) for errors in zip(*axes, strict=True)]
+
+
+def innovations(e: Array, noise: LocalLevel) -> Array:
+    """Return the normalised innovations (n - 1,) of a residual e (n,) whose level at the start is not known.
+
+    An average of the first few rows is off by their noise, and a sum over those that follow would show it as a jump.
+    """
+    walk = np.full(len(e), noise.walk)
+    walk[0] = np.inf
+    return np.asarray(whitened(e[:, None], np.full(len(e), noise.white), walk)[0][1:, 0])
 
 
 def _slow(interval: float, parts: list[Array], error: Array) -> bool:

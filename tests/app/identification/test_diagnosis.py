@@ -3,7 +3,8 @@
 import numpy as np
 from rows_at_rest import evidence, search_of
 
-from driftlab.identification.diagnosis import structures
+from driftlab.identification.diagnosis import innovations, structures
+from driftlab.noise.local_level import fit_local_level
 
 
 def test_what_is_left_is_noise_or_is_not():
@@ -25,3 +26,14 @@ def test_what_is_left_is_noise_or_is_not():
     assert quiet == [[]] * 5
     assert all(any("jumps" in s.description for s in seen) for seen in jumping)
     assert all(s.log_likelihood_gain > s.threshold for seen in jumping for s in seen)
+
+
+def test_the_first_rows_of_a_recording_are_no_jump():
+    """Sums of innovations over any rows are normal, those of the first rows too, whatever the walk."""
+    for ratio in (0.0, 0.02, 0.3):
+        first, rng = [], np.random.default_rng(3)
+        for _ in range(400):
+            e = rng.normal(size=500) + np.cumsum(rng.normal(0, ratio, 500))
+            first.append(innovations(e, fit_local_level([e]))[:8].sum() / np.sqrt(8))
+        assert np.std(first) < 1.1
+        assert np.max(np.abs(first)) < 4.3
