@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord
 from fusion_core.chunk import Array
@@ -105,6 +106,11 @@ class UnitRecords:
                 out[of_code] = np.asarray(held)[first[:, None] + at]
         return table
 
+    def keys(self, units: Sequence[str]) -> NDArray[np.uint64]:
+        """Return the keys (n, 4) of the work on some units: hashes of recordings and config, 0 where none is known."""
+        rows = np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
+        return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[rows]
+
     def names(self, units: Sequence[str]) -> set[str]:
         """Return the names of the figures that any of some units has."""
         codes = {self._codes[self._rows[unit]] for unit in units}
@@ -142,6 +148,16 @@ class RecordsOfUnits(Sequence[UnitRecord]):
 
     def __iter__(self) -> Iterator[UnitRecord]:
         return map(self.records.__getitem__, self.units)
+
+    def same_recordings(self) -> list[list[str]]:
+        """Return the names of units whose recordings are the same, byte by byte, in groups."""
+        keys = self.records.keys(self.units)
+        _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        twice = np.flatnonzero((count[group] > 1) & keys.any(axis=1))
+        found: dict[int, list[str]] = {}
+        for k in twice.tolist():
+            found.setdefault(int(group[k]), []).append(self.units[k])
+        return list(found.values())
 
     def in_state(self, state: str) -> RecordsOfUnits:
         """Return those that are in a state."""

@@ -373,6 +373,7 @@ class _Command:
             store=folder.mark.get("store"),
             replaced=jobs.again,
             kept_without_recordings=jobs.without_recordings,
+            same_recordings=status.done.same_recordings(),
             left=left,
             failed={record.unit: record.error for record in status.failed[:SHOWN]},
             certificates_failed=self.failed,

@@ -93,6 +93,7 @@ def fleet_progress() -> Iterator[FleetProgress]:
 
 
 NAMED = 10  # units that a line names
+SHOWN = 5  # groups of units with the same recordings
 MAX_PAGES = 20  # pages of units that stand out and were not asked for
 
 
@@ -164,6 +165,7 @@ class FleetSummary(BaseModel):
     store: str | None = None
     replaced: list[str] = []
     kept_without_recordings: list[str] = []
+    same_recordings: list[list[str]] = []
     left: list[str] = []
     failed: dict[str, str] = {}
     certificates_failed: Annotated[list[str], Field(exclude=True)] = []
@@ -211,6 +213,8 @@ class FleetSummary(BaseModel):
                 f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables "
                 "leave them out"
             )
+        for names in self.same_recordings[:SHOWN]:
+            lines.append(f"units {some(names)} have the same recordings and count as {len(names)}: name these once")
         if without:
             lines.append(
                 f"of {units(len(without))} a recording is not there any more ({some(without)}): their results "

@@ -124,6 +124,17 @@ def test_lots_dates_and_the_rest_are_those_of_the_manifest_now(fleet):
     assert (record["lot"], record["more"]) == ("north", {"noise": "K0"})
 
 
+def test_one_recording_given_for_two_units_is_said_to_be(fleet):
+    result, _ = fleet()
+    assert result.summary["same_recordings"] == []
+    shutil.copy("units/0000/soak.h5", "units/0002/soak.h5")
+    result, asked = fleet()
+    assert asked == ["0002"]
+    assert result.summary["same_recordings"] == [["0000", "0002"]]
+    said = "units 0000, 0002 have the same recordings and count as 2: name these once"
+    assert said in result.lines()
+
+
 def test_a_unit_that_left_stays_where_it_is_and_out_of_the_tables(fleet):
     lines = Path("units.csv").read_text().splitlines()
     Path("units.csv").write_text("\n".join(line for line in lines if not line.startswith("0001")))
