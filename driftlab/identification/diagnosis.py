@@ -82,14 +82,14 @@ def judge(search: Search, error: Array, progress: Progress) -> Diagnosis:
     beside = replace(search, model=(*search.model, *(trial.term for trial in unnamed)))
     beside.noises = beside.noises_of(beside.model)
     left = (*map(_structure, unnamed), *structures(beside, error))
+    promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
-    elif left:
+    elif left or any(map(_likely, promising)):
         word = "unexplained"
     else:
         word = "explained" if findings else "nothing_missing"
-    promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
     experiments = propose(search, _questions(findings, promising))
     return Diagnosis(word, findings, rejected, left, promising, experiments)
 
@@ -164,8 +164,13 @@ def _promising(trial: Trial) -> bool:
     """Return True if left-out parts or fast times speak for a candidate, though not enough of them."""
     evidence = trial.evidence
     slow = evidence.steady < -1 and evidence.left_out > 0 and evidence.ratio < PROMISING
-    likely = evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
-    return not trial.passes and (slow or likely)
+    return not trial.passes and (slow or _likely(trial))
+
+
+def _likely(trial: Trial) -> bool:
+    """Return True if a candidate is significant at fast times, and predicts no worse."""
+    evidence = trial.evidence
+    return evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
 
 
 def _unnamed(search: Search) -> list[Trial]:
