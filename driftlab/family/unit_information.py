@@ -136,8 +136,8 @@ class UnitInformation:
             own = {name: file[f"{k}/{name}"] for number, name in names if int(number) == k}
             channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
             recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
-        low, high = file["seen"].tolist()
+        knots = SplineBasis(int(first), int(intervals), float(step))
+        low, high = file["seen"].tolist() if "seen" in file else knots.domain  # of a file from before
         return cls(
-            str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
-            (low, high), file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
+            str(file["unit"]), tuple(file["axes"].tolist()), knots, (low, high), file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
         )  # fmt: skip
