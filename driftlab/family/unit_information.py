@@ -139,5 +139,6 @@ class UnitInformation:
         knots = SplineBasis(int(first), int(intervals), float(step))
         low, high = file["seen"].tolist() if "seen" in file else knots.domain  # of a file from before
         return cls(
-            str(file["unit"]), tuple(file["axes"].tolist()), knots, (low, high), file["J"], file["h"], int(file["count"]), file["white"], file["walk"], tuple(recordings),
+            str(file["unit"]), tuple(file["axes"].tolist()), knots, (low, high), file["J"], file["h"],
+            int(file["count"]), file["white"], file["walk"], tuple(recordings),
         )  # fmt: skip
