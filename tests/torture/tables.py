@@ -13,6 +13,7 @@ from torture.truth import Truth
 CASES, WORKERS, LIMIT, IN_PROCESS = 1_000, 2, 5.0, True
 RNG = np.random.Generator
 WORDS = {"nan": np.nan, "inf": np.inf, "infinity": np.inf}  # as every language prints them, in any case, with a sign
+EMPTY = ("", "n/a", "N/A", "NA", "#N/A", "null", "NULL", "None")  # as spreadsheets, R and databases write it
 
 CELLS = (
     "", " ", "nan", "NaN", "-nan", "inf", "-Infinity", "1e999", "1e-999", "x", "ERR", "1,5", '"1,5"', "1.5.2",
@@ -27,7 +28,7 @@ CELLS = (
 def cell(text: str) -> float | None:
     """Return the number in a cell, NaN where it is empty, None where it is none."""
     text = text.strip(" \t")
-    if not text:
+    if text in EMPTY:
         return np.nan
     word = WORDS.get(text.lstrip("+-").lower()) if text[:2] not in ("--", "++", "+-", "-+") else None
     return word * (-1 if text[0] == "-" else 1) if word is not None else grammar.number(text)
