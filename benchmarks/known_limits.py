@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
+from loop_cases.signatures import late
 
 import driftlab
 
@@ -35,8 +35,7 @@ def temperature(*, back: bool) -> np.ndarray:
     """Return the temperature (N,) of a body that follows a ramp up, and back down."""
     corners = [0.0, 0.02, 0.49, 0.51, 1.0] if back else [0.0, 0.03, 0.97, 1.0, 1.0]
     chamber = np.interp(np.arange(N) / N, corners, [LOW, LOW, HIGH, HIGH, LOW if back else HIGH])
-    gain = 1 - np.exp(-1 / LAG)
-    return np.asarray(lfilter([gain], [1, gain - 1], chamber, zi=[LOW * (1 - gain)])[0])
+    return np.asarray(late(chamber, LAG))
 
 
 def cubic(rng: np.random.Generator) -> Curve:
@@ -90,12 +89,12 @@ def two_lags(seed: int) -> tuple[np.ndarray, bool]:
     The size is that of the largest difference between warming and cooling at one temperature, 2 K from either end.
     """
     rng, T = np.random.default_rng([seed, 3]), temperature(back=True)
-    curves, late, at = [cubic(rng) for _ in range(3)], np.empty(N), LOW
+    curves, behind, at = [cubic(rng) for _ in range(3)], np.empty(N), LOW
     for k, now in enumerate(T.tolist()):
         at += (now - at) / (120.0 if now > at else 900.0)
-        late[k] = at
+        behind[k] = at
     loop = np.zeros((N, 3))
-    loop[:, 0] = curves[0](late) - curves[0](T) + late - T
+    loop[:, 0] = curves[0](behind) - curves[0](T) + behind - T
     grid, top = np.linspace(LOW + 2, HIGH - 2, 300), int(np.argmax(T))
     up, down = np.interp(grid, T[:top], loop[:top, 0]), np.interp(grid, T[top:][::-1], loop[top:, 0][::-1])
     size = float(np.max(np.abs(up - down)))

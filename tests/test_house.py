@@ -259,7 +259,7 @@ BUDGET = {
     "driftlab": 633,
     "driftlab/commands": 3755,
     "driftlab/evaluation": 1466,
-    "driftlab/family": 3278,
+    "driftlab/family": 3279,
     "driftlab/filtering": 1245,
     "driftlab/identification": 2174,
     "driftlab/live": 848,

@@ -92,7 +92,7 @@ class UnitRecords:
 
     def column(self, units: Sequence[str], name: str, d: int) -> Array:
         """Return values and deviations (2, n, d) of a figure of some units, NaN where they are not known."""
-        rows = np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
+        rows = self._places(units)
         table, codes = np.full((2, len(units), d), np.nan), np.asarray(self._codes)[rows]
         for code in np.unique(codes):
             *_, axes, _, _, names = self._common[code]
@@ -108,8 +108,11 @@ class UnitRecords:
 
     def keys(self, units: Sequence[str]) -> NDArray[np.uint64]:
         """Return the keys (n, 4) of the work on some units: hashes of recordings and config, 0 where none is known."""
-        rows = np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
-        return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[rows]
+        return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[self._places(units)]
+
+    def _places(self, units: Sequence[str]) -> NDArray[np.intp]:
+        """Return the rows (n,) of some units."""
+        return np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
 
     def names(self, units: Sequence[str]) -> set[str]:
         """Return the names of the figures that any of some units has."""
