@@ -91,7 +91,10 @@ def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
 def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
     for k in range(len(variance)):
         F_k, C_k = F[min(k, len(F) - 1)], C[min(k, len(C) - 1)]
-        P[:] = F_k @ P @ F_k.T + Q[min(k, len(Q) - 1)]
+        after, Q_k = F_k @ P @ F_k.T, Q[min(k, len(Q) - 1)]
+        for i in range(len(P)):
+            for j in range(len(P)):
+                P[i, j] = after[i, j] + Q_k[i, j]
         CP = C_k @ P
         for j in range(len(C_k)):
             variance[k, j] = np.sum(CP[j] * C_k[j])

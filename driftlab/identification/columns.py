@@ -32,6 +32,7 @@ from fusion_core.fast import compiled, inlined
 Indices = NDArray[np.intp]
 
 TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not determine stays small
+ROUNDING = 1e-14  # of the square of a column: what is left of it is nothing
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,47 @@ def _reduced(G: Array, V: Array, i: int, j: int) -> float:
     return float(total)
 
 
+@inlined
+def _squares_explained(A: Array, b: Array) -> float:
+    """Return b' A^-1 b of a symmetric A (k, k), which is overwritten by its Cholesky factor L, and b (k,) by L^-1 b.
+
+    A column that is a combination of those before it, to rounding, explains nothing more: L is infinite there.
+    """
+    squares = 0.0
+    for j in range(len(b)):
+        whole = A[j, j]
+        for q in range(j):
+            A[j, j] -= A[j, q] * A[j, q]
+            b[j] -= A[j, q] * b[q]
+        root = np.sqrt(A[j, j]) if A[j, j] > ROUNDING * whole else np.inf
+        A[j, j], b[j] = root, b[j] / root
+        squares += b[j] * b[j]
+        for i in range(j + 1, len(b)):
+            for q in range(j):
+                A[i, j] -= A[i, q] * A[j, q]
+            A[i, j] /= root
+    return squares
+
+
+@inlined
+def _coefficients(L: Array, w: Array, first: int) -> tuple[Array, Array]:
+    """Return coefficients and variances (k,) under noise of a variance of 1, from the `first` on; w is L^-1 b (k,)."""
+    k = len(w)
+    beta, variances, column = np.zeros(k), np.zeros(k), np.zeros(k)
+    for i in range(k - 1, first - 1, -1):
+        beta[i] = w[i]
+        for r in range(i + 1, k):
+            beta[i] -= L[r, i] * beta[r]
+        beta[i] /= L[i, i]
+        for r in range(i, k):
+            column[r] = 1.0 if r == i else 0.0
+            for q in range(i, r):
+                column[r] -= L[r, q] * column[q]
+            column[r] /= L[r, r]
+            variances[i] += column[r] ** 2
+    return beta, variances
+
+
 @compiled
 def left_with_starts(G: Array, V: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
     """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
@@ -156,14 +198,13 @@ def left_with_starts(G: Array, V: Array, y: int, cols: Indices, sizes: Indices, 
     for i in range(k):
         A[i, i] += TINY * level
     if np.sum(sizes) > 0:
-        inverse = np.linalg.inv(A)
-        beta = inverse @ b
-        slow = colour * max(yy - b @ beta, 1e-12 * yy, 1e-300) / rows
-        at = k - np.sum(sizes)
+        L, w, at = A.copy(), b.copy(), k - np.sum(sizes)
+        slow = colour * max(yy - _squares_explained(L, w), 1e-12 * yy, 1e-300) / rows
+        beta, variances = _coefficients(L, w, at)
         for size in sizes:
             sd2 = 0.0
             for i in range(at, at + size):
-                sd2 += (beta[i] ** 2 - slow * inverse[i, i]) / size
+                sd2 += (beta[i] ** 2 - slow * variances[i]) / size
             for i in range(at, at + size):
                 if sd2 > 0:
                     A[i, i] += slow / sd2
@@ -172,7 +213,7 @@ def left_with_starts(G: Array, V: Array, y: int, cols: Indices, sizes: Indices, 
                     A[:, i] = 0.0
                     A[i, i], b[i] = level, 0.0
             at += size
-    return float(yy - b @ np.linalg.solve(A, b))
+    return float(yy - _squares_explained(A, b))
 
 
 PARTS = 5  # that a single recording is cut into

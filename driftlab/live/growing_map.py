@@ -178,7 +178,7 @@ class GrowingMap:
         interval = n * (self.config.filter.update_interval if self.config.filter else 1.0)
         domain = Used(low=self.used.low, high=self.used.high)
         name = self.config.source.name if self.config.source else ""
-        soak = GatheredSoak(T, blocks.bias, [name], [0], interval, used=domain, steps=steps)
+        soak = GatheredSoak(blocks.t, T, blocks.bias, [name], [0], interval, used=domain, steps=steps)
         fitted = fit_gathered(self.config, self.settings, soak)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:

@@ -190,6 +190,7 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
 class GatheredSoak:
     """The samples at rest of one or more recordings, joined."""
 
+    t: Array  # (N,): s; a recording begins an interval after the one before it
     T: Array  # (N,): temperature in degC, without the thermometer's steps, in the order of time
     bias: Array  # (N, d): tracked bias, SI
     names: list[str]  # names of the recordings
@@ -204,7 +205,7 @@ class GatheredSoak:
 
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""
-        return brief(self.T, self.bias, self.starts, self.interval)
+        return brief(self.T, self.bias, self.starts, self.interval, self.t)
 
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
@@ -252,7 +253,26 @@ def gather(
         known = np.concatenate([part.known for part in parts])
         bias, placements = placed(T, bias + known[placement], placement, *unknown)
         starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return GatheredSoak(T, bias, names, starts, interval, _about(configs), placements, windows, used, steps)
+    return GatheredSoak(
+        _joined([part.t for part in parts], interval),
+        T,
+        bias,
+        names,
+        starts,
+        interval,
+        _about(configs),
+        placements,
+        windows,
+        used,
+        steps,
+    )
+
+
+def _joined(times: Sequence[Array], interval: float) -> Array:
+    """Return the times (N,) of recordings, each an interval after the one before it."""
+    lasts = [t[-1] - t[0] + interval for t in times]
+    begins = np.cumsum([0.0, *lasts])[:-1]
+    return np.concatenate([t - t[0] + begin for t, begin in zip(times, begins, strict=True)])
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:

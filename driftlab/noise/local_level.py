@@ -11,14 +11,13 @@ g^2 S a row. J. F. Muth, J. Am. Stat. Assoc. 55 (1960) 299. So the gain of least
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.fast import compiled
-from fusion_core.thermal.soak_noise import minimum_near
 
 
 @compiled
@@ -45,7 +44,8 @@ def whitened(columns: Array, white: Array, walk: Array) -> tuple[Array, Array]:
         if np.isinf(white[k]):
             continue
         if np.isinf(P):
-            x[:] = columns[k]
+            for j in range(m):
+                x[j] = columns[k, j]
             P = white[k]
             continue
         S = P + white[k]
@@ -227,3 +227,12 @@ def _of_walk(power: Array) -> Array:
         sizes, _ = nnls(shapes[high] * weight[:, None], power[high] * weight)
         omega = np.maximum(shapes @ sizes, 1e-12 * float(np.mean(power)))
     return np.asarray(omega)
+
+
+def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5, costs: Array | None = None) -> float:
+    """Return the minimum of a cost, between the neighbours of the best place of a grid, where it may be known."""
+    from scipy.optimize import minimize_scalar
+
+    k = int(np.argmin([cost(float(x)) for x in grid] if costs is None else costs))
+    bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)

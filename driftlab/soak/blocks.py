@@ -188,12 +188,16 @@ class SoakSummary(SoakRows):
         return self.count[row], self.cell_T[row], self.cell_bias[row]
 
 
-def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> SoakSummary:
-    """Return the summary of samples T (N,), bias (N, d); each recording begins at one of `starts`, the first at 0."""
+def brief(T: Array, bias: Array, starts: Sequence[int], interval: float, times: Array | None = None) -> SoakSummary:
+    """Return the summary of samples T (N,), bias (N, d); each recording begins at one of `starts`, the first at 0.
+
+    They are an `interval` apart, s, unless it is known at which `times` (N,) they were: what was not recorded, or was
+    not at rest, is a gap over which a bias wanders on.
+    """
     N, domain = len(T), (float(T.min()), float(T.max()))
     cuts = runs(starts, N, -(-N // SLOTS))
     n, recording = np.diff(cuts, append=N), np.searchsorted(np.asarray(starts), cuts, side="right") - 1
-    t, row_T = (cuts + (n - 1) / 2) * interval, means(T, cuts)
+    t, row_T = (cuts + (n - 1) / 2) * interval if times is None else means(times, cuts), means(T, cuts)
     threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(row_T))
     way = np.concatenate([directions(row_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])

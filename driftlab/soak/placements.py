@@ -137,10 +137,8 @@ def _solved(design: _Design, up: Array) -> list[_Solved]:
     free = [Contrasts(blocks, own) for own in columns]
     one = np.eye(len(blocks.T))
     noises = [contrasts.noise(y, one) for contrasts, y in zip(free, blocks.y.T, strict=True)]
-    # a walk that hardly shows is often taken for none: no axis has less than all have on average
-    usual = float(np.mean([noise.walk / noise.white for noise in noises if noise.white > 0] or [0.0]))
     roots = [
-        np.hstack([np.sqrt(max(n.walk, usual * n.white)) * c.walk, np.diag(np.sqrt(n.white * c.white))])
+        np.hstack([np.sqrt(n.walk) * c.walk, np.diag(np.sqrt(n.white * c.white))])
         for n, c in zip(noises, free, strict=True)
     ]
     return [_axis(design, y, own, root) for y, own, root in zip(blocks.y.T, columns, roots, strict=True)]

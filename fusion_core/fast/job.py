@@ -286,7 +286,8 @@ def steady_of_many(
                 x_j = x[j, g]
                 for i in range(len(s)):
                     before[i] += turned[g, j, i] * x_j
-            after[:] = before
+            for i in range(len(s)):
+                after[i] = before[i]
             for i in range(len(c)):
                 y, white = observe(s, (k, i, g), H, before, after, z, root[k_K, kind[g], i], out)
                 nis += white * white

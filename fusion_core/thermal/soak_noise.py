@@ -5,8 +5,8 @@ temperature, the bias is::
 
     y = X beta + walk + white,    walk: the means of a random walk over the blocks,    white_k ~ N(0, s^2 / n_k)
 
-X are straight pieces between knots in T, free to follow any curve, up and down alike; both variances are found by
-restricted maximum likelihood, so that what a bias wanders over hours counts, and not the noise of one sample.
+X are straight pieces between knots in T, free to follow any curve, up and down alike; both variances are means over
+their restricted likelihood, so that what a bias wanders over hours counts, and not the noise of one sample.
 
 Source: H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika
 58 (1971) 545.
@@ -39,7 +39,7 @@ FINE = 1000
 STRETCHES = 1920  # of time, at most: resolution of the times of a block
 RANK = 1e-9  # of the largest singular value: columns that are combinations of others
 TAKEN = 1e-6  # of the largest eigenvalue: a contrast of which the map leaves less says nothing
-RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
+RATIOS = np.logspace(-6, 6, 241)  # of the walk's variance over a soak to the white noise of a block
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Contrasts:
         A = self.Z.T @ left  # the map has taken its part of the noise already
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
         if len(A) >= MIN_BLOCKS:
-            k2, s2 = _likeliest(*self._turned(A, self.Z.T @ (y / scale)))
+            k2, s2 = _expected(*self._turned(A, self.Z.T @ (y / scale)))
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
@@ -217,29 +217,21 @@ def _solved(root: Array, X: Array) -> Array:
     return np.asarray(cho_solve((root, True), X, check_finite=False))
 
 
-def _likeliest(own: Array, u: Array) -> tuple[float, float]:
-    """Return the variances of walk and white noise for which u (m,) ~ N(0, k^2 own + s^2) is likeliest."""
+def _expected(own: Array, u: Array) -> tuple[float, float]:
+    """Return the means of the variances of walk and white noise, given u (m,) ~ N(0, k^2 own + s^2).
+
+    The likeliest walk is none in many soaks that have one. What follows from the noise is linear in both variances,
+    and is right on average with their means: k / s and log s are as probable everywhere before (A. Gelman, Prior
+    distributions for variance parameters in hierarchical models, Bayesian Analysis 1 (2006) 515).
+    """
     if not np.any(u):
         return 0.0, 0.0
-
-    def at(ratio: float) -> tuple[float, float]:
-        variances = ratio * own + 1.0
-        scale = float(np.mean(u**2 / variances))
-        return len(u) * np.log(scale) + float(np.sum(np.log(variances))), scale
-
-    best = float(np.exp(minimum_near(lambda log: at(float(np.exp(log)))[0], np.log(RATIOS))))
-    best = best if at(best)[0] < at(0.0)[0] else 0.0
-    scale = at(best)[1]
-    return best * scale, scale
-
-
-def minimum_near(cost: Callable[[float], float], grid: Array, xatol: float = 1e-5, costs: Array | None = None) -> float:
-    """Return the minimum of a cost, between the neighbours of the best place of a grid, where it may be known."""
-    from scipy.optimize import minimize_scalar
-
-    k = int(np.argmin([cost(float(x)) for x in grid] if costs is None else costs))
-    bounds = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
-    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol}).x)
+    variances = np.outer(RATIOS, own) + 1.0
+    squares = np.sum(u**2 / variances, axis=1)
+    log_density = np.log(RATIOS) / 2 - len(u) / 2 * np.log(squares) - np.sum(np.log(variances), axis=1) / 2
+    weight = np.exp(log_density - np.max(log_density))
+    white = weight / np.sum(weight) * squares / (len(u) - 2)
+    return float(white @ RATIOS), float(np.sum(white))
 
 
 def _pieces(blocks: Blocks) -> tuple[Array, Array]:

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
-from scipy.stats import multivariate_normal
+from scipy.linalg import cho_factor, cho_solve
 
 from fusion_core.thermal.soak_noise import Contrasts, blocks_of
 
 
 @pytest.mark.parametrize("order", [None, 3])
-def test_the_likeliest_variances_are_those_of_the_dense_likelihood(order: int | None) -> None:
-    """Of all samples, and of what a polynomial leaves of them."""
+def test_the_variances_are_the_means_over_the_dense_likelihood(order: int | None) -> None:
+    """Of all samples, and of what a polynomial leaves of them; on a grid of both deviations, in their own units."""
     rng, N = np.random.default_rng(2), 4000
     T = 20 - 30 * np.cos(6 * np.pi * np.arange(N) / N)
     bias = rng.normal(size=(N, 1)) + 0.03 * np.cumsum(rng.normal(size=(N, 1)), axis=0)
@@ -21,12 +20,33 @@ def test_the_likeliest_variances_are_those_of_the_dense_likelihood(order: int | 
         left -= V @ np.linalg.solve(V.T @ (V * blocks.n[:, None]), V.T * blocks.n)
     y = left @ blocks.y[:, 0]
     A = contrasts.Z.T @ left
+    values, V = np.linalg.eigh(A @ A.T)
+    A = V[:, values > 1e-6 * values[-1]].T @ A  # of the rest the polynomial leaves nothing
+    walks, whites = A @ contrasts.covariance @ A.T, (A * contrasts.white) @ A.T
 
-    def cost(logs: np.ndarray) -> float:
-        walk, white = np.exp(logs)
-        S = A @ (walk * contrasts.covariance + white * np.diag(contrasts.white)) @ A.T
-        return -float(multivariate_normal.logpdf(A @ blocks.y[:, 0], cov=(S + S.T) / 2, allow_singular=True))
+    def log_likelihood(walk: float, white: float) -> float:
+        factor, u = cho_factor(walk**2 * walks + white**2 * whites), A @ blocks.y[:, 0]
+        return -float(np.sum(np.log(np.diagonal(factor[0]))) + u @ cho_solve(factor, u) / 2)
 
     found = contrasts.noise(y, left)
-    best = minimize(cost, np.log([found.walk, found.white]) + 0.3, method="Nelder-Mead", options={"xatol": 1e-6})
-    np.testing.assert_allclose([found.walk, found.white], np.exp(best.x), rtol=1e-3)
+    walk = np.sqrt(found.walk) * np.linspace(0.02, 3, 41)[:, None]
+    white = np.sqrt(found.white) * np.linspace(0.7, 1.4, 29)
+    logs = np.vectorize(log_likelihood)(walk, white)
+    density = np.exp(logs - logs.max()) / white**2  # uniform in walk / white and in log white
+    density /= density.sum()
+    assert max(density[0].sum(), density[-1].sum(), density[:, 0].sum(), density[:, -1].sum()) < 1e-4, (
+        "the grid is wide"
+    )
+    expected = [np.sum(density * walk**2), np.sum(density * white**2)]
+    np.testing.assert_allclose([found.walk, found.white], expected, rtol=2e-3)
+
+
+def test_a_walk_that_the_likelihood_denies_by_chance_is_not_none() -> None:
+    """Of a soak that only warms, the likeliest walk is often none; its mean is in proportion on average."""
+    rng, N, means = np.random.default_rng(8), 2000, []
+    for _ in range(40):
+        walk = np.cumsum(rng.normal(size=(N, 1)), axis=0) * 0.02
+        blocks = blocks_of(np.linspace(0, 50, N), walk + rng.normal(size=(N, 1)))
+        means.append(Contrasts(blocks).noise(blocks.y[:, 0], np.eye(len(blocks.T))).walk / (N * 0.02**2))
+    assert min(means) > 0.02
+    assert 0.7 < np.median(means) < 3
