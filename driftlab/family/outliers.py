@@ -68,8 +68,8 @@ class Outlier:
     axis : str
     p : float
         Chance of a value as far out among units of the family.
-    value, expected, spread : float
-        The figure, the units' median and width of it; of a curve how far it is off, 0, and the units' spread; SI.
+    value : float
+        The figure; of a curve how far it is off; SI.
     T : float or None
         Of a curve: where it is off most, degC.
     sentence : str
@@ -82,8 +82,6 @@ class Outlier:
     axis: str
     p: float
     value: float
-    expected: float
-    spread: float
     T: float | None
     sentence: str
     as_family: tuple[str, ...]
@@ -250,23 +248,20 @@ class _Words:
         }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} °C ({off})")
         axis = " ".join(self.family.axes[own] for own in reason.axes)
         what = reason.what if reason.what in ("sign", "swap", "scale", "level") else "shape"
-        return Outlier(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)
+        return Outlier(name, what, axis, p, reason.off, reason.T, sentence, fine)
 
     def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
         tests, shown = self.tests, _shown(what, self.unit)
         value = float(tests.values[k, tests.what.index((what, axis))])
         size, called = f"{_number(value, shown)} {shown.shown}{PER.get(what, '')}", self._axis(axis)
         law = tests.laws.figures.get(what)
-        low, middle, high = (np.nan,) * 3 if law is None else _usual(what, law, axis)
         sentence = {
             "hysteresis": f"{called} differs by {size} between warming and cooling",
             "soaks": f"two soaks differ more than one unit can: by {size} on {called}",
         }.get(what, f"{figure_name(what)} of {called} is {size}")
-        of_most = f"of most units {_number(low, shown)} to {_number(high, shown)}"
-        sentence += ", more than noise explains" if law is None else f", {of_most}"
-        return Outlier(
-            tests.names[k], what, self.family.axes[axis], p, value, middle, (high - low) / 4, None, sentence, fine
-        )
+        usual = () if law is None else [_number(of_most, shown) for of_most in _usual(what, law, axis)]
+        sentence += f", of most units {' to '.join(usual)}" if usual else ", more than noise explains"
+        return Outlier(tests.names[k], what, self.family.axes[axis], p, value, None, sentence, fine)
 
     def _axis(self, axis: int) -> str:
         """Return the name of an axis: its letter, or its channel where it is the only one."""
@@ -285,11 +280,10 @@ def _number(value: float, shown: BiasUnit) -> str:
     return f"{size:.0f}" if shown is OF_M["scale"] and abs(size) >= 1000 else f"{size:.3g}"
 
 
-def _usual(what: str, law: FigureLaw, axis: int) -> tuple[float, float, float]:
-    """Return a figure of an axis in most units: from, in the middle, and to; SI."""
+def _usual(what: str, law: FigureLaw, axis: int) -> list[float]:
+    """Return the range of a figure of an axis in most units, SI."""
     width = float(np.hypot(law.width[axis], law.sure[axis]))
-    low, middle, high = (unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 0, 2))
-    return low, middle, high
+    return [unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 2)]
 
 
 SHAPE = "shape"
