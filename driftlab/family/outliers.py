@@ -89,12 +89,11 @@ class Outlier:
 
 @dataclass(frozen=True)
 class LotOutlier:
-    """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
+    """A lot that is off: `what` (`shape` or a figure) on which axis, and in words."""
 
     lot: str
     what: str
     axis: str
-    T: float | None
     sentence: str
 
 
@@ -313,7 +312,7 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
                     f"at {T:.0f} °C (its units spread by {number(spread[k, axis] * unit.factor)}); its {lot.units} "
                     "units are held against one another"
                 )
-                odd.append(LotOutlier(name, SHAPE, called, T, sentence))
+                odd.append(LotOutlier(name, SHAPE, called, sentence))
     for name, axis, lot_name, times in tests.lots:
         differs = f"{times:.2g} times that of"
         if name in TERM_FIGURES:
@@ -323,7 +322,7 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
             f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
             f"{tests.of_lots.count(lot_name)} units are held against one another"
         )
-        odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))
+        odd.append(LotOutlier(lot_name, name, family.axes[axis], sentence))
     return tuple(odd)
 
 
