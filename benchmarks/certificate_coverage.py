@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from limits import DEG_H, DT, LAWS, PROGRAMS, WHITE
+from loop_cases.signatures import dragged
 from numpy.typing import NDArray
 
 from driftlab.evaluation.uncertainty import UncertaintyBudget, bias_budget
@@ -38,7 +39,7 @@ def soaked(rng: np.random.Generator, kind: str, law: str, off: float, program: s
     c = rng.normal(size=(4, 3)) * np.array([50, 100, 40, 30])[:, None] * DEG_H
     wandering = LAWS[law.removeprefix("play, ")](rng, len(T))
     slope = rng.uniform(0.5, 3, size=3) * rng.choice([-1, 1], size=3) * DEG_H * (law == PLAY)
-    bias = np.polynomial.polynomial.polyval((T - 15) / 35, c).T + wandering + np.outer(T - played(T), slope)
+    bias = np.polynomial.polynomial.polyval((T - 15) / 35, c).T + wandering + np.outer(T - dragged(T, 2 * WIDTH), slope)
     bias = bias + rng.normal(size=bias.shape) * WHITE / np.sqrt(DT)
     read = T + off / 2 * rng.normal()
     fitted = KINDS[kind].fit(read, bias, {})
@@ -46,14 +47,6 @@ def soaked(rng: np.random.Generator, kind: str, law: str, off: float, program: s
     budget = bias_budget(verdict.map, thermometer=off or None)
     truth = np.polynomial.polynomial.polyval((budget.T - 15) / 35, c).T + np.mean(wandering, axis=0)
     return budget, np.array([truth - WIDTH * slope, truth + WIDTH * slope])
-
-
-def played(T: Array) -> Array:
-    """Return the play operator (N,) of temperatures T (N,), which follows them at WIDTH."""
-    values, at = np.empty(len(T)), T[0]
-    for k, value in enumerate(T):
-        values[k] = at = min(max(at, value - WIDTH), value + WIDTH)
-    return values
 
 
 def coverages(soaks: int, seed: int, only: str = "") -> Iterator[tuple[str, float, float]]:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from loop_cases.signatures import late
 
 DEG_H = np.deg2rad(1) / 3600
 OMEGA = 7.292115e-5
@@ -105,19 +106,11 @@ class Unit:
         return bias
 
 
-def smooth(x: np.ndarray, dt: float, tau: float) -> np.ndarray:
-    """Return x through a first-order lag."""
-    from scipy.signal import lfilter
-
-    a = np.exp(-dt / tau)
-    return lfilter([1 - a], [1, -a], x, zi=[a * x[0]])[0]
-
-
 def soak() -> tuple[np.ndarray, np.ndarray]:
     """Return ten hours of steps of 5 K up and down again, at 1 Hz."""
     t = np.arange(36_000.0)
     stairs = np.concatenate([np.arange(-10, 50, 5.0), np.arange(50, -11, -5.0)])
-    return t, smooth(stairs[np.minimum((t / 36_000 * len(stairs)).astype(int), len(stairs) - 1)], 1.0, 150.0)
+    return t, late(stairs[np.minimum((t / 36_000 * len(stairs)).astype(int), len(stairs) - 1)], 150.0)
 
 
 def day(hours: float, dt: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +122,7 @@ def day(hours: float, dt: float, rng: np.random.Generator) -> tuple[np.ndarray, 
         at += [at[-1] + abs(target - T[-1]) / rng.uniform(0.005, 0.02)]
         at += [at[-1] + rng.uniform(60, 1200)]
         T += [target, target]
-    return t, smooth(np.interp(t, at, T), dt, 120.0)
+    return t, late(np.interp(t, at, T), 120.0, dt)
 
 
 def config(case: Case) -> str:

@@ -21,6 +21,7 @@ sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "examples" / "06_fam
 import family  # noqa: E402
 from families_at_rest import COLOURS, DEG_H, effect_of, of_other_type, planted, soaked  # noqa: E402
 
+from driftlab.family.shared_effect import without_effects  # noqa: E402
 from driftlab.family.shared_effects import SharedEffects, find_common  # noqa: E402
 from driftlab.family.unit_information import UnitInformation  # noqa: E402
 
@@ -56,7 +57,9 @@ def map_error(
     errors: tuple[list[float], list[float]] = ([], [])
     for unit, (own, lot) in zip(dealt, units, strict=True):
         truth = unit.bias(T)
-        for part, one in zip(errors, (own, found.apart(own, lot)), strict=True):
+        for part, one in zip(
+            errors, (own, without_effects(own, lot, found.effects, found.noise.get(own.unit))), strict=True
+        ):
             for axis in range(truth.shape[1]):
                 c = np.linalg.lstsq(one.J[axis], one.h[axis], rcond=1e-10)[0]
                 part.append(float(np.mean((one.knots.values(T) @ c - truth[:, axis]) ** 2)))

@@ -24,6 +24,7 @@ from functools import cache
 import foreign_families as foreign
 import numpy as np
 import planted_units as own
+from loop_cases.signatures import dragged
 from odd_oracles import Truth, modes_of
 
 from driftlab.family.mixed_model import Family, fit_family
@@ -77,7 +78,7 @@ def _of_planted(
     for k, one in enumerate(rows):
         after = unit.second if k and unit.second is not None else unit.curve
         changed = np.interp(one.T, own.GRID, (after - good.curve)[:, axis])
-        signal.append(changed + (own.played(one.T) - one.T) * unit.play[axis])
+        signal.append(changed + (dragged(one.T, 2 * own.PLAY) - one.T) * unit.play[axis])
     bias = [one.bias[:, axis] / own.DEG_H - np.interp(one.T, own.GRID, mean[:, axis]) for one in rows]
     return Truth(
         "level" if kind == "offset" else kind, _levels_of_planted((unit.curve - mean)[None])[0, axis], levels[:, axis],

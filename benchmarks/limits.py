@@ -23,6 +23,7 @@ from dataclasses import replace
 
 import foreign_soaks
 import numpy as np
+from loop_cases.signatures import dragged
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
@@ -134,12 +135,8 @@ def of_log(rng: Rng, law: str, hours: float) -> dict[str, Unit]:
 def of_play(rng: Rng, law: str, program: str, width: float) -> dict[str, Unit]:
     """Return the hysteresis of a unit whose bias follows a play operator of temperature, half a `width` wide."""
     T, bias, _ = soak(rng, law, program)
-    played, at = np.empty(len(T)), T[0]
-    for k, value in enumerate(T):
-        at = min(max(at, value - width), value + width)
-        played[k] = at
     slope = rng.uniform(0.5, 3, size=3) * rng.choice([-1, 1], size=3) * DEG_H
-    bias = bias + (T - played)[:, None] * slope
+    bias = bias + (T - dragged(T, 2 * width))[:, None] * slope
     settings = Spline()
     fitted = settings.fit(T, bias, {})
     verdict = MapVerdict(fitted, settings, brief(T, bias, [0], DT))

@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # cases run side by side
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from loop_cases.signatures import dragged, late
 
 HOURS = 6.0
 WHITE, WALK = np.deg2rad(3.18 / 3600), np.deg2rad(2.2e-5)  # rad/s/sqrt(Hz), rad/s/sqrt(s)
@@ -38,24 +39,6 @@ def chamber(name, t):
     return levels[np.minimum((t / (HOURS * 3600) * len(levels)).astype(int), len(levels) - 1)]
 
 
-def late(x, tau, step=1.0):
-    """Return x (N,) through a first-order lag."""
-    out, y, a = np.empty_like(x), x[0], 1 - np.exp(-step / tau)
-    for k, value in enumerate(x):
-        y += (value - y) * a
-        out[k] = y
-    return out
-
-
-def slip(T, width):
-    """Return the lag of a body that T (N,) drags along through a play."""
-    out, at = np.empty_like(T), T[0]
-    for k, value in enumerate(T):
-        at = min(max(at, value - width / 2), value + width / 2)
-        out[k] = at
-    return out - T
-
-
 def curve(T, slope=1.0):
     """Return the bias (N,) over temperature, bent: its slope grows three times from -15 to 50 degC."""
     x = (T - 17.5) / 32.5
@@ -66,7 +49,7 @@ def shown(effect, t, T):
     """Return the signature of an effect (N,), with the hyper-parameters that stand in `effect`, of any size."""
     values = dict(effect.hyper_parameters)
     return {
-        "hysteresis": lambda: slip(T, values["width"]),
+        "hysteresis": lambda: dragged(T, values["width"]) - T,
         "relaxation": lambda: T - late(T, values["tau"]),
         "thermal_rate": lambda: late(late(np.gradient(T, t), values["tau"]), values["tau"]),
         "thermal_lag": lambda: curve(late(T, values["tau"])) - curve(T),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from loop_cases.signatures import dragged
 
 from driftlab.soak.blocks import SoakRows
 
@@ -43,7 +44,7 @@ class Planted:
         R = round(hours * 3600 / ROW)
         t = (np.arange(R) + 0.5) * ROW
         T = LOW + (HIGH - LOW) * (1 - np.cos(2 * np.pi * t / (R * ROW))) / 2
-        follows, found = played(T), []
+        follows, found = dragged(T, 2 * PLAY), []
         for soak in range(self.soaks):
             curve = self.second if soak and self.second is not None else self.curve
             bias = np.stack([np.interp(T, GRID, own) for own in curve.T], axis=1)
@@ -53,15 +54,6 @@ class Planted:
             bias = bias + walk + white + turn_on + np.outer(follows - T, self.play)
             found.append(SoakRows(t, T, bias * DEG_H, np.full(R, ROW), {}))
         return tuple(found)
-
-
-def played(T: np.ndarray) -> np.ndarray:
-    """Return the response to T (R,) with play."""
-    follows, y = np.empty(len(T)), T[0]
-    for k, own in enumerate(T):
-        y = min(max(y, own - PLAY), own + PLAY)
-        follows[k] = y
-    return follows
 
 
 def mean_curves() -> np.ndarray:

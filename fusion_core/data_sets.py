@@ -158,8 +158,8 @@ class DataSetRows:
     def _cut(self, values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
         return values[self._at(start, stop)]
 
-    def _refused(self, what: str, advice: str = "copy it with `h5repack -f GZIP=4 OLD NEW`") -> UnreadableFile:
-        return UnreadableFile(f"{self.path}: data set '{self.name}' {what}; {advice}")
+    def _refused(self, what: str) -> UnreadableFile:
+        return UnreadableFile(f"{self.path}: data set '{self.name}' {what}; copy it with `h5repack -f GZIP=4 OLD NEW`")
 
     def _check_place(self) -> None:
         if self._plan.get_external_count():

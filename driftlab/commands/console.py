@@ -37,7 +37,7 @@ class Session:
 
     Attributes
     ----------
-    quiet, verbose : bool
+    quiet : bool
     settings : list of str
         Keys to set beside each config, as `KEY=VALUE`.
     configs : list of Config
@@ -47,7 +47,6 @@ class Session:
     """
 
     quiet: bool = False
-    verbose: bool = False
     settings: list[str] = field(default_factory=list)
     configs: list[Config] = field(default_factory=list)
     stages: list[tuple[str, float]] = field(default_factory=list)
@@ -76,7 +75,7 @@ def session() -> Session:
 @contextmanager
 def in_session(quiet: bool, verbose: bool, settings: list[str] | None) -> Iterator[None]:
     """Let a command be the one in progress; at its end say how long the stages took, where that is asked."""
-    now = Session(quiet, verbose, settings or [])
+    now = Session(quiet, settings or [])
     token = CURRENT.set(now)
     WITH_NUMBA[:] = [note_compiling]
     try:

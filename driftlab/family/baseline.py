@@ -14,7 +14,7 @@ that single odd units of phase I do not widen it. p figures, U units.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -197,12 +197,3 @@ class Baseline(BaseModel):
         if any((name, one.axis) not in known for one in self.together for name in one.quantities):
             raise ValueError("a covariance is of quantities without limits")
         return self
-
-    @classmethod
-    def of_levels(cls, units: int, axes: Sequence[str], levels: Sequence[tuple[float, float]]) -> Baseline:
-        """Return that of centre and deviation of the `level` of each axis alone."""
-        laws = (
-            FrozenLimits(quantity="level", axis=axis, scale="as it is", centre=centre, spread=spread)
-            for axis, (centre, spread) in zip(axes, levels, strict=True)
-        )
-        return cls(units=units, limits=tuple(laws))

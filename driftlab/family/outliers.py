@@ -68,8 +68,8 @@ class Outlier:
     axis : str
     p : float
         Chance of a value as far out among units of the family.
-    value, expected, spread : float
-        The figure, the units' median and width of it; of a curve how far it is off, 0, and the units' spread; SI.
+    value : float
+        The figure; of a curve how far it is off; SI.
     T : float or None
         Of a curve: where it is off most, degC.
     sentence : str
@@ -82,8 +82,6 @@ class Outlier:
     axis: str
     p: float
     value: float
-    expected: float
-    spread: float
     T: float | None
     sentence: str
     as_family: tuple[str, ...]
@@ -91,12 +89,11 @@ class Outlier:
 
 @dataclass(frozen=True)
 class LotOutlier:
-    """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
+    """A lot that is off: `what` (`shape` or a figure) on which axis, and in words."""
 
     lot: str
     what: str
     axis: str
-    T: float | None
     sentence: str
 
 
@@ -250,23 +247,20 @@ class _Words:
         }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} °C ({off})")
         axis = " ".join(self.family.axes[own] for own in reason.axes)
         what = reason.what if reason.what in ("sign", "swap", "scale", "level") else "shape"
-        return Outlier(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)
+        return Outlier(name, what, axis, p, reason.off, reason.T, sentence, fine)
 
     def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
         tests, shown = self.tests, _shown(what, self.unit)
         value = float(tests.values[k, tests.what.index((what, axis))])
         size, called = f"{_number(value, shown)} {shown.shown}{PER.get(what, '')}", self._axis(axis)
         law = tests.laws.figures.get(what)
-        low, middle, high = (np.nan,) * 3 if law is None else _usual(what, law, axis)
         sentence = {
             "hysteresis": f"{called} differs by {size} between warming and cooling",
             "soaks": f"two soaks differ more than one unit can: by {size} on {called}",
         }.get(what, f"{figure_name(what)} of {called} is {size}")
-        of_most = f"of most units {_number(low, shown)} to {_number(high, shown)}"
-        sentence += ", more than noise explains" if law is None else f", {of_most}"
-        return Outlier(
-            tests.names[k], what, self.family.axes[axis], p, value, middle, (high - low) / 4, None, sentence, fine
-        )
+        usual = () if law is None else [_number(of_most, shown) for of_most in _usual(what, law, axis)]
+        sentence += f", of most units {' to '.join(usual)}" if usual else ", more than noise explains"
+        return Outlier(tests.names[k], what, self.family.axes[axis], p, value, None, sentence, fine)
 
     def _axis(self, axis: int) -> str:
         """Return the name of an axis: its letter, or its channel where it is the only one."""
@@ -285,11 +279,10 @@ def _number(value: float, shown: BiasUnit) -> str:
     return f"{size:.0f}" if shown is OF_M["scale"] and abs(size) >= 1000 else f"{size:.3g}"
 
 
-def _usual(what: str, law: FigureLaw, axis: int) -> tuple[float, float, float]:
-    """Return a figure of an axis in most units: from, in the middle, and to; SI."""
+def _usual(what: str, law: FigureLaw, axis: int) -> list[float]:
+    """Return the range of a figure of an axis in most units, SI."""
     width = float(np.hypot(law.width[axis], law.sure[axis]))
-    low, middle, high = (unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 0, 2))
-    return low, middle, high
+    return [unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 2)]
 
 
 SHAPE = "shape"
@@ -319,7 +312,7 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
                     f"at {T:.0f} °C (its units spread by {number(spread[k, axis] * unit.factor)}); its {lot.units} "
                     "units are held against one another"
                 )
-                odd.append(LotOutlier(name, SHAPE, called, T, sentence))
+                odd.append(LotOutlier(name, SHAPE, called, sentence))
     for name, axis, lot_name, times in tests.lots:
         differs = f"{times:.2g} times that of"
         if name in TERM_FIGURES:
@@ -329,7 +322,7 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
             f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
             f"{tests.of_lots.count(lot_name)} units are held against one another"
         )
-        odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))
+        odd.append(LotOutlier(lot_name, name, family.axes[axis], sentence))
     return tuple(odd)
 
 

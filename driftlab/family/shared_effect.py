@@ -182,12 +182,10 @@ def _products(
 
 @dataclass(frozen=True, eq=False)
 class OfUnit:
-    """An effect in a unit: coefficients and deviations (d, q), shrunken to the law; `own`, by its own soak alone."""
+    """An effect in a unit: coefficients and deviations (d, q), shrunken to the law."""
 
     c: Array
     sigma: Array
-    own: Array
-    own_sigma: Array
 
 
 class _UnitContrast(NamedTuple):
@@ -211,8 +209,7 @@ def sizes(
         law = _laws(offer.effect, c, v, contrasts, lots)
         laws.append(law)
         of_units.append([
-            OfUnit(*law.law_of(lot).shrunken(one, variance), one, np.sqrt(variance))
-            for one, variance, lot in zip(c, v, lots, strict=True)
+            OfUnit(*law.law_of(lot).shrunken(one, variance)) for one, variance, lot in zip(c, v, lots, strict=True)
         ])  # fmt: skip
     return laws, dict(zip(names, zip(*of_units, strict=True), strict=True)), dict(zip(names, densities, strict=True))
 

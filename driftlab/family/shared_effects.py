@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
 from driftlab.family.contrasts import EffectContrasts
 from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
-from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes, without_effects
+from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes
 from driftlab.family.shared_effect_search import (
     CHANCE,
     Candidate,
@@ -30,7 +30,6 @@ from driftlab.family.shared_effect_search import (
     offers_for,
     refine,
 )
-from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.result import described
 from driftlab.units import BiasUnit
 from fusion_core.contracts import Effect
@@ -65,12 +64,6 @@ class SharedEffects(BaseModel):
     # (d, q) of each effect, by unit
     of_units: Annotated[InstanceOf[dict[str, tuple[OfUnit, ...]]], Field(exclude=True)] = {}
     noise: Annotated[InstanceOf[dict[str, UnitDensities]], Field(exclude=True)] = {}  # by unit, beside the effects
-
-    def apart(self, soaked: UnitInformation, lot: str = "") -> UnitInformation:
-        """Return the information of a unit's soaks with the effects in the model; itself where there are none."""
-        if not self.effects:
-            return soaked
-        return without_effects(soaked, lot, self.effects, self.noise.get(soaked.unit))
 
 
 def find_common(units: FamilyUnits, *, bias_unit: str = "rad/s", sample: int = SAMPLE) -> SharedEffects:

@@ -283,8 +283,8 @@ class EffectRegressors:
         """All segments."""
         return tuple(range(len(self.segments)))
 
-    def gram(self, segments: Sequence[int], rows: Indices | None = None, columns: Indices | None = None) -> Array:
-        """Return the inner products of all columns over some segments, or of `rows` with `columns` (as `rows`)."""
+    def gram(self, segments: Sequence[int], rows: Indices | None = None) -> Array:
+        """Return the inner products of all columns over some segments, or of `rows` alone."""
         self._complete()
         key, size = tuple(segments), self._known
         if rows is None and key not in self._sums:
@@ -294,10 +294,9 @@ class EffectRegressors:
             self._sums[key] = total
         if rows is None:
             return self._sums[key]
-        columns = rows if columns is None else columns
         if key in self._sums:
-            return np.asarray(self._sums[key][np.ix_(rows, columns)])
-        return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, columns)].sum(axis=0))
+            return np.asarray(self._sums[key][np.ix_(rows, rows)])
+        return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, rows)].sum(axis=0))
 
     def equations(self, segments: Sequence[int], cols: Indices, y: Indices) -> NormalEquations:
         """Return the normal equations of columns (k,) over some segments, y (1,) the signal's column."""

@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.bands import deviation
-from driftlab.family.baseline import Baseline
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
@@ -98,7 +97,7 @@ def analyse(
         apart = units.keep("apart", partial(_bare, common.effects), [None] * len(units))
     progress(Stage("what the line did"))
     levels = None if family is None else _levels(family, apart)
-    before = None if known is None or family is None else _baseline(family)
+    before = None if known is None or family is None else family.baseline
     line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules)
     if family is None:
         return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
@@ -128,11 +127,11 @@ def _frozen_after_changes(line: LineReport) -> list[str]:
 
 def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
     """Return in a sentence the reference of units that are compared with a known family."""
-    if known is None or family.laws is None:
+    if known is None or family.laws is None or family.baseline is None:
         return []
     of = "one new unit" if count == 1 else f"{count:,} new units"
     alone = f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}"
-    if all(limits.quantity == LEVEL for limits in _baseline(family).limits):
+    if all(limits.quantity == LEVEL for limits in family.baseline.limits):
         return [
             f"{alone}, and levels are charted about theirs; other charts, changes and limits of the line are of {of}, "
             "and do not say whether the line has moved since: the family has no limits of other charts."
@@ -193,12 +192,6 @@ def _level_law(family: Family) -> list[InControl]:
     return [
         InControl(float(c @ B), float(np.sqrt(B @ C @ B))) for c, C in zip(before.c, before.covariance, strict=True)
     ]
-
-
-def _baseline(family: Family) -> Baseline:
-    """Return the frozen limits of a family; of one that has none, as of an earlier version, those of levels."""
-    levels = [(law.centre, law.spread) for law in _level_law(family)]
-    return family.baseline or Baseline.of_levels(family.units, family.axes, levels)
 
 
 def _mean_over_range(family: Family) -> Array:

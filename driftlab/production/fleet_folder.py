@@ -93,14 +93,9 @@ class FleetFolder:
         names = set(os.listdir(self.path)) if self.path.exists() else set()
         mark = ownership.document(self.path / MARK)
         self.mark, self.written = mark if "schema" in mark else {}, ownership.written(self.path / MARK)
-        if not self.mark and names - {LOCK, f".{MARK}{NEW}"}:
+        if not self.written and names - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(
                 f"--out {self.out}: exists and is not the output of an earlier fleet; move it away, or name another "
-                "folder"
-            )
-        if self.mark and not self.written:
-            raise ConfigError(
-                f"--out {self.out}: is of a version that kept no SHA-256 of its files; move it away, or name another "
                 "folder"
             )
         changed = foreign(self.path, MARK, {MARK, *({*OF_ALL} & names)}) if self.mark else []

@@ -213,9 +213,9 @@ def _numbers(values: Array, digits: int = 6) -> list[float | None]:
     return numbers
 
 
-def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate", style: LineStyle = "line") -> Line:
+def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate") -> Line:
     """Return a line within a band that reaches as far to either side."""
-    return Line(x, middle, name, role, middle - reach, middle + reach, style)
+    return Line(x, middle, name, role, middle - reach, middle + reach)
 
 
 def band_alone(x: Array, reach: Array, name: str, role: str) -> Line:

@@ -353,7 +353,7 @@ def huber(X: Array, x: Array, sigma: Array, start: Array) -> Array:
     return found
 
 
-def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
+def ewma(z: Array, most: float = SIGMAS) -> Array:
     """Return the EWMA (..., n) of z (..., n), which counts to `most`.
 
     Values further out belong to Shewhart's chart; else one odd unit would hold the EWMA out of its limits for ten.
@@ -361,12 +361,12 @@ def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
     """
     from scipy.signal import lfilter
 
-    return np.asarray(lfilter([weight], [1, weight - 1], np.clip(z, -most, most)))
+    return np.asarray(lfilter([LAMBDA], [1, LAMBDA - 1], np.clip(z, -most, most)))
 
 
-def ewma_limit(n: int, weight: float = LAMBDA, width: float = L) -> Array:
+def ewma_limit(n: int) -> Array:
     """Return the limit (n,) of the EWMA about 0, which is less for the first units."""
-    return np.asarray(width * np.sqrt(weight / (2 - weight) * (1 - (1 - weight) ** (2.0 * np.arange(1, n + 1)))))
+    return np.asarray(L * np.sqrt(LAMBDA / (2 - LAMBDA) * (1 - (1 - LAMBDA) ** (2.0 * np.arange(1, n + 1)))))
 
 
 @dataclass(frozen=True)

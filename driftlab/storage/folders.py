@@ -95,8 +95,8 @@ class Folder:
         first, second = FILES[self.command][:2]
         if names and not any(fnmatch(name, second) for name in written(self.folder / first)):
             raise ConfigError(
-                f"{self.subject}: exists and is not the output of an earlier {self.command}, or of a version that kept "
-                "no SHA-256 of its files; move it away, or name another folder"
+                f"{self.subject}: exists and is not the output of an earlier {self.command}; move it away, or name "
+                "another folder"
             )
         names -= {LOCK, BEFORE}
         others = sorted(name for name in names if not matches(name, FILES[self.command]))

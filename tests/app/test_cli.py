@@ -125,7 +125,7 @@ def test_run_can_print_json_and_replaces_its_own_output_only(bench):
     assert summary["t"]["end_s"] == pytest.approx(200, abs=0.2)
     refused = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", ".", cwd=bench)
     assert refused.returncode == 2
-    assert "exists and is not the output of an earlier run, or of a version that kept no SHA-256" in refused.stderr
+    assert "exists and is not the output of an earlier run;" in refused.stderr
 
 
 def test_fit_map_of_another_kind_and_as_json(bench):

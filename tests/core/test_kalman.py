@@ -121,22 +121,25 @@ def test_one_sample_of_a_model_whose_bias_is_a_function_of_states(C):
     assert_same(found, plain, 1e-12)
 
 
+def assert_is_filterpys(F, Q, H, R, P, u, z, method):
+    (N, n), m = u.shape, len(H)
+    ours = estimate(State(np.zeros(n), P), Transition(F, Q, u), Measurement(z, H, R, np.ones(N, bool)), method=method)
+    theirs = KalmanFilter(dim_x=n, dim_z=m, dim_u=n)
+    theirs.x, theirs.P, theirs.F, theirs.Q, theirs.H, theirs.R = np.zeros((n, 1)), P, F, Q, H, R
+    for k in range(N):
+        theirs.predict(u=u[k][:, None], B=np.eye(n))
+        theirs.update(z[k][:, None])
+        sigma = np.sqrt(np.diag(theirs.P))
+        assert np.max(np.abs(ours.x[k] - theirs.x[:, 0]) / sigma) < 1e-9
+        assert np.max(np.abs(ours.sigma[k] / sigma - 1)) < 1e-9
+
+
 def test_the_recursion_equals_filterpy():
     F, Q, H, R = twelve()
     rng = np.random.default_rng(2)
     P0 = np.diag([1e-10] * 3 + [1e-6] * 3 + [1e-8] * 3 + [1e-4] * 3)
     u, z = simulate(F, Q, H, R, P0, 500, rng)
-    ours = estimate(
-        State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(500, bool)), method="recursive"
-    )
-    theirs = KalmanFilter(dim_x=12, dim_z=6, dim_u=12)
-    theirs.x, theirs.P, theirs.F, theirs.Q, theirs.H, theirs.R = np.zeros((12, 1)), P0, F, Q, H, R
-    for k in range(500):
-        theirs.predict(u=u[k][:, None], B=np.eye(12))
-        theirs.update(z[k][:, None])
-        sigma = np.sqrt(np.diag(theirs.P))
-        assert np.max(np.abs(ours.x[k] - theirs.x[:, 0]) / sigma) < 1e-9
-        assert np.max(np.abs(ours.sigma[k] / sigma - 1)) < 1e-9
+    assert_is_filterpys(F, Q, H, R, P0, u, z, "recursive")
 
 
 @pytest.mark.parametrize("method", ["recursive", "steady"])
@@ -147,16 +150,7 @@ def test_states_that_are_all_coupled_equal_filterpy(n, m, method):
     F, H = 0.97 * np.linalg.qr(rng.normal(size=(n, n)))[0], rng.normal(size=(m, n))
     Q, R = 0.01 * np.eye(n), np.diag(rng.uniform(0.5, 2.0, m))
     u, z = simulate(F, Q, H, R, np.eye(n), N, rng)
-    used = np.ones(N, bool)
-    ours = estimate(State(np.zeros(n), np.eye(n)), Transition(F, Q, u), Measurement(z, H, R, used), method=method)
-    theirs = KalmanFilter(dim_x=n, dim_z=m, dim_u=n)
-    theirs.x, theirs.P, theirs.F, theirs.Q, theirs.H, theirs.R = np.zeros((n, 1)), np.eye(n), F, Q, H, R
-    for k in range(N):
-        theirs.predict(u=u[k][:, None], B=np.eye(n))
-        theirs.update(z[k][:, None])
-        sigma = np.sqrt(np.diag(theirs.P))
-        assert np.max(np.abs(ours.x[k] - theirs.x[:, 0]) / sigma) < 1e-9
-        assert np.max(np.abs(ours.sigma[k] / sigma - 1)) < 1e-9
+    assert_is_filterpys(F, Q, H, R, np.eye(n), u, z, method)
 
 
 @pytest.mark.parametrize("rate_variance", [1e-12, 1e-8, 1e-4])

@@ -6,6 +6,7 @@ holdout day with other profiles. Bias = curve(T) with a bend + turn-on offset + 
 
 import h5py
 import numpy as np
+from loop_cases.signatures import dragged, late
 
 OMEGA_IE = np.array([5.51177e-5, 0.0, -4.77445e-5])  # level, x north, z down-looking: f_z > 0 gives + sin below
 WHITE, WALK = 1.5e-5, 1.0e-7  # rad/s/sqrt(Hz), rad/s/sqrt(s)
@@ -17,7 +18,7 @@ def soak(hours, low=-15.0, high=50.0):
     t = np.arange(0, hours * 3600, 1 / RATE)
     stairs = np.concatenate([np.arange(low, high, 5.0), np.arange(high, low - 1, -5.0)])
     where = np.minimum((t / t[-1] * len(stairs)).astype(int), len(stairs) - 1)
-    return t, first_order(stairs[where], 150.0)
+    return t, late(stairs[where], 150.0)
 
 
 def day(hours, rng, low=-8.0, high=47.0):
@@ -29,29 +30,7 @@ def day(hours, rng, low=-8.0, high=47.0):
         knots_t += [knots_t[-1] + abs(target - knots_T[-1]) / rng.uniform(0.01, 0.04), 0]
         knots_t[-1] = knots_t[-2] + rng.uniform(60, 900)
         knots_T += [target, target]
-    return t, first_order(np.interp(t, knots_t, knots_T), 120.0)
-
-
-def first_order(x, tau):
-    out = np.empty_like(x)
-    y = x[0]
-    for k, value in enumerate(x):
-        y += (value - y) * (1 - np.exp(-1 / RATE / tau))
-        out[k] = y
-    return out
-
-
-def backlash(T, width):
-    """Position of a slipping element that is dragged along by T once it has crossed the width."""
-    out = np.empty_like(T)
-    at = T[0]
-    for k, value in enumerate(T):
-        if value - at > width / 2:
-            at = value - width / 2
-        elif at - value > width / 2:
-            at = value + width / 2
-        out[k] = at
-    return out
+    return t, late(np.interp(t, knots_t, knots_T), 120.0)
 
 
 class Unit:
@@ -77,7 +56,7 @@ class Unit:
             noise = r.normal(size=n)
             noise[0] = 0.0  # else it begins tens of deviations away
             # bounded, as a regulator keeps it: beyond what was fitted on, an effect holds
-            return level + spread * 1.5 * np.tanh(first_order(noise, tau) / np.sqrt(1 / (2 * tau)) / 1.5)
+            return level + spread * 1.5 * np.tanh(late(noise, tau) / np.sqrt(1 / (2 * tau)) / 1.5)
 
         made = {
             "voltage": (
@@ -98,7 +77,7 @@ class Unit:
         """Write one recording; return its true gyro bias (N, 3)."""
         r, n = self.rng, len(t)
         extra = self.auxiliary(t, T)
-        seen = first_order(T, 150.0) if "thermal_lag" in self.effects else T
+        seen = late(T, 150.0) if "thermal_lag" in self.effects else T
         bias = (
             self.curve(seen)
             + r.normal(0, 2e-4, 3)
@@ -120,7 +99,7 @@ class Unit:
         x = {name: values for name, (values, _) in extra.items()}
         return {
             "thermal_lag": lambda: 0 * t,
-            "hysteresis": lambda: 2.5e-5 * backlash(T, 9.0),
+            "hysteresis": lambda: 2.5e-5 * dragged(T, 9.0),
             "turn_on": lambda: 2.5e-4 * np.exp(-t / 700.0),
             "drift": lambda: 2.0e-8 * t,
             "thermal_rate": lambda: 5e-3 * np.gradient(T, t),
@@ -129,7 +108,7 @@ class Unit:
             "square": lambda: 1.5e-4 * (x["flow"] - 2) ** 2 / 0.25,
             "periodic": lambda: 8e-5 * np.sin(2 * np.pi * t / 97.0),
             "bands": lambda: 2e-4 * (x["voltage"] - 5) * np.cos(2 * np.pi * (T - 20) / 30),
-            "late": lambda: 6e-5 * first_order(x["flow"] - 2, 900.0) / 0.3,
+            "late": lambda: 6e-5 * late(x["flow"] - 2, 900.0) / 0.3,
             "gradient": lambda: 4e-5 * (x["temperature_case"] - T),
             "telegraph": lambda: 8e-5 * np.sign(np.sin(2 * np.pi * (t / 3300.0) ** 1.3)),
         }[effect]()

@@ -67,9 +67,9 @@ class MessageStream:
     unit: int | None = None
     samples: dict[str, Array] = field(default_factory=dict, init=False)
 
-    def values(self, label: str, rows: slice = slice(None)) -> Array:
+    def values(self, label: str) -> Array:
         """Return a field of the rows."""
-        return self.message.values(self.data, self.at[rows], label)
+        return self.message.values(self.data, self.at, label)
 
     def time(self, label: str | None = None) -> Array:
         """Return the times of the rows (N,) in s since power-up, by their TimeUS or the clock `label`.

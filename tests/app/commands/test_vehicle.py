@@ -2,8 +2,6 @@
 
 import gzip
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,8 +265,8 @@ def test_maps_keep_their_devices_through_parameters_and_back(folder, tmp_path):
 
 
 @pytest.mark.recordings
-def test_a_measured_log_of_three_units_that_is_too_short_says_so_of_each():
-    logs = sorted((Path(os.environ["DRIFTLAB_DATA"]) / "data" / "px4_ulog").glob("*.ulg"))
+def test_a_measured_log_of_three_units_that_is_too_short_says_so_of_each(recordings):
+    logs = sorted((recordings / "data" / "px4_ulog").glob("*.ulg"))
     assert logs
     for log in logs:
         result = driftlab.vehicle(log)

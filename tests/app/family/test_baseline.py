@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lines import AXES, DEG_H, line, record
+from lines import DEG_H, line, record
 from pydantic import ValidationError
 
 from driftlab.family.baseline import Baseline, Together
@@ -116,7 +116,7 @@ def test_run_rules_are_those_that_were_asked_for():
     found = line_of(records, None, rules="nelson")
     said = [one.text for reasons in alarms(found).values() for one in reasons]
     assert any(text.startswith("y noise: 9 units in a row") for text in said)
-    base = Baseline.of_levels(30, AXES, [(0.0, 1.0)] * 3)
+    base = baseline_of(line_of(line(3), None), LEVEL)
     assert "frozen" not in " ".join(judged(records, base).sentences)
 
 

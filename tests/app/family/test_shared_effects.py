@@ -9,11 +9,13 @@ import family
 import numpy as np
 import pytest
 from families_at_rest import AXES, DEG_H, effect_of, of_other_type, planted, soaked
+from loop_cases.signatures import dragged
 from statsmodels.stats.meta_analysis import combine_effects
 
 from driftlab.family.basis import SplineBasis
 from driftlab.family.contrasts import UnitRows, without_noise
 from driftlab.family.partitions import in_partitions
+from driftlab.family.shared_effect import without_effects
 from driftlab.family.shared_effect_search import Offer, between, contrasts_of, gains, mean_of, of_size
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.unit_information import UnitInformation
@@ -25,6 +27,10 @@ PLAY = effect_of("hysteresis", width=6.0)
 # sqrt(2 (log 54 + 5)), is at 4.2
 THIRD = 0.1
 UNIT = BiasUnit("rad/s", "deg/h")
+
+
+def _apart(found: SharedEffects, own: UnitInformation, lot: str) -> UnitInformation:
+    return without_effects(own, lot, found.effects, found.noise.get(own.unit))
 
 
 def _sizes(n: int, seed: int, size: float = THIRD) -> np.ndarray:
@@ -61,7 +67,7 @@ def test_maps_get_better_with_it_and_units_have_what_they_were_dealt(
     T = np.linspace(family.LOW + 1, family.HIGH - 1, 100)
     errors = np.zeros((2, len(units), 3))
     for k, (unit, (own, lot)) in enumerate(zip(dealt, units, strict=True)):
-        for j, one in enumerate((own, found.apart(own, lot))):
+        for j, one in enumerate((own, _apart(found, own, lot))):
             for axis in range(3):
                 c = np.linalg.lstsq(one.J[axis], one.h[axis], rcond=1e-10)[0]
                 errors[j, k, axis] = np.mean((one.knots.values(T) @ c - unit.bias(T)[:, axis]) ** 2)
@@ -82,8 +88,8 @@ def test_it_comes_back_from_json(
     assert json.dumps(again.model_dump(mode="json")) == content
     own, lot = units[0]
     fresh = found.model_copy(update={"noise": {}})
-    np.testing.assert_allclose(again.apart(own, lot).h, fresh.apart(own, lot).h, rtol=1e-10)
-    np.testing.assert_allclose(again.apart(own, lot).white, found.apart(own, lot).white, rtol=0.02)
+    np.testing.assert_allclose(_apart(again, own, lot).h, _apart(fresh, own, lot).h, rtol=1e-10)
+    np.testing.assert_allclose(_apart(again, own, lot).white, _apart(found, own, lot).white, rtol=0.02)
 
 
 def test_signs_that_differ_from_unit_to_unit_are_seen() -> None:
@@ -142,10 +148,7 @@ def test_coefficients_are_those_of_dense_generalised_least_squares() -> None:
     unit = UnitInformation.of("a", AXES, [half], unit.white, unit.walk, 2.5)
     shown = contrasts_of(in_partitions([(unit, "")]), [Offer(PLAY, 1)], ())
     T = without_noise(half.T)
-    y, low = T[0], np.empty(len(T))
-    for k, value in enumerate(T):  # the play, by its definition
-        y = min(max(y, value - 3.0), value + 3.0)
-        low[k] = y - value
+    low = dragged(T, 6.0) - T
     knots = SplineBasis.covering(*unit.knots.domain, 1.25)
     for axis in range(3):
         since = half.t - half.t[0]
@@ -215,7 +218,7 @@ def test_a_unit_without_the_effects_says_of_its_curve_what_the_dense_covariance_
 ) -> None:
     _, units, found = of_a_third
     own, lot = units[3]
-    apart = found.apart(own, lot)
+    apart = _apart(found, own, lot)
     (rows,), (effect,) = own.recordings, found.effects
     since, z = rows.t - rows.t[0], _shown(effect.effect, rows)
     law, B = effect.law_of(lot), own.knots.values(rows.T)
@@ -256,5 +259,5 @@ def test_a_unit_that_lacks_what_an_effect_reads_has_none_of_it() -> None:
     (effect,) = found.effects
     assert effect.effect.subject == "voltage"
     np.testing.assert_allclose(effect.mean[:, 0] / DEG_H, 10.0, rtol=0.1)
-    assert np.all(np.isinf(found.of_units["0005"][0].own_sigma))
-    assert found.apart(*units[5]).count == units[5][0].count
+    np.testing.assert_array_equal(found.of_units["0005"][0].c, effect.mean)
+    assert _apart(found, *units[5]).count == units[5][0].count

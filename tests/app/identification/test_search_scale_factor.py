@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from loop_cases.signatures import dragged
 
 import driftlab
 
@@ -35,14 +36,6 @@ CONFIG = {
 }
 
 
-def play(T, width):
-    out, state = np.empty_like(T), T[0]
-    for k, x in enumerate(T):
-        state = min(max(state, x - width / 2), x + width / 2)
-        out[k] = state
-    return out
-
-
 def days(folder, seed, scale=0.0, memory=0.0):
     """Write a recording of each placement; `scale` (3,) in 1/K, `memory` in m/s^2/K of a play of 6 K."""
     rng, paths = np.random.default_rng(seed), []
@@ -56,7 +49,7 @@ def days(folder, seed, scale=0.0, memory=0.0):
         u *= G / np.linalg.norm(u)
         drift = rng.normal(0, 3e-3, 3) + np.cumsum(rng.normal(0, 2e-6 * np.sqrt(STEP), (len(t), 3)), axis=0)
         noise = 1e-3 / np.sqrt(STEP) * rng.normal(size=(len(t), 3))
-        accel = u + u * scale * (T - 25)[:, None] + bias + memory * (play(T, 6.0) - T)[:, None] + drift + noise
+        accel = u + u * scale * (T - 25)[:, None] + bias + memory * (dragged(T, 6.0) - T)[:, None] + drift + noise
         gyro = 2e-5 / np.sqrt(STEP) * rng.normal(size=(len(t), 3))
         with h5py.File(folder / f"{name}.h5", "w") as file:
             for channel, values in (("time", t), ("gyro", gyro), ("accel", accel), ("temperature", T)):

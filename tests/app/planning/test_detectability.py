@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from loop_cases.signatures import dragged
 
 from driftlab.identification.records import Evidence, Record
 from driftlab.identification.result import search
@@ -67,10 +68,7 @@ def made_up(effect, size, seed):
     """A recording with a play planted in it, as the loop has it, its bias made sample by sample."""
     t = np.arange(1.0, DURATION + 1)
     T, rng = up_and_down(t), np.random.default_rng(seed)
-    slip, at = np.empty_like(T), T[0]
-    for k, value in enumerate(T):
-        at = min(max(at, value - effect.width / 2), value + effect.width / 2)
-        slip[k] = at - value
+    slip = dragged(T, effect.width) - T
     bias = curve(T) + (size / np.ptp(slip) * slip)[:, None]
     bias = bias + WALK * np.cumsum(rng.normal(size=bias.shape), axis=0) + WHITE * rng.normal(size=bias.shape)
     means = [x.reshape(-1, 4, *x.shape[1:]).mean(axis=1) for x in (t, T, bias)]

@@ -231,7 +231,7 @@ def test_a_fleet_whose_disk_was_full_at_its_first_file_is_made_anew(tmp_path, mo
 
 def test_a_fleet_of_a_version_without_digests_says_so(tmp_path):
     (tmp_path / "fleet.json").write_text('{"schema": 1, "complete": true}')
-    message = "is of a version that kept no SHA-256 of its files; move it away, or name another folder"
+    message = "exists and is not the output of an earlier fleet; move it away, or name another folder"
     with pytest.raises(ConfigError, match=message), fleet_folder(tmp_path):
         pass
 

@@ -10,8 +10,7 @@ from families_at_rest import effect_of
 
 from driftlab.family.basis import STEP
 from driftlab.family.partitions import ScratchFolder
-from driftlab.family.shared_effect import SharedEffect
-from driftlab.family.shared_effects import SharedEffects
+from driftlab.family.shared_effect import SharedEffect, without_effects
 from driftlab.family.unit_information import UnitInformation
 from driftlab.production.family import _bare
 from driftlab.production.fleet_folder import stored_units
@@ -80,8 +79,7 @@ def test_units_that_are_kept_are_those_without_the_effects_and_come_again(kept, 
         unit="rad/s/K", evidence=9, of_mean=9, of_size=9, price=5, left_out=1.0,
         in_other_lots=None, indistinguishable_from=(),
     )  # fmt: skip
-    common = SharedEffects(verdict="explained", effects=(shared,), tried=1, units=COUNT, searched=COUNT)
-    expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept.read()]
+    expected = [(without_effects(soaked, lot, [shared]), lot) for soaked, lot in kept.read()]
     for engine, scratch in ((map, None), (hands, ScratchFolder(tmp_path))):
         units = replace(kept, engine=engine, scratch=scratch).keep("apart", partial(_bare, [shared]), [None] * COUNT)
         assert len(units) == COUNT

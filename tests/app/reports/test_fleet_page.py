@@ -49,8 +49,7 @@ def fleet(count, seed=0, failed=(), odd=(), **more):
     rng = np.random.default_rng(seed)
     curves = rng.normal(size=(len(done), 3, 1)) * 60 * DEG_H + MEAN
     why = {
-        f"{k:04d}": (Outlier(f"{k:04d}", "shape", "z", 1e-6, 1.0, 0.0, 0.1, 41.0, "z bends at 41 degC", ("noise",)),)
-        for k in odd
+        f"{k:04d}": (Outlier(f"{k:04d}", "shape", "z", 1e-6, 1.0, 41.0, "z bends at 41 degC", ("noise",)),) for k in odd
     }
     known = {
         "title": "line", "records": records, "unit": RATE, "line": line_of(records, LIMITS), "T": T,

@@ -57,7 +57,7 @@ def test_another_soak_and_another_family_open_it_again():
 
 def test_an_outlier_is_known_by_its_own_value_and_a_curve_by_its_kind():
     def about(what, value):
-        return of_outlier(Outlier("u", what, "x", 0.0, value, 0.0, 1.0, None, "a sentence", ())).about
+        return of_outlier(Outlier("u", what, "x", 0.0, value, None, "a sentence", ())).about
 
     assert about("noise", 1.0) != about("noise", 1.1)
     assert about("shape", 1.0) == about("shape", 1.1) != about("level", 1.0)

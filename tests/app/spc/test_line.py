@@ -5,18 +5,18 @@ import pytest
 from lines import AXES, DEG_H, SPREAD, TYPICAL, line, record
 
 from driftlab.config import Limits
-from driftlab.family.baseline import Baseline
 from driftlab.spc.change_points import least_alike, parts, scores, shares, steps
 from driftlab.spc.charts import (
     LAMBDA,
     SIGMAS,
+    InControl,
     L,
     ewma,
     ewma_limit,
     in_control,
     scale_of,
 )
-from driftlab.spc.line import line_of
+from driftlab.spc.line import baseline_of, line_of
 
 LIMITS = Limits.model_validate({"noise": "2.5 deg/h/sqrt(Hz)", "residual": "1 deg/h", "bias_instability": "1 deg/h"})
 
@@ -188,7 +188,7 @@ def test_the_level_of_the_map_is_watched_where_it_is_given():
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_levels_are_charted_about_a_family_that_is_known(count):
     """A line that has moved since shows at once, also by few units; by its own units it would be in control."""
-    rng, law = np.random.default_rng(1), Baseline.of_levels(30, AXES, [(0.0, 60 * DEG_H)] * 3)
+    rng, law = np.random.default_rng(1), baseline_of(line_of(line(3), None), [InControl(0.0, 60 * DEG_H)] * 3)
     records = line(count)
     levels = (rng.normal(size=(count, 3)) * 20 + [240, 0, 0]) * DEG_H
     found = line_of(records, None, levels=levels, baseline=law)

@@ -10,7 +10,7 @@ from driftlab.spc.line import line_of, reconcile
 
 def said(records, *lots):
     """Return the lots that are told, and what the line says."""
-    odd = [LotOutlier(lot, "noise", "y", None, f"lot {lot} is off") for lot in lots]
+    odd = [LotOutlier(lot, "noise", "y", f"lot {lot} is off") for lot in lots]
     kept, found = reconcile(odd, line_of(records, None))
     return [lot.lot for lot in kept], " ".join(found.sentences)
 

@@ -1,6 +1,3 @@
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -30,8 +27,8 @@ def published(name):
 
 
 @pytest.fixture(scope="module")
-def xsens():
-    folder = Path(os.environ["DRIFTLAB_DATA"]) / "data" / "imu_tk"
+def xsens(recordings):
+    folder = recordings / "data" / "imu_tk"
     accel, gyro = (np.loadtxt(folder / f"xsens_{name}.txt.gz") for name in ("acc", "gyro"))
     counts = {"accel": accel[:, 1:] - 32768, "gyro": gyro[:, 1:] - 32768}
     y = {name: values * NOMINAL[name] for name, values in counts.items()}

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,17 +18,9 @@ from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
 
 
-@pytest.fixture
-def data():
-    folder = os.environ.get("DRIFTLAB_DATA")
-    if not folder:
-        pytest.skip("DRIFTLAB_DATA does not name the folder of the measured recordings")
-    return Path(folder)
-
-
 @pytest.mark.recordings
-def test_bursts_of_a_cold_test(data):
-    path = data / "data/pan_tvc_lsm6dsm/pan_tvc_50hz_bursts.csv"
+def test_bursts_of_a_cold_test(recordings):
+    path = recordings / "data/pan_tvc_lsm6dsm/pan_tvc_50hz_bursts.csv"
     own = [f"g{a}_file_rad_s" for a in AXES]
     fields = {
         "time": {"path": "t_s", "unit": "s"},
@@ -46,8 +37,8 @@ def test_bursts_of_a_cold_test(data):
 
 
 @pytest.mark.recordings
-def test_a_sweep_without_time(data):
-    path = data / "data/rtimulib2_teensy/measurements2.csv"
+def test_a_sweep_without_time(recordings):
+    path = recordings / "data/rtimulib2_teensy/measurements2.csv"
     fields = {
         "accel": {"path": ["ax_g", "ay_g", "az_g"], "unit": "g"},
         "gyro": {"path": [f"g{a}_rad_s" for a in AXES], "unit": "rad/s"},
@@ -61,8 +52,8 @@ def test_a_sweep_without_time(data):
 
 
 @pytest.mark.recordings
-def test_a_soak_in_hdf5_and_cut_short(data, tmp_path):
-    path = data / "blind/a/soak.h5"
+def test_a_soak_in_hdf5_and_cut_short(recordings, tmp_path):
+    path = recordings / "blind/a/soak.h5"
     names = ("time", "gyro", "accel", "temperature")
     source = Hdf5(path=path, channels={name: {"path": name} for name in names})
     got = read(source, 4096)

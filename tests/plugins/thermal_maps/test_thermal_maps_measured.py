@@ -1,8 +1,5 @@
 """Maps of soaks that were measured."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from soaks import ALL, DEG_H, kinds
@@ -11,11 +8,8 @@ REFERENCE = {(2, 3): [23, 25, 25], (3, 2): [35, 21, 23]}  # of an independent fi
 
 
 @pytest.fixture(scope="module")
-def heating():
-    if "DRIFTLAB_DATA" not in os.environ:
-        pytest.skip("DRIFTLAB_DATA does not name the folder of measured recordings")
-    folder = Path(os.environ["DRIFTLAB_DATA"]) / "data" / "rtimulib2_teensy"
-    runs = {}
+def heating(recordings):
+    folder, runs = recordings / "data" / "rtimulib2_teensy", {}
     for k in (2, 3):
         table = np.genfromtxt(folder / f"measurements{k}.csv", delimiter=",", names=True)
         table = table[table["ok"] == 1]

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from loop_cases.signatures import dragged, late
 
 from driftlab.maps.hysteresis import memory as module
 from driftlab.maps.hysteresis.memory import memory_of
@@ -19,25 +20,9 @@ def temperature(profile, hours):
         return 15 - 35 * np.cos(6 * np.pi * x)
     if profile == "stairs":
         levels = np.concatenate([np.arange(-20, 51, 10), np.arange(40, -21, -10)])
-        return late(levels[np.minimum((x * len(levels)).astype(int), len(levels) - 1)].astype(float), 300)
+        return late(levels[np.minimum((x * len(levels)).astype(int), len(levels) - 1)].astype(float), 300, DT)
     turns = TURNS[profile]
-    return late(np.interp(x, np.linspace(0, 1, len(turns)), turns), 480)
-
-
-def late(T, tau):
-    out, y = np.empty_like(T), T[0]
-    for k, value in enumerate(T):
-        y += (value - y) * (1 - np.exp(-DT / tau))
-        out[k] = y
-    return out
-
-
-def slipping(T, half):
-    out, y = np.empty_like(T), T[0]
-    for k, value in enumerate(T):
-        y = min(max(y, value - half), value + half)
-        out[k] = y
-    return out
+    return late(np.interp(x, np.linspace(0, 1, len(turns)), turns), 480, DT)
 
 
 def curve(T):
@@ -48,11 +33,11 @@ def curve(T):
 def memory(T, kind, size):
     """Return what is added on one axis, with a difference of `size` between up and down at most."""
     if kind == "play":
-        return size * (T - slipping(T, 4.0)) / 8
+        return size * (T - dragged(T, 8.0)) / 8
     if kind == "step":
-        way = np.sign(T - slipping(T, 0.3))
+        way = np.sign(T - dragged(T, 0.6))
         return size * way / 2
-    added = T - late(T, 600)
+    added = T - late(T, 600, DT)
     return size * added / np.ptp(added)
 
 
@@ -60,7 +45,7 @@ def judged(seed, profile="room", hours=6.0, kind="", size=0.0, walk=0.03, white=
     """Judge three axes in deg/h; walk in deg/h/sqrt(s), white in deg/h/sqrt(Hz)."""
     rng = np.random.default_rng(seed)
     T = temperature(profile, hours)
-    bias = curve(late(T, 400)) if kind == "lag" else curve(T)
+    bias = curve(late(T, 400, DT)) if kind == "lag" else curve(T)
     if kind and kind != "lag":
         bias = bias + memory(T, kind, size)[:, None] * [1.0, -2 / 3, 0.0]
     bias = bias + np.cumsum(walk * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
@@ -91,7 +76,7 @@ def test_a_lag_of_a_bent_curve_is_seen(profile):
 def test_a_lag_that_the_free_curve_of_temperature_has_taken_in_part_is_seen_nonetheless():
     """Up and down once, the time of a lag as long as features of the curve: fitted to temperature, they are gone."""
     T = temperature("once", 4.0)
-    u = (late(T, 1800) - 15) / 35
+    u = (late(T, 1800, DT) - 15) / 35
     bias = np.stack([9 * np.sin(4 * u), -9 * np.tanh(4 * u), 0 * u], axis=1)
     rng = np.random.default_rng(9)
     bias = bias + np.cumsum(0.03 * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
@@ -103,7 +88,7 @@ def test_a_lag_that_the_free_curve_of_temperature_has_taken_in_part_is_seen_none
 def test_a_part_of_the_curve_that_follows_late_is_seen_beside_a_part_that_does_not():
     """The curve that is fitted to temperature is that of the part that does not: its lag shows nothing."""
     T = temperature("room", 8.0)
-    u = (late(T, 600) - 15) / 35
+    u = (late(T, 600, DT) - 15) / 35
     rng = np.random.default_rng(9)
     bias = curve(T) + 10 * np.stack([np.cos(3 * u), np.sin(4 * u), 0 * u], axis=1)
     bias = bias + np.cumsum(0.03 * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
@@ -116,7 +101,7 @@ def test_a_part_of_the_curve_that_follows_late_is_seen_beside_a_part_that_does_n
 @pytest.mark.parametrize("profile", ["once", "room"])
 def test_a_lag_without_any_noise_is_seen(profile):
     T = temperature(profile, 4.0)
-    assert memory_of(brief(T, curve(late(T, 400)), [0], DT)).answer == "seen"
+    assert memory_of(brief(T, curve(late(T, 400, DT)), [0], DT)).answer == "seen"
 
 
 def test_a_walk_is_taken_for_none():
@@ -164,7 +149,7 @@ def test_a_steady_drift_and_a_jump_between_recordings_are_none():
 def test_a_lag_of_less_than_a_minute_is_not_taken_for_a_memory_and_not_denied():
     """A thermometer that is read some seconds before the sensor looks like it."""
     T = temperature("room", 4.0)
-    bias = curve(late(T, 25)) + 10 / np.sqrt(DT) * np.random.default_rng(5).normal(size=(len(T), 3))
+    bias = curve(late(T, 25, DT)) + 10 / np.sqrt(DT) * np.random.default_rng(5).normal(size=(len(T), 3))
     found = memory_of(brief(T, bias, [0], DT))
     assert found.answer == "undecided"
     assert "less than a minute" in found.why

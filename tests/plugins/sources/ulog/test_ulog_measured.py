@@ -1,8 +1,5 @@
 """Two real logs of PX4: one of a vehicle with three units (1.11), one of its simulator (1.13)."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pyulog import ULog
@@ -17,11 +14,8 @@ AXES = ("x", "y", "z")
 
 
 @pytest.fixture(params=LOGS)
-def path(request):
-    folder = os.environ.get("DRIFTLAB_DATA")
-    if not folder:
-        pytest.skip("DRIFTLAB_DATA does not name the folder of the measured recordings")
-    return Path(folder) / "data/px4_ulog" / request.param
+def path(request, recordings):
+    return recordings / "data/px4_ulog" / request.param
 
 
 def read(path, faults, **settings):
