@@ -82,7 +82,7 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     t = _regular(given.interval, columns)
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
-        T = channels["temperature"].values[:, 0] if "temperature" in channels else None
+        T = _between(channels["temperature"].values[:, 0]) if "temperature" in channels else None
         if field in SENSORS and t is not None and (quick := noise_of(t, values, T)):
             noise[field] = quick
         stated = _stated(field, group, columns, given.units, written)
@@ -144,7 +144,14 @@ def _step(t: Array | None) -> float | None:
 def noise_of_column(columns: FileColumns, path: str, found: Mapping[str, GuessedChannel]) -> QuickNoise | None:
     """Return the noise of one column beside the temperature, in its unit."""
     t = _seconds(found.get("time"))
-    return None if t is None else noise_of(t, columns.values[path][:, None], found["temperature"].values[:, 0])
+    T = _between(found["temperature"].values[:, 0])
+    return None if t is None else noise_of(t, columns.values[path][:, None], T)
+
+
+def _between(T: Array) -> Array:
+    """Return a temperature (N,) that few rows read with all of them: a source draws it between its readings, too."""
+    at = np.flatnonzero(np.isfinite(T))
+    return np.interp(np.arange(len(T)), at, T[at]) if len(at) > 2 and np.median(np.diff(at)) > 1 else T
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
