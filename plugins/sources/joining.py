@@ -133,8 +133,8 @@ def bridged(chunks: Iterable[Chunk], size: int, faults: Faults) -> Iterator[Chun
         return
     thermometer = _Thermometer(spacing, faults)
     done = (thermometer.take(stop) for chunk in chain(head, stream) if (stop := thermometer.hold(chunk)))
-    for rows in chain(done, thermometer.rest()):
-        yield from (rows.part(start, start + size) for start in range(0, len(rows), size))
+    for part in chain(done, thermometer.rest()):
+        yield from (part.part(start, start + size) for start in range(0, len(part), size))
 
 
 def _readings(chunk: Chunk) -> NDArray[np.bool_]:
@@ -180,7 +180,7 @@ class _Thermometer:
         return before if before > 8 * HELD else 0  # of a time that does not go on
 
     def take(self, stop: int) -> Chunk:
-        """Return the first rows that are held, with their temperature."""
+        """Return the first rows that are held, with their temperature, but for those of a reading and nothing else."""
         rows = concatenate(self.held)
         self.held = [rest] if len(rest := rows.part(stop, len(rows))) else []
         rows = rows.part(0, stop)
@@ -195,7 +195,9 @@ class _Thermometer:
         self.rows, self.readings = self.rows + stop, self.readings + int(np.sum(read))
         self.open += int(np.sum(np.isnan(values)))
         self._say()
-        return rows.having(temperature=values)
+        others = [v.reshape(len(rows), -1) for name, v in rows.channels.items() if name != "temperature"]
+        alone = read & np.all(np.isnan(np.hstack(others)), axis=1) if others else np.zeros(stop, dtype=bool)
+        return rows.having(temperature=values).where(~alone)
 
     def rest(self) -> Iterator[Chunk]:
         """Yield the rows behind the last reading."""
