@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import difflib
 import inspect
+import re
 import textwrap
 from collections.abc import Mapping
 from itertools import pairwise
@@ -114,7 +115,15 @@ def _descriptions(cls: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
+AXIS = re.compile(r"(?<![A-Za-z])[xyzXYZ](?![A-Za-z])|[xyz]$|(?<=[a-z])[XYZ](?![a-z])")  # in a name
+
+
 def nearest(word: str, known: Any, cutoff: float = 0.5) -> str | None:
-    """Return the known word most like `word`, or None where none has the share `cutoff` of its letters in order."""
-    matches = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=cutoff)
+    """Return the known word most like `word`, or None where none has the share `cutoff` of its letters in order.
+
+    That of another axis is none that was meant.
+    """
+    axis = [found.lower() for found in AXIS.findall(word)]
+    alike = [k for k in map(str, known) if not axis or [found.lower() for found in AXIS.findall(k)] in ([], axis)]
+    matches = difflib.get_close_matches(word, alike, n=1, cutoff=cutoff)
     return matches[0] if matches else None

@@ -13,11 +13,12 @@ from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.fast import compiled
-from fusion_core.faults import Fault, Faults, usable
+from fusion_core.faults import Faults, usable
 from fusion_core.model import Flags
 
 ROWS = 65_536  # of a chunk read at once
-LONG = 600.0  # s between samples that are noted
+FIRST = 11  # rows that show the usual step
+LONG, RARE = 1.0, 10.0  # s between rows that are a gap, and times the usual step where that is more
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
 
@@ -32,8 +33,8 @@ def read(
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
-    chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
     gaps, look = Gaps(faults), getattr(_suspect, "py_func", _suspect) if few else _suspect
+    chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
@@ -58,7 +59,6 @@ def read(
         if len(kept):
             empty = False
             faults.usable += len(kept)
-            gaps.look(kept.t)
             yield kept
     if empty:
         raise EmptyRecording(
@@ -79,36 +79,48 @@ def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
 
 
 class Gaps:
-    """Notes the long gaps between samples: how many, and the longest."""
+    """Notes the long gaps between the rows of a recording: how many, how long in all, and the longest."""
 
     def __init__(self, faults: Faults) -> None:
         self.faults = faults
-        self.last = np.nan  # time of the last sample so far [s]
-        self.least = np.nan  # s; where samples are rare, a gap is longer
-        self.longest, self.where = 0.0, ""
+        self.first = np.empty(0)  # times of the rows that show how long a gap is [s]
+        self.last = self.least = np.nan  # time of the last row so far, and of a step that is no gap [s]
+        self.total = self.longest = 0.0
+        self.begin, self.where = "", ""  # of the first, and of the longest
+
+    def along(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Pass the rows of a source on, and look at them: what is left out of them is counted by itself."""
+        for chunk in chunks:
+            yield chunk
+            t = chunk.t[np.isfinite(chunk.t)]
+            if len(t):
+                self.look(t)
 
     def look(self, t: Array) -> None:
-        """Look at the times (N,) of the next samples."""
+        """Look at the times (N,) of the next rows."""
         if np.isnan(self.last):
-            self.last = float(t[0])
-            self.least = max(LONG, 10 * float(np.median(np.diff(t[:1000])))) if len(t) > 1 else LONG
+            self.first = t = np.append(self.first, t)
+            if len(t) < FIRST:
+                return
+            self.last, self.least = float(t[0]), max(LONG, RARE * float(np.median(np.diff(t[:FIRST]))))
         if t[-1] - self.last > self.least:  # a gap is no longer than all of it
             steps = np.diff(t, prepend=self.last)
             long = steps > self.least
             if np.any(long):
-                self._add(t, steps, int(np.sum(long)))
+                self._add((t - steps)[long], steps[long])
         self.last = float(t[-1])
 
-    def _add(self, t: Array, steps: Array, count: int) -> None:
-        what = f"gaps of more than {self.least:g} s, predicted across"
-        begin = t - steps
-        self.where = self.where or f"at {self.faults.when(begin[int(np.argmax(steps > self.least))])}"
-        k = int(np.argmax(steps))
-        if steps[k] > self.longest:
-            self.longest = float(steps[k])
-            text = f"{self.where}, the longest {self.longest:.6g} s at {self.faults.when(begin[k])}"
-            self.faults.found.setdefault(what, Fault(0, "")).first = text
-        self.faults.add(what, count, self.where)
+    def _add(self, begins: Array, lengths: Array) -> None:
+        what = f"gaps of more than {self.least:.4g} s, predicted across"
+        k = int(np.argmax(lengths))
+        self.begin = self.begin or f"at {self.faults.when(begins[0])}"
+        if lengths[k] > self.longest:
+            self.longest, self.where = float(lengths[k]), f"{self.faults.since(begins[k]):.6g} s"
+        self.total += float(np.sum(lengths))
+        self.faults.add(what, len(lengths), "")
+        found = self.faults.found[what]
+        found.first = f"{self.begin}, {self.total:.6g} s "
+        found.first += f"in all, the longest {self.longest:.6g} s at {self.where}" if found.count > 1 else "long"
 
 
 @compiled

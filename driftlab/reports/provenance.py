@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -17,15 +18,19 @@ from pathlib import Path
 from typing import Any
 
 from driftlab import __version__
-from driftlab.config import Config, paths_of
+from driftlab.config import Config, paths_of, with_recording
 from driftlab.evaluation.limits import RULE, LimitResult, outcome, verdict
 from driftlab.recordings.identity import identity, of_source, sha256
 from driftlab.storage.recorder import started_at
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FileSource, FittedMap
+from fusion_core.contracts import FileSource, FittedMap, Source
+from fusion_core.errors import FusionError
+from fusion_core.faults import Faults
 from fusion_core.host.provenance import Participant, participants
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
+FIRST = 100  # rows, of which one says when it was
+YEARS = (8e8, 4e9)  # s since 1970, 1995 to 2096: a time that is a date
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,9 @@ def sheet_of(
     files = [source.path for source in sources if isinstance(source, FileSource) and source.path is not None]
     paths = files if recordings is None else paths_of(recordings)
     began = next((start for path in paths if (start := started_at(path)) is not None), None)
+    if began is None:
+        read = sources if recordings is None else (_source_of(config, name) for name in recordings)
+        began = next((start for source in read if (start := _date(source)) is not None), None)
     day = datetime.now(UTC) if began is None else datetime.fromtimestamp(began, UTC)
     return Sheet(
         serial=config.serial or "",
@@ -123,6 +131,22 @@ def sheet_of(
         limits=[row.cells(unit) for row in judged],
         verdict=verdict(judged),
     )
+
+
+def _date(source: Source | None) -> float | None:
+    """Return the time of the first rows of a file, s since 1970; None where it is no date."""
+    if isinstance(source, FileSource) and source.path and source.path.is_file() and "time" in source.channels:
+        with suppress(FusionError):
+            t = next(iter(source.chunks(FIRST, Faults()))).t
+            return next((float(moment) for moment in t if YEARS[0] < moment < YEARS[1]), None)
+    return None
+
+
+def _source_of(config: Config, recording: str) -> Source | None:
+    """Return the source of a recording; None where the config's reads no file."""
+    with suppress(FusionError):
+        return with_recording(config, recording).source
+    return None
 
 
 def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> dict[str, str]:

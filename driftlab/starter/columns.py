@@ -82,8 +82,13 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     t = _regular(given.interval, columns)
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
-        T = channels["temperature"].values[:, 0] if "temperature" in channels else None
-        if field in SENSORS and t is not None and (quick := noise_of(t, values, T)):
+        T = _between(channels["temperature"].values[:, 0]) if "temperature" in channels else None
+        own = np.any(np.isfinite(values), axis=1)  # rows that are not another sensor's alone
+        if (
+            field in SENSORS
+            and t is not None
+            and (quick := noise_of(t[own], values[own], None if T is None else T[own]))
+        ):
             noise[field] = quick
         stated = _stated(field, group, columns, given.units, written)
         counts = any(name.counts for name in group) and field in ("gyro", "temperature")
@@ -144,7 +149,14 @@ def _step(t: Array | None) -> float | None:
 def noise_of_column(columns: FileColumns, path: str, found: Mapping[str, GuessedChannel]) -> QuickNoise | None:
     """Return the noise of one column beside the temperature, in its unit."""
     t = _seconds(found.get("time"))
-    return None if t is None else noise_of(t, columns.values[path][:, None], found["temperature"].values[:, 0])
+    T = _between(found["temperature"].values[:, 0])
+    return None if t is None else noise_of(t, columns.values[path][:, None], T)
+
+
+def _between(T: Array) -> Array:
+    """Return a temperature (N,) that few rows read with all of them: a source draws it between its readings, too."""
+    at = np.flatnonzero(np.isfinite(T))
+    return np.interp(np.arange(len(T)), at, T[at]) if len(at) > 2 and np.median(np.diff(at)) > 1 else T
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
@@ -220,7 +232,7 @@ def _values(group: list[Name], columns: FileColumns) -> Array:
 
 def _rises(t: Array) -> bool:
     finite = t[np.isfinite(t)] if t.ndim == 1 else np.empty(0)
-    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and np.median(np.diff(finite)) > 0)
+    return len(finite) > 1 and bool(np.mean(np.diff(finite) < 0) < FALLS and np.median(np.diff(finite)) > 0)
 
 
 def _seconds(time: GuessedChannel | None) -> Array | None:
@@ -229,6 +241,9 @@ def _seconds(time: GuessedChannel | None) -> Array | None:
 
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
 YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
+DAYS = {25569.0: "as Excel counts", 719529.0: "as MATLAB counts"}  # numbers of 1970-01-01 among days
+DAY = 86_400.0  # s
+FALLS = 0.01  # of the steps of a time, where a clock was set
 RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
 TICKS = "SampleTimeFine"  # of Xsens: in us where its steps are those of a slow device
 G = {"g": 1.0, "m/s^2": 9.80665, "mg": 1000.0, "Gal": 980.665}
@@ -257,6 +272,9 @@ def of_time(t: Array, swing: float = 0.0) -> Guess:
     for unit, factor in EPOCHS.items():
         if len(finite) and YEARS[0] < finite[0] * factor < YEARS[1]:
             return Guess(unit, f"{finite[0]:.4g} is a date in {unit} since 1970")
+    for epoch, why in DAYS.items():
+        if len(finite) and YEARS[0] < (finite[0] - epoch) * DAY < YEARS[1] and step * DAY <= RATES["s"][1]:
+            return Guess("day", f"{finite[0]:.9g} is a date in days, {why}")
     for unit, (low, high) in RATES.items():
         if low <= step <= high:
             lasts = float(finite[-1] - finite[0])

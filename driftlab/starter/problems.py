@@ -46,6 +46,12 @@ def problems_of(config: Config) -> Iterator[str]:
     t = samples.t[np.isfinite(samples.t)]
     lasts = float(np.ptp(t)) if len(t) else 0.0
     steps = np.diff(t)
+    if len(steps) and (back := float(np.min(steps))) < 0:
+        at = float(t[np.argmin(steps)] - t[0])
+        yield (
+            f"time runs backwards by {-back:.6g} s, {at:.6g} s after the first row: sort the rows, or read a part, as "
+            f"in --input FILE::0:{np.floor(at * 1e3) / 1e3:.3f}"
+        )
     if len(steps) and getattr(source, "dates", None) and (jump := float(np.max(steps))) > DAY / 2:
         yield f"the date jumps by {jump / DAY:.3g} days: day and month may be the other way round, say it with --dates"
     if len(samples) < ROWS and not lasts > model.align:

@@ -147,7 +147,8 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
     return (
         f"{accel.section}.bias.sigma_0: is missing, and an accelerometer's bias across the vertical is one with "
         f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
-        f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
+        f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write the "
+        f"offset that its data sheet allows, as in {accel.section}.bias.sigma_0: {1e3 * LARGE:.0f} mg",
     )
 
 

@@ -11,7 +11,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -90,7 +90,9 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     usual = [k for k in rows if 2 * good[k] >= most]
     if not usual:
         return None
-    first = _longest_run(usual, lines)
+    filled = [sum(bool(cell.strip()) for cell in cells) for cells in cut]
+    few = {k for k, count in enumerate(filled) if 2 <= count == good[k] and len(cut[k]) >= width}  # most cells empty
+    first = _longest_run(usual, lines, few)
     share = sum(good[k] for k in usual if k >= first) / sum(len(bare(cells)) for cells in cut[first:] if cells)
     header = _header(lines, first, width, separator, decimal)
     names = names_of(lines[header], separator) if header is not None else [str(k + 1) for k in range(width)]
@@ -105,16 +107,19 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     )
 
 
-def _longest_run(rows: Sequence[int], lines: Sequence[str]) -> int:
-    """Return the first of the most rows that nothing but lines without a value and comments are between."""
+def _longest_run(rows: Sequence[int], lines: Sequence[str], few: Collection[int]) -> int:
+    """Return the first of the most rows that only lines of few numbers, comments and lines without a value part."""
     begin, best, longest = 0, 0, 0
     above = {line.strip() for line in lines[: rows[0]]}  # where the names are: a logger writes them again as it begins
     for k in range(1, len(rows) + 1):
-        between = lines[rows[k - 1] + 1 : rows[k]] if k < len(rows) else ["-"]
+        inside = (j for j in range(rows[k - 1] + 1, rows[k]) if j not in few) if k < len(rows) else ()
+        between = [lines[j] for j in inside] if k < len(rows) else ["-"]
         if any(line.strip(NOTHING) and not line.startswith("#") and line.strip() not in above for line in between):
             if k - begin > longest:
                 best, longest = rows[begin], k - begin
             begin = k
+    while best - 1 in few:
+        best -= 1
     return best
 
 

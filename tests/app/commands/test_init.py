@@ -535,3 +535,26 @@ def test_a_cell_that_says_it_is_empty_is_empty(tmp_path, cell):
     gyro = samples(tmp_path / "rec.yaml")["gyro"]
     assert np.argwhere(np.isnan(gyro)).tolist() == [[299, 1]]
     np.testing.assert_allclose(np.delete(gyro, 299, 0), np.delete(UNIT.gyro, 299, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_thermometer_that_few_rows_read_is_no_problem(tmp_path, apart):
+    """Its cells are empty in between, or its readings have rows of their own."""
+    content = table(LOGS["short"], "deg/s", "g")
+    read = np.arange(len(UNIT.t)) % 10 == 3
+    rows = pl.DataFrame(content | {"temp": np.where(read & (not apart), content["temp"], np.nan)})
+    if apart:
+        alone = {name: np.where(name in "t temp", values, np.nan)[read] for name, values in content.items()}
+        rows = pl.concat([rows, pl.DataFrame(alone | {"t": alone["t"] + 1e-3})]).sort("t")
+    rows.fill_nan(None).write_csv(tmp_path / "rec.csv")
+    done = init(tmp_path / "rec.csv", out=tmp_path / "rec.yaml", units={"gyro": "deg/s"})
+    assert (done.asked, done.problems) == ((), ())
+    got = samples(tmp_path / "rec.yaml")
+    np.testing.assert_allclose(got["gyro"], UNIT.gyro, atol=1e-12)
+    np.testing.assert_allclose(got["temperature"][3:-6], UNIT.temperature[3:-6], atol=1e-3)
+
+
+def test_a_clock_that_was_set_back_is_a_time_and_a_problem(tmp_path):
+    done = written(tmp_path, table(LOGS["short"]) | {"t": np.where(UNIT.t > UNIT.t[4000], UNIT.t - 1, UNIT.t)})
+    assert "time: {path: t, unit: s}" in done.text
+    assert done.problems[0].startswith("time runs backwards by 0.95 s, 200 s after the first row: sort the rows, or")

@@ -168,17 +168,20 @@ class Timed(Source):
 @pytest.mark.parametrize("rows", [7, 1000, 65_536])
 def test_long_gaps_are_noted_where_they_are(rows):
     t = 1.7e9 + np.arange(900.0) / 2
-    t[100:] += 599.0  # not long enough
+    t[100:] += 4.0  # not long enough
     t[300:] += 5000.0
     t[600:] += 1e12
     faults = Faults()
     source = config().model_copy(update={"source": Timed(t=tuple(t))})
     assert sum(map(len, read(source, faults, rows))) == 900
     assert faults.lines() == [
-        "gaps of more than 600 s, predicted across: 2 "
-        "(first at 748.5 s (t = 1700000748.5 s in the file), "
-        "the longest 1e+12 s at 5898.5 s (t = 1700005898.5 s in the file))"
+        "gaps of more than 5 s, predicted across: 2 "
+        "(first at 153.5 s (t = 1700000153.5 s in the file), 1e+12 s in all, "
+        "the longest 1e+12 s at 5303.5 s)"
     ]
+    pause = config().model_copy(update={"source": Timed(t=(*np.arange(0, 20, 0.01), *np.arange(260, 280, 0.01)))})
+    list(read(pause, faults := Faults(), rows))
+    assert faults.lines() == ["gaps of more than 1 s, predicted across: 1 (first at 19.99 s, 240.01 s long)"]
     seldom = config().model_copy(update={"source": Timed(t=tuple(np.arange(900.0) * 1200))})
     list(read(seldom, faults := Faults(), rows))
     assert faults.found == {}, "as far apart as all others"

@@ -90,6 +90,27 @@ def test_the_date_is_that_of_the_recording_where_it_says_one(folder):
     assert (live.date, live.recordings[0]["sha256"]) == ("2023-11-14", sha256sum(folder / "rest.h5"))
 
 
+@pytest.mark.parametrize(
+    ("cells", "settings", "date"),
+    [
+        (["2024-02-29T23:59:58", "2024-02-29T23:59:59"], "dates: {time: '%Y-%m-%dT%H:%M:%S'}", "2024-02-29"),
+        (["1709251198.5", "1709251199.5"], "", "2024-02-29"),
+        (["", "1709251199.5"], "", "2024-02-29"),
+        (["23:59:58", "23:59:59"], "dates: {time: '%H:%M:%S'}", None),
+        (["0.5", "1.5"], "", None),
+        (["x", "1709251199.5"], "", None),
+    ],
+)
+def test_the_date_is_that_of_the_first_row_whose_time_is_one(tmp_path, cells, settings, date):
+    (tmp_path / "rest.csv").write_text("time,x,y,z\n" + "".join(f"{cell},0,0,0\n" for cell in cells))
+    channels = "channels: {time: {path: time, unit: s}, gyro: {path: [x, y, z], unit: deg/s}}"
+    config = load(tmp_path, f"{GOOD}\nsource:\n  kind: csv\n  path: rest.csv\n  {settings}\n  {channels}\n")
+    expected = ("page", datetime.now(UTC).date().isoformat()) if date is None else ("recorded", date)
+    assert (sheet_of(config).dated, sheet_of(config).date) == expected
+    named = sheet_of(config, [f"{tmp_path / 'rest.csv'}::0:1"])
+    assert (named.dated, named.date) == expected
+
+
 def test_the_map_says_on_what_it_was_fitted(folder):
     T = np.linspace(0, 40, 300)
     bias = np.stack([1e-5 * T] * 3, axis=1) + 4.8481368e-6 * np.resize([1, -1], 300)[:, None]  # 1 deg/h

@@ -31,6 +31,12 @@ def test_a_clock_shows_its_unit(unit, rate, begin):
     assert columns.of_time(t).unit == unit
 
 
+@pytest.mark.parametrize("first", [45658.5, 739617.5])  # of noon on 1 January 2025, in Excel and in MATLAB
+def test_days_of_a_spreadsheet_are_a_date(first):
+    assert columns.of_time(first + np.arange(300) / 86_400 / 20).unit == "day"
+    assert columns.of_time(first + np.arange(300) / 20).unit == "s"
+
+
 def test_slow_samples_are_not_fast_ones_where_the_temperature_moves():
     t = 5.0 * np.arange(6000)
     assert columns.of_time(t).unit == "ms"

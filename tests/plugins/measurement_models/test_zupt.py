@@ -96,6 +96,7 @@ def test_an_unknown_bias_of_the_accelerometers_is_noted_where_the_gyro_could_see
     assert bool(found.notes) == noted
     if noted:
         assert "filter.accel.bias.sigma_0: is missing" in found.notes[0]
+        assert found.notes[0].endswith("as in filter.accel.bias.sigma_0: 20 mg"), "with a value and its unit"
         assert "one of 20 mg puts the gyro's bias off by x 0.19, y 0.19" in found.notes[0]
     told = found.unsure[:2] > np.deg2rad(0.15 / 3600)
     assert np.all(told) == (sigma_0 is not None), "what is said of it is in the sigma"
