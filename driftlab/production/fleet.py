@@ -355,9 +355,8 @@ class _Command:
     def _mark(self, **more: Any) -> dict[str, Any]:
         """Write `fleet.json`, and return its content."""
         jobs, folder, status = self.jobs, self.jobs.folder, self.status
-        names = set(jobs.manifest.names)
-        left = [unit for unit in folder.units.names() if unit not in names]
-        counts = {"units": len(names), "done": len(status.done), "failed": len(status.failed)}
+        left = [unit for unit in folder.units.names() if unit not in folder.records]
+        counts = {"units": len(status.records), "done": len(status.done), "failed": len(status.failed)}
         summary = FleetSummary(
             plugins=participants(self.config),
             units_from=jobs.manifest.name,

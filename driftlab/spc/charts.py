@@ -84,15 +84,16 @@ class ControlChart:
         One of FIGURES, or `level`; the unit is SI.
     at : (m,) int array
         Places of the units in the line.
-    value : (m,) array
+    figures : callable
+        Returns values (SI) and deviations (2, m): where they are kept, they need not be a second time.
     scale : Scale
         In which the limits lie alike above and below.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
         Middle of a line in control, SI.
-    own : (m,) array
-        Deviations of the units' measurements in the scale, single precision.
+    usual : float
+        Value (SI) of which the deviations of the units' measurements are.
     changes : tuple of Change
     lots : tuple of Lot
         In the order of their first units.
@@ -112,11 +113,11 @@ class ControlChart:
     axis: str
     unit: str
     at: NDArray[np.intp]
-    value: Array
+    figures: Callable[[], Array]
     scale: ChartScale
     basis: tuple[int, int]
     centre: float
-    own: NDArray[np.float32]
+    usual: float
     changes: tuple[StepChange, ...]
     lots: tuple[LotPoint, ...]
     law: InControl
@@ -128,6 +129,11 @@ class ControlChart:
     # what follows of the above is computed where it is asked for: of a million units it would be gigabytes
 
     @property
+    def value(self) -> Array:
+        """Values (m,), SI."""
+        return np.asarray(self.figures()[0])
+
+    @property
     def of_family(self) -> bool:
         """True if centre and limits are those of a family that was known."""
         return self.frozen is not None
@@ -135,7 +141,9 @@ class ControlChart:
     @property
     def sigma(self) -> Array:
         """Deviations (m,) in control, in the scale."""
-        return np.maximum(self.law.sigma(self.own.astype(np.float64)), 1e-100)  # of values that do not vary
+        value, sigma = self.figures()
+        own = self.scale.of_usual(value, sigma, self.usual).astype(np.float32)
+        return np.maximum(self.law.sigma(own.astype(np.float64)), 1e-100)  # of values that do not vary
 
     @property
     def z(self) -> Array:
@@ -401,6 +409,16 @@ class ChartScale:
         if self.name == "log":
             return np.asarray(known / values)
         return np.asarray(0.5 * known / np.sqrt(np.maximum(np.maximum(values, known), 1e-300)))  # also of 0
+
+    def of_usual(self, value: Array, sigma: Array, usual: float) -> Array:
+        """Return the deviations (n,) that values (n,) would have in this scale, were each as `usual` (SI).
+
+        What comes out large by chance has a large deviation of its own, and what comes out small a small one.
+        """
+        if not usual > 0:
+            return self.sigma(value, sigma)
+        own = self.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
+        return np.maximum(own, np.median(own))
 
 
 def scale_of(values: Array, *, size: bool) -> ChartScale:
