@@ -19,9 +19,10 @@ known family. n units, d axes, q coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from sys import intern
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +60,7 @@ OF_NOISE = ("hysteresis", "soaks")  # compared with noise alone, where other uni
 SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than its estimate
 MIN_UNITS_OF_LOT, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
 LOGARITHMIC, FLOOR = ("noise",), 0.1  # of the median: a figure may be estimated as 0
+Texts = npt.NDArray[np.object_]
 REACH = 2.0  # times the usual: range of the noise of a unit
 
 
@@ -175,10 +177,8 @@ class Tests:
         Statistics of the curves, in deviations.
     records : sequence of UnitRecord
         Of the units.
-    of_lots : (n,) int array
-        The units' lots, by their places in `named`.
-    named : list of str
-        The lots.
+    of_lots : (n,) array of str
+        The units' lots.
     laws : TailLaws
     off : dict of str to list of dict
         Of each figure and axis the lots that are off as a whole, and by how much, as `scaled` has it.
@@ -187,8 +187,7 @@ class Tests:
     what: list[tuple[str, int]]
     curves: Array
     records: Sequence[UnitRecord]
-    of_lots: Index
-    named: list[str]
+    of_lots: Texts
     laws: TailLaws
     off: dict[str, list[dict[str, float]]]
 
@@ -198,7 +197,7 @@ class Tests:
         columns = [_chance(self.laws.curves.get(name), curves[:, k], name) for k, name in enumerate(CURVES)]
         for name, off in self.off.items():
             figures = figure_of(records, name, curves.shape[2]).swapaxes(0, 1)
-            columns.append(_of_figure(self.laws.figures.get(name), name, figures, self.named, lots, off))
+            columns.append(_of_figure(self.laws.figures.get(name), name, figures, lots, off))
         return np.concatenate(columns, axis=1)
 
     def figure(self, unit: int, name: str, axis: int) -> float:
@@ -221,30 +220,28 @@ def tests_of(
     laws: TailLaws | None,
 ) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
-    d, count, lots = len(family.axes), len(units), dict[str, int]()
-    curves, lot = np.empty((count, len(CURVES), d)), np.empty(count, dtype=np.intp)
+    d, n = len(family.axes), len(units)
+    curves, lots = np.empty((n, len(CURVES), d)), np.empty(n, dtype=np.object_)
 
     def read() -> Iterator[str]:
         at = 0
         for names, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
             part = slice(at, at := at + len(names))
-            curves[part], lot[part] = table, [lots.setdefault(one, len(lots)) for one in of_lots]
+            curves[part], lots[part] = table, [*map(intern, of_lots)]
             yield from names
 
     known = of_units(records, read())
-    there, named = figures_in(known), list(lots)
-    figures = [name for name in FIGURES if name in there]
+    figures = sorted(figures_in(known) & {*FIGURES}, key=FIGURES.index)
     off: dict[str, list[dict[str, float]]] = {name: [{}] * d for name in figures}
     if laws is None:
-        found = {name: figure_law(name, figure_of(known, name, d).swapaxes(0, 1), named, lot) for name in figures}
+        found = {name: figure_law(name, figure_of(known, name, d).swapaxes(0, 1), lots) for name in figures}
         off = {name: own for name, (_, own) in found.items()}
         laws = TailLaws(
             curves={name: law for k, name in enumerate(CURVES) if (law := TailLaw.of(curves[:, k])) is not None},
             figures={name: law for name, (law, _) in found.items() if law is not None},
         )
-    return Tests(
-        [(name, axis) for name in (*CURVES, *figures) for axis in range(d)], curves, known, lot, named, laws, off
-    )
+    tests = [(name, axis) for name in (*CURVES, *figures) for axis in range(d)]
+    return Tests(tests, curves, known, lots, laws, off)
 
 
 def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[list[str], list[str], Array]:
@@ -264,9 +261,7 @@ def _times(name: str, law: FigureLaw, axis: int, off: dict[str, float]) -> list[
     ]
 
 
-def figure_law(
-    name: str, columns: Array, named: Sequence[str], lots: Index
-) -> tuple[FigureLaw | None, list[dict[str, float]]]:
+def figure_law(name: str, columns: Array, lots: Texts) -> tuple[FigureLaw | None, list[dict[str, float]]]:
     """Return the law of a figure, and of each axis the lots that are off as a whole.
 
     Parameters
@@ -274,10 +269,7 @@ def figure_law(
     name : str
     columns : (n, 2, d) array
         Value and sigma.
-    named : sequence of str
-        The lots.
-    lots : (n,) int array
-        That of each unit, by its place in these.
+    lots : (n,) array of str
 
     Returns
     -------
@@ -296,9 +288,9 @@ def figure_law(
         own = np.fmax(own, sure)  # none is surer of itself than most because it came out large
         z, centre, width = standardised(x, own)
         total = float(np.hypot(width, sure))
-        shifts = {lot: by * total for lot, by in _off(z, named, lots).items()}
+        shifts = {lot: by * total for lot, by in _off(z, lots).items()}
         if shifts:
-            z, centre, width = standardised(x - _shift(shifts, named)[lots], own)
+            z, centre, width = standardised(x - np.array([shifts.get(lot, 0.0) for lot in lots]), own)
         u[:, axis] = z
         off.append(shifts)
         rows.append((usual, sure, centre, width))
@@ -309,19 +301,15 @@ def figure_law(
     return FigureLaw(usual=usual_of, sure=sure_of, centre=centre_of, width=width_of, law=law), off
 
 
-def _of_figure(
-    law: FigureLaw | None, name: str, columns: Array, named: Sequence[str], lots: Index,
-    off: Sequence[dict[str, float]],
-) -> Array:  # fmt: skip
+def _of_figure(law: FigureLaw | None, name: str, columns: Array, lots: Texts, off: Sequence[dict[str, float]]) -> Array:
     """Return p-values (n, d) of a figure with value and sigma (n, 2, d), of lots that are `off` as a whole."""
     if law is None:
         return _of_noise(columns, MARGIN) if name in OF_NOISE else np.full(columns[:, 0].shape, np.nan)
     u = np.full(columns[:, 0].shape, np.nan)
     for axis, shifts in enumerate(off):
         x, own = scaled(name, columns[:, 0, axis], columns[:, 1, axis], law.usual[axis])
-        u[:, axis] = (x - _shift(shifts, named)[lots] - law.centre[axis]) / np.hypot(
-            law.width[axis], np.fmax(own, law.sure[axis])
-        )
+        shift = np.array([shifts.get(lot, 0.0) for lot in lots])
+        u[:, axis] = (x - shift - law.centre[axis]) / np.hypot(law.width[axis], np.fmax(own, law.sure[axis]))
     p = _chance(law.law, u, name)
     return np.fmax(p, _of_noise(columns, 1.0)) if name in OF_NOISE else p  # a walk makes a loop, too
 
@@ -377,15 +365,11 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
     return float(np.median(positive)) if len(positive) else 1.0
 
 
-def _shift(shifts: Mapping[str, float], named: Sequence[str]) -> Array:
-    return np.array([shifts.get(lot, 0.0) for lot in named])
-
-
-def _off(u: Array, named: Sequence[str], lots: Index) -> dict[str, float]:
+def _off(u: Array, lots: Texts) -> dict[str, float]:
     """Return the shift, in widths, of each lot that is off as a whole."""
     shifts = {}
-    for lot in sorted(named):
-        own = u[(lots == named.index(lot)) & np.isfinite(u)]
+    for lot in sorted(set(lots)):
+        own = u[(lots == lot) & np.isfinite(u)]
         if MIN_UNITS_OF_LOT <= len(own) <= len(u) / 2:
             middle = float(np.median(own))
             if abs(middle) > max(1.0, LOT_OFF * 1.2533 / np.sqrt(len(own))):

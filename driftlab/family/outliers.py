@@ -137,8 +137,7 @@ def find_outliers(
     tests = tests_of(family, statistics, units, records, None if fitted else family.laws)
     if not len(tests.curves):
         return Outliers({})
-    ordinary = 0 if fitted or family.laws is None else family.units
-    places, p, reported = chosen(tests.p, len(tests.curves), ordinary)
+    places, p, reported = chosen(tests.p, len(tests.curves), 0 if fitted or family.laws is None else family.units)
     unit = shown or default_unit(family.bias_unit)
     words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
     read = zip(places.tolist(), p, reported, units.chosen(places).read(), strict=True)
@@ -172,9 +171,7 @@ def chosen(p: Callable[[Index], Array], count: int, ordinary: int = 0) -> tuple[
     `p` returns those of some of `count` units, NaN where there is no test; `ordinary` further units are known to be as
     they should.
     """
-    of_unit = np.empty(count)
-    for part in np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE)):
-        of_unit[part] = simes(p(part))
+    of_unit = np.concatenate([simes(p(part)) for part in np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))])
     share = _level(of_unit[np.isfinite(of_unit)], FALSE, int(np.sum(np.isfinite(of_unit))) + ordinary)
     places = np.flatnonzero(of_unit <= share)
     tested = p(places)
@@ -326,7 +323,7 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
             differs = f"{_number(times, shown)} {shown.shown} off"
         sentence = (
             f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
-            f"{np.sum(tests.of_lots == tests.named.index(lot_name))} units are held against one another"
+            f"{np.sum(tests.of_lots == lot_name)} units are held against one another"
         )
         odd.append(LotOutlier(lot_name, name, family.axes[axis], None, sentence))
     return tuple(odd)

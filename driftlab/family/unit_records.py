@@ -39,8 +39,8 @@ class UnitRecords:
         self._codes, self._common = array("I"), list[tuple[Any, ...]]()  # of what rows have in common with others
         self._texts, self._known = dict[Any, Any](), dict[tuple[Any, ...], int]()
         # of each row the table of those with the same axes and figures, and its place there
-        self._kinds, self._places, self._numbered = array("I"), array("I"), dict[tuple[Any, ...], int]()
-        self._tables: list[tuple[tuple[str, ...], tuple[str, ...], array[float], array[float]]] = []
+        self._kinds, self._places = array("I"), array("I")
+        self._tables: dict[tuple[tuple[str, ...], ...], tuple[int, array[float], array[float]]] = {}
         self._alone: dict[int, _Alone] = {}
 
     def __contains__(self, unit: str) -> bool:
@@ -63,10 +63,8 @@ class UnitRecords:
         code = self._known.setdefault(common, len(self._common))
         if code == len(self._common):
             self._common.append(common)
-        kind = self._numbered.setdefault((axes, names), len(self._tables))
-        if kind == len(self._tables):
-            self._tables.append((axes, names, array("d"), array("f")))
-        *_, numbers, deviations = self._tables[kind]
+        table = (len(self._tables), array("d"), array("f"))
+        kind, numbers, deviations = self._tables.setdefault((axes, names), table)
         self._codes.append(code)
         self._kinds.append(kind)
         self._places.append(len(numbers) // (NUMBERS + values.size))
@@ -82,7 +80,7 @@ class UnitRecords:
         state, lot, date, more, channel, bias_unit, driftlab, limits = self._common[self._codes[row]]
         unhashed = self._keys[32 * row : 32 * row + 32].hex(), "", (), None
         key, error, repeats, parabolas = self._alone.get(row, unhashed)
-        axes, names, numbers, deviations = self._tables[self._kinds[row]]
+        (axes, names), (_, numbers, deviations) = [*self._tables.items()][self._kinds[row]]
         place, d = self._places[row], len(axes)
         start, own = place * (NUMBERS + d * len(names)), place * d * len(names)
         low, high, hours, samples, seconds = numbers[start : start + NUMBERS]
@@ -105,7 +103,7 @@ class UnitRecords:
     def column(self, rows: Rows, name: str, d: int) -> Array:
         """Return values and deviations (2, n, d) of a figure of some rows, NaN where they are not known."""
         table, kinds = np.full((2, len(rows), d), np.nan), np.asarray(self._kinds)[rows]
-        for kind, (axes, names, *held) in enumerate(self._tables):
+        for (axes, names), (kind, *held) in self._tables.items():
             if name not in names or len(axes) != d:
                 continue
             own = np.flatnonzero(kinds == kind)
@@ -119,14 +117,14 @@ class UnitRecords:
         """Return the keys (n, 4) of the work on some rows: hashes of recordings and config, 0 where none is known."""
         return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[rows]
 
+    def are(self, state: str, rows: Rows) -> NDArray[np.bool_]:
+        """Return True for each of some rows that is in a state: `done` or `failed`."""
+        of_codes = np.array([one[0] == state for one in self._common], dtype=bool)
+        return np.asarray(of_codes[np.asarray(self._codes)[rows]])
+
     def names(self, rows: Rows) -> set[str]:
         """Return the names of the figures that any of some rows has."""
-        return {name for kind in np.unique(np.asarray(self._kinds)[rows]) for name in self._tables[kind][1]}
-
-    def states(self, rows: Rows) -> NDArray[np.str_]:
-        """Return the state of each of some rows: `done` or `failed`."""
-        of_codes = np.array([state for state, *_ in self._common], dtype=np.str_)
-        return np.asarray(of_codes[np.asarray(self._codes)[rows]])
+        return {name for kind in np.unique(np.asarray(self._kinds)[rows]) for name in [*self._tables][kind][1]}
 
 
 class RecordsOfUnits(Sequence[UnitRecord]):
@@ -167,7 +165,7 @@ class RecordsOfUnits(Sequence[UnitRecord]):
 
     def in_state(self, state: str) -> RecordsOfUnits:
         """Return those that are in a state."""
-        return self[np.flatnonzero(self.records.states(self.rows) == state)]
+        return self[np.flatnonzero(self.records.are(state, self.rows))]
 
 
 def at_places(records: Sequence[UnitRecord], places: NDArray[np.intp]) -> Sequence[UnitRecord]:

@@ -162,7 +162,6 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
             figures.append({"name": figure_name(name), "unit": unit.shown + PER.get(name, ""), "columns": columns})
     domains = [record.domain or (None, None) for record in records]
     why = [record.error if record.state == "failed" else reasons.get(record.unit, "") for record in records]
-    links = [overview.links.get(record.unit, "") for record in records]
     more = dict.fromkeys(name for record in records for name in record.more)
     return {
         "axes": list(axes), "lots": list(places), "verdicts": list(VERDICTS), "figures": figures,
@@ -176,7 +175,7 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
         "low": [rounded(low, 4) for low, _ in domains],
         "high": [rounded(high, 4) for _, high in domains],
         "why": {k: text for k, text in enumerate(why) if text},
-        "links": {k: link for k, link in enumerate(links) if link},
+        "links": {k: link for k, record in enumerate(records) if (link := overview.links.get(record.unit))},
         "more": {name: [record.more.get(name, "") for record in records] for name in more},
     }  # fmt: skip
 

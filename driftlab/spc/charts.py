@@ -85,15 +85,13 @@ class ControlChart:
     at : (m,) int array
         Places of the units in the line.
     figures : callable
-        Returns values (SI) and deviations (2, m): where they are kept, they need not be a second time.
+        Returns the values (m,), SI, and the deviations (m,) of their measurements in the scale, by the records.
     scale : Scale
         In which the limits lie alike above and below.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
         Middle of a line in control, SI.
-    usual : float
-        Value (SI) of which the deviations of the units' measurements are.
     changes : tuple of Change
     lots : tuple of Lot
         In the order of their first units.
@@ -113,11 +111,10 @@ class ControlChart:
     axis: str
     unit: str
     at: NDArray[np.intp]
-    figures: Callable[[], Array]
+    figures: Callable[[], tuple[Array, Array]]
     scale: ChartScale
     basis: tuple[int, int]
     centre: float
-    usual: float
     changes: tuple[StepChange, ...]
     lots: tuple[LotPoint, ...]
     law: InControl
@@ -131,7 +128,7 @@ class ControlChart:
     @property
     def value(self) -> Array:
         """Values (m,), SI."""
-        return np.asarray(self.figures()[0])
+        return self.figures()[0]
 
     @property
     def of_family(self) -> bool:
@@ -141,9 +138,8 @@ class ControlChart:
     @property
     def sigma(self) -> Array:
         """Deviations (m,) in control, in the scale."""
-        value, sigma = self.figures()
-        own = self.scale.of_usual(value, sigma, self.usual).astype(np.float32)
-        return np.maximum(self.law.sigma(own.astype(np.float64)), 1e-100)  # of values that do not vary
+        # no less than that of values that do not vary
+        return np.maximum(self.law.sigma(self.figures()[1].astype(np.float32).astype(np.float64)), 1e-100)
 
     @property
     def z(self) -> Array:
@@ -409,16 +405,6 @@ class ChartScale:
         if self.name == "log":
             return np.asarray(known / values)
         return np.asarray(0.5 * known / np.sqrt(np.maximum(np.maximum(values, known), 1e-300)))  # also of 0
-
-    def of_usual(self, value: Array, sigma: Array, usual: float) -> Array:
-        """Return the deviations (n,) that values (n,) would have in this scale, were each as `usual` (SI).
-
-        What comes out large by chance has a large deviation of its own, and what comes out small a small one.
-        """
-        if not usual > 0:
-            return self.sigma(value, sigma)
-        own = self.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
-        return np.maximum(own, np.median(own))
 
 
 def scale_of(values: Array, *, size: bool) -> ChartScale:

@@ -85,10 +85,9 @@ def line_of(
     enough = quantities.enough()
     alpha = FALSE / max(sum(enough.values()), 1)
     of_rules, everywhere = RULES.get(rules or "", {}), np.arange(len(line.units))
-    names = dict.fromkeys(name for (name, _), there in enough.items() if there)
     controls = tuple(
-        _control(line, name, k, quantities, alpha, known.get((name, axis)), of_rules, everywhere)
-        for name in names for k, axis in enumerate(line.axes) if enough[name, axis]
+        _control(line, name, line.axes.index(axis), quantities, alpha, known.get((name, axis)), of_rules, everywhere)
+        for (name, axis), there in enough.items() if there
     )  # fmt: skip
     too_few = tuple(f"{axis} {name}" for (name, axis), there in enough.items() if not there)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
@@ -137,10 +136,6 @@ class _Quantities:
         }  # fmt: skip
 
 
-def _figures(quantities: _Quantities, name: str, k: int, at: NDArray[np.intp]) -> Array:
-    return quantities.read(name)[:, at, k]
-
-
 def _control(
     line: LineReport, name: str, k: int, quantities: _Quantities, alpha: float, known: FrozenLimits | None,
     rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]], everywhere: NDArray[np.intp],
@@ -148,12 +143,12 @@ def _control(
     """Return the chart of a quantity of axis k."""
     at = np.flatnonzero(np.isfinite(quantities.read(name)[0, :, k]))
     at = everywhere if len(at) == len(everywhere) else at  # charts of all units have the same places
-    figures = partial(_figures, quantities, name, k, at)
-    (value, sigmas), lots = figures(), np.array(line.lots, dtype=np.str_)[at]
+    value, lots = quantities.read(name)[0, at, k], np.array(line.lots, dtype=np.str_)[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
     usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
-    x, own = scale.to(value), scale.of_usual(value, sigmas, usual)
+    figures = partial(_figures, quantities, name, k, at, scale, usual)
+    x, own = scale.to(value), figures()[1]
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
     course = course_of(x, whole, alpha, _runs(lots.tolist()))
     level_steps, trend = course.steps, _trend(course, scale)
@@ -164,7 +159,7 @@ def _control(
     sigma = np.maximum(law.sigma(own.astype(np.float32).astype(np.float64)), 1e-100)  # of values that do not vary
     return ControlChart(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, scale=scale, figures=figures,
-        basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))), usual=usual,
+        basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))),
         changes=_changes(level_steps, stretches, x, sigma, scale, at),
         lots=_lots(lots, x, sigma, law, scale, known=known is not None),
         trend=trend, law=law, rules=rules, phi=course.phi, frozen=known,
@@ -251,6 +246,21 @@ def _about_stretches(line: LineReport, chart: ControlChart) -> Array:
         part = z[start:stop]
         part -= np.nanmedian(part) if np.any(np.isfinite(part)) else 0.0
     return z
+
+
+def _figures(
+    quantities: _Quantities, name: str, k: int, at: NDArray[np.intp], scale: ChartScale, usual: float
+) -> tuple[Array, Array]:
+    """Return the values (m,), SI, of a quantity of axis k, and the deviations in the scale that they would have.
+
+    Were each as `usual` (SI): what comes out large by chance has a large deviation of its own, what comes out small a
+    small one.
+    """
+    value, sigma = quantities.read(name)[:, at, k]
+    if not usual > 0:
+        return value, scale.sigma(value, sigma)
+    own = scale.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
+    return value, np.maximum(own, np.median(own))
 
 
 def _trend(course: Course, scale: ChartScale) -> Trend | None:
