@@ -50,7 +50,7 @@ from driftlab.units import BiasUnit, axis_name, default_unit, number
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
-AT_ONCE = 10_000  # units of which copies are made
+AT_ONCE = 1000  # units whose p-values are in memory
 FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name not in ("soaks", *TERM_FIGURES))),
     "hysteresis": ("walk", "residual", "coast"),

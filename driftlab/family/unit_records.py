@@ -35,11 +35,10 @@ class UnitRecords:
 
     def __init__(self) -> None:
         self._rows, self.units = dict[str, int](), list[str]()  # of each row its unit
-        self._keys = bytearray()  # 32 bytes a row
-        self._codes, self._common = array("I"), list[tuple[Any, ...]]()  # of what rows have in common with others
+        self.codes, self.common = array("I"), list[tuple[Any, ...]]()  # of what rows have in common with others
         self._texts, self._known = dict[Any, Any](), dict[tuple[Any, ...], int]()
-        # of each row the table of those with the same axes and figures, and its place there
-        self._kinds, self._places = array("I"), array("I")
+        # of each row 32 bytes of its key, the table of those with the same axes and figures, and its place there
+        self._keys, self._kinds, self._places = bytearray(), array("I"), array("I")
         self._tables: dict[tuple[tuple[str, ...], ...], tuple[int, array[float], array[float]]] = {}
         self._alone: dict[int, _Alone] = {}
 
@@ -50,8 +49,8 @@ class UnitRecords:
         row, axes = len(self.units), record.axes
         limits = tuple(tuple((name, row[name]) for name in OF_LIMITS if name in row) for row in record.limits)
         names = tuple(name for name in HELD if name in record.figures)
-        more = tuple(record.more.items())
-        texts = (record.state, record.lot, record.date, more, record.channel, record.bias_unit, record.driftlab, limits)
+        texts = (record.state, record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit,
+                 record.driftlab, limits)  # fmt: skip
         common = tuple([self._texts.setdefault(text, text) for text in texts])
         values, sigmas = record.table(names, len(axes))
         hashed = len(record.key) == 64 and set(record.key) <= HEX
@@ -60,12 +59,12 @@ class UnitRecords:
         self._rows[unit] = row
         self.units.append(unit)
         self._keys += bytes.fromhex(record.key) if hashed else bytes(32)
-        code = self._known.setdefault(common, len(self._common))
-        if code == len(self._common):
-            self._common.append(common)
+        code = self._known.setdefault(common, len(self.common))
+        if code == len(self.common):
+            self.common.append(common)
         table = (len(self._tables), array("d"), array("f"))
         kind, numbers, deviations = self._tables.setdefault((axes, names), table)
-        self._codes.append(code)
+        self.codes.append(code)
         self._kinds.append(kind)
         self._places.append(len(numbers) // (NUMBERS + values.size))
         numbers.extend([*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds])
@@ -77,7 +76,7 @@ class UnitRecords:
 
     def at(self, row: int) -> UnitRecord:
         """Return the record of a row."""
-        state, lot, date, more, channel, bias_unit, driftlab, limits = self._common[self._codes[row]]
+        state, lot, date, more, channel, bias_unit, driftlab, limits = self.common[self.codes[row]]
         unhashed = self._keys[32 * row : 32 * row + 32].hex(), "", (), None
         key, error, repeats, parabolas = self._alone.get(row, unhashed)
         (axes, names), (_, numbers, deviations) = [*self._tables.items()][self._kinds[row]]
@@ -116,11 +115,6 @@ class UnitRecords:
     def keys(self, rows: Rows) -> NDArray[np.uint64]:
         """Return the keys (n, 4) of the work on some rows: hashes of recordings and config, 0 where none is known."""
         return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[rows]
-
-    def are(self, state: str, rows: Rows) -> NDArray[np.bool_]:
-        """Return True for each of some rows that is in a state: `done` or `failed`."""
-        of_codes = np.array([one[0] == state for one in self._common], dtype=bool)
-        return np.asarray(of_codes[np.asarray(self._codes)[rows]])
 
     def names(self, rows: Rows) -> set[str]:
         """Return the names of the figures that any of some rows has."""
@@ -165,7 +159,8 @@ class RecordsOfUnits(Sequence[UnitRecord]):
 
     def in_state(self, state: str) -> RecordsOfUnits:
         """Return those that are in a state."""
-        return self[np.flatnonzero(self.records.are(state, self.rows))]
+        of_codes = np.array([common[0] == state for common in self.records.common], dtype=bool)
+        return self[np.flatnonzero(of_codes[np.asarray(self.records.codes)[self.rows]])]
 
 
 def at_places(records: Sequence[UnitRecord], places: NDArray[np.intp]) -> Sequence[UnitRecord]:

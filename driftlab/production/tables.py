@@ -74,8 +74,7 @@ def write_fleet(
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
     drawn = _drawn(status, analysis)
     table = _Table(folder.units, scratch, analysis.family, analysis.common.effects, tuple(more))
-    stage = Stage("tables and maps", total=len(status.records))
-    progress(stage)
+    progress(stage := Stage("tables and maps", total=len(status.records)))
     names, chosen = status.records.units, set(drawn)
     shown = np.array([name in chosen for name in names])
     of_units = (
