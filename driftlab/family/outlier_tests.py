@@ -19,7 +19,7 @@ known family. n units, d axes, q coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from sys import intern
@@ -30,10 +30,10 @@ import numpy.typing as npt
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import TERM_FIGURES, UnitRecord
-from driftlab.family.reml import WEIGHT
+from driftlab.family.reml import WEIGHT, Index
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
-from driftlab.family.unit_records import figure_of, figures_in
+from driftlab.family.unit_records import at_places, figure_of, figures_in, of_units
 from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak with less information on an axis has none
@@ -60,6 +60,7 @@ OF_NOISE = ("hysteresis", "soaks")  # compared with noise alone, where other uni
 SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than its estimate
 MIN_UNITS_OF_LOT, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
 LOGARITHMIC, FLOOR = ("noise",), 0.1  # of the median: a figure may be estimated as 0
+Texts = npt.NDArray[np.object_]
 REACH = 2.0  # times the usual: range of the noise of a unit
 
 
@@ -166,31 +167,52 @@ def _along(own: CurveDeviation, g: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Tests:
-    """Tests of units `names`.
+    """Tests of n units; p-values and values are computed of those that are asked for.
 
     Attributes
     ----------
     what : list of (str, int)
         One of CURVES or FIGURES, and the axis, of each of the m tests: of the curves, and of figures that occur.
-    p : (n, m) array
-        NaN where there is no test.
-    values : (n, m) array
-        In SI, of the statistics of curves in deviations; single precision.
-    laws : TailLaws
-    of_lots : list of str
+    curves : (n, CURVES, d) array
+        Statistics of the curves, in deviations.
+    records : sequence of UnitRecord
+        Of the units.
+    of_lots : (n,) array of str
         The units' lots.
-    lots : list of (str, int, str, float)
-        Figures of lots that are off as a whole: figure, axis, lot, and how many times that of the others it is; of a
-        term of M by how much it is off, SI.
+    laws : TailLaws
+    off : dict of str to list of dict
+        Of each figure and axis the lots that are off as a whole, and by how much, as `scaled` has it.
     """
 
-    names: list[str]
     what: list[tuple[str, int]]
-    p: Array
-    values: npt.NDArray[np.float32]
+    curves: Array
+    records: Sequence[UnitRecord]
+    of_lots: Texts
     laws: TailLaws
-    of_lots: list[str]
-    lots: list[tuple[str, int, str, float]]
+    off: dict[str, list[dict[str, float]]]
+
+    def p(self, units: Index) -> Array:
+        """Return the p-values (k, m) of some units, NaN where there is no test."""
+        curves, records, lots = self.curves[units], at_places(self.records, units), self.of_lots[units]
+        columns = [_chance(self.laws.curves.get(name), curves[:, k], name) for k, name in enumerate(CURVES)]
+        for name, off in self.off.items():
+            figures = figure_of(records, name, curves.shape[2]).swapaxes(0, 1)
+            columns.append(_of_figure(self.laws.figures.get(name), name, figures, lots, off))
+        return np.concatenate(columns, axis=1)
+
+    def figure(self, unit: int, name: str, axis: int) -> float:
+        """Return a figure of an axis of a unit, SI."""
+        return float(np.float32(figure_of([self.records[unit]], name, self.curves.shape[2])[0, 0, axis]))
+
+    def odd_lots(self) -> list[tuple[str, int, str, float]]:
+        """Return figures of lots that are off as a whole: figure, axis, lot, and how many times that of the others.
+
+        Of a term of M by how much it is off, SI.
+        """
+        return [
+            (name, axis, *lot) for name, off in self.off.items() if name in self.laws.figures
+            for axis, own in enumerate(off) for lot in _times(name, self.laws.figures[name], axis, own)
+        ]  # fmt: skip
 
 
 def tests_of(
@@ -198,40 +220,28 @@ def tests_of(
     laws: TailLaws | None,
 ) -> Tests:  # fmt: skip
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
-    d, names, lots = len(family.axes), list[str](), list[str]()
-    curves = np.empty((len(units), len(CURVES), d))
-    for own, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
-        curves[len(names) : len(names) + len(own)] = table
-        names += own
-        lots += map(intern, of_lots)
-    places = _places(records, names)
-    known = figures_in(records)
-    figures = [name for name in FIGURES if name in known]
-    of_curves: dict[str, TailLaw] = {}
-    of_figures: dict[str, FigureLaw] = {}
+    d, n = len(family.axes), len(units)
+    curves, lots = np.empty((n, len(CURVES), d)), np.empty(n, dtype=np.object_)
+
+    def read() -> Iterator[str]:
+        at = 0
+        for names, of_lots, table in in_partitions(units).map(partial(_curves, statistics)):
+            part = slice(at, at := at + len(names))
+            curves[part], lots[part] = table, [*map(intern, of_lots)]
+            yield from names
+
+    known = of_units(records, read())
+    figures = sorted(figures_in(known) & {*FIGURES}, key=FIGURES.index)
+    off: dict[str, list[dict[str, float]]] = {name: [{}] * d for name in figures}
+    if laws is None:
+        found = {name: figure_law(name, figure_of(known, name, d).swapaxes(0, 1), lots) for name in figures}
+        off = {name: own for name, (_, own) in found.items()}
+        laws = TailLaws(
+            curves={name: law for k, name in enumerate(CURVES) if (law := TailLaw.of(curves[:, k])) is not None},
+            figures={name: law for name, (law, _) in found.items() if law is not None},
+        )
     tests = [(name, axis) for name in (*CURVES, *figures) for axis in range(d)]
-    p, values, odd_lots = np.empty((len(names), len(tests))), np.empty((len(names), len(tests)), np.float32), []
-    for k, name in enumerate(CURVES):
-        statistic = curves[:, k]
-        law = TailLaw.of(statistic) if laws is None else laws.curves.get(name)
-        of_curves |= {} if law is None else {name: law}
-        p[:, k * d : (k + 1) * d], values[:, k * d : (k + 1) * d] = _chance(law, statistic, name), statistic
-    for k, name in enumerate(figures, len(CURVES)):
-        of_axes = np.full((len(names), 2, d), np.nan)
-        of_axes[places[places >= 0]] = figure_of(records, name, d).swapaxes(0, 1)[places >= 0]
-        usual, off = figure_law(name, of_axes, lots) if laws is None else (laws.figures.get(name), [{}] * d)
-        if usual is not None:
-            of_figures[name] = usual
-            odd_lots += [(name, axis, *lot) for axis in range(d) for lot in _times(name, usual, axis, off[axis])]
-        p[:, k * d : (k + 1) * d] = _of_figure(usual, name, of_axes, lots, off)
-        values[:, k * d : (k + 1) * d] = of_axes[:, 0]
-    return Tests(names, tests, p, values, TailLaws(curves=of_curves, figures=of_figures), lots, odd_lots)
-
-
-def _places(records: Sequence[UnitRecord], names: Sequence[str]) -> npt.NDArray[np.intp]:
-    """Return the place of each record among units, -1 of one that is not done or not among them."""
-    at = {name: k for k, name in enumerate(names)}
-    return np.array([at.get(one.unit, -1) if one.state == "done" else -1 for one in records], dtype=np.intp)
+    return Tests(tests, curves, known, lots, laws, off)
 
 
 def _curves(statistics: CurveStatistics, units: Sequence[UnitOfLot]) -> tuple[list[str], list[str], Array]:
@@ -251,7 +261,7 @@ def _times(name: str, law: FigureLaw, axis: int, off: dict[str, float]) -> list[
     ]
 
 
-def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLaw | None, list[dict[str, float]]]:
+def figure_law(name: str, columns: Array, lots: Texts) -> tuple[FigureLaw | None, list[dict[str, float]]]:
     """Return the law of a figure, and of each axis the lots that are off as a whole.
 
     Parameters
@@ -259,8 +269,7 @@ def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLa
     name : str
     columns : (n, 2, d) array
         Value and sigma.
-    lots : sequence of str
-        Of the n units.
+    lots : (n,) array of str
 
     Returns
     -------
@@ -292,9 +301,7 @@ def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLa
     return FigureLaw(usual=usual_of, sure=sure_of, centre=centre_of, width=width_of, law=law), off
 
 
-def _of_figure(
-    law: FigureLaw | None, name: str, columns: Array, lots: Sequence[str], off: Sequence[dict[str, float]]
-) -> Array:
+def _of_figure(law: FigureLaw | None, name: str, columns: Array, lots: Texts, off: Sequence[dict[str, float]]) -> Array:
     """Return p-values (n, d) of a figure with value and sigma (n, 2, d), of lots that are `off` as a whole."""
     if law is None:
         return _of_noise(columns, MARGIN) if name in OF_NOISE else np.full(columns[:, 0].shape, np.nan)
@@ -358,11 +365,11 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
     return float(np.median(positive)) if len(positive) else 1.0
 
 
-def _off(u: Array, lots: Sequence[str]) -> dict[str, float]:
+def _off(u: Array, lots: Texts) -> dict[str, float]:
     """Return the shift, in widths, of each lot that is off as a whole."""
     shifts = {}
     for lot in sorted(set(lots)):
-        own = u[np.array([other == lot for other in lots]) & np.isfinite(u)]
+        own = u[(lots == lot) & np.isfinite(u)]
         if MIN_UNITS_OF_LOT <= len(own) <= len(u) / 2:
             middle = float(np.median(own))
             if abs(middle) > max(1.0, LOT_OFF * 1.2533 / np.sqrt(len(own))):

@@ -19,7 +19,7 @@ number of trials. A hypothesis holds if with it the curve is an ordinary one of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -43,12 +43,14 @@ from driftlab.family.outlier_tests import (
 )
 from driftlab.family.partitions import FamilyUnits, in_partitions
 from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
+from driftlab.family.reml import Index
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
+from driftlab.family.unit_information import UnitInformation
 from driftlab.units import BiasUnit, axis_name, default_unit, number
 from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
-AT_ONCE = 10_000  # units of which copies are made
+AT_ONCE = 1000  # units whose p-values are in memory
 FOLLOWS = {
     "soaks": (*CURVES, *(name for name in FIGURES if name not in ("soaks", *TERM_FIGURES))),
     "hysteresis": ("walk", "residual", "coast"),
@@ -130,23 +132,20 @@ def find_outliers(
     """
     units, statistics = in_partitions(units), CurveStatistics(family, fitted=fitted)
     tests = tests_of(family, statistics, units, records, None if fitted else family.laws)
-    if not tests.names:
+    if not len(tests.curves):
         return Outliers({})
-    reported = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
+    places, p, reported = chosen(tests.p, len(tests.curves), 0 if fitted or family.laws is None else family.units)
     unit = shown or default_unit(family.bias_unit)
     words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
-    places = np.flatnonzero(np.any(reported, axis=1))
-    odd = {
-        soaked.unit: words.of(k, reported[k], *family.information_of(soaked), lot)
-        for k, (soaked, lot) in zip(places.tolist(), units.chosen(places).read(), strict=True)
-    }
+    read = zip(places.tolist(), p, reported, units.chosen(places).read(), strict=True)
+    odd = {soaked.unit: words.of(k, own, passed, soaked, lot) for k, own, passed, (soaked, lot) in read}
     lots = _odd_lots(family, tests, unit) if fitted else ()
     return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted), lots)
 
 
 def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     """Return the units or figures that were not judged, and why."""
-    n = len(tests.names)
+    n = len(tests.curves)
     if not tests.laws.curves:
         few = f"{n:,} unit{'s are' if n != 1 else ' is'} too few to judge one by the others, {MIN_UNITS} will do"
         new = f"; the family's file, of {family.units:,}, does not say what is usual of its units" if known else ""
@@ -163,18 +162,20 @@ def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
     return f"unit {unit}: {'; '.join(one.sentence for one in odd)}{rest}"
 
 
-def chosen(p: Array, ordinary: int = 0) -> npt.NDArray[np.bool_]:
-    """Return the tests (n, m) that are reported, of p-values (n, m), NaN where there is no test.
+def chosen(p: Callable[[Index], Array], count: int, ordinary: int = 0) -> tuple[Index, Array, npt.NDArray[np.bool_]]:
+    """Return the units (k,) that stand out, the p-values (k, m) of their tests, and which of these are reported.
 
-    `ordinary` further units are known to be as they should.
+    `p` returns those of some of `count` units, NaN where there is no test; `ordinary` further units are known to be as
+    they should.
     """
-    of_unit = simes(p)
+    of_unit = np.concatenate([simes(p(part)) for part in np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))])
     share = _level(of_unit[np.isfinite(of_unit)], FALSE, int(np.sum(np.isfinite(of_unit))) + ordinary)
-    reported = np.zeros(p.shape, dtype=bool)
-    for k in np.flatnonzero(of_unit <= share):
-        known = p[k][np.isfinite(p[k])]
-        reported[k] = p[k] <= _level(known, share, len(known))
-    return reported
+    places = np.flatnonzero(of_unit <= share)
+    tested = p(places)
+    known = [row[np.isfinite(row)] for row in tested]
+    reported = tested <= np.array([_level(row, share, len(row)) for row in known]).reshape(-1, 1)
+    passed = np.any(reported, axis=1)
+    return places[passed], tested[passed], reported[passed]
 
 
 def _level(p: Array, false: float, n: int) -> float:
@@ -185,14 +186,10 @@ def _level(p: Array, false: float, n: int) -> float:
 
 def simes(p: Array) -> Array:
     """Return the p-value (n,) of all tests of a unit together, of p (n, m)."""
-    of_unit = np.empty(len(p))
-    for first in range(0, len(p), AT_ONCE):
-        some = p[first : first + AT_ONCE]
-        ordered, m = np.sort(some, axis=1), np.sum(np.isfinite(some), axis=1)
-        scaled = ordered * np.where(m > 0, m, np.nan)[:, None] / np.arange(1, p.shape[1] + 1)
-        with np.errstate(invalid="ignore"):
-            of_unit[first : first + AT_ONCE] = np.fmin.reduce(scaled, axis=1)
-    return of_unit
+    ordered, m = np.sort(p, axis=1), np.sum(np.isfinite(p), axis=1)
+    scaled = ordered * np.where(m > 0, m, np.nan)[:, None] / np.arange(1, p.shape[1] + 1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.fmin.reduce(scaled, axis=1))
 
 
 class _Words:
@@ -201,15 +198,17 @@ class _Words:
     def __init__(self, family: Family, tests: Tests, reasons: CurveReasons, unit: BiasUnit) -> None:
         self.family, self.tests, self.reasons, self.unit = family, tests, reasons, unit
 
-    def of(self, k: int, reported: npt.NDArray[np.bool_], J: Array, h: Array, lot: str) -> tuple[Outlier, ...]:
-        """Return the outliers of unit k, of which the tests `reported` (m,) passed."""
-        tests = self.tests
-        p = {one: float(tests.p[k, j]) for j, one in enumerate(tests.what) if reported[j]}
+    def of(
+        self, k: int, of_tests: Array, reported: npt.NDArray[np.bool_], soaked: UnitInformation, lot: str
+    ) -> tuple[Outlier, ...]:
+        """Return the outliers of unit k with p-values `of_tests` (m,), of which those `reported` passed."""
+        tests, (J, h) = self.tests, self.family.information_of(soaked)
+        p = {what: float(one) for what, one, passed in zip(tests.what, of_tests, reported, strict=True) if passed}
         named = {what for what, _ in p}
         silent = {after for what in named for after in FOLLOWS.get(what, ())}
         tested = dict.fromkeys(
             "shape" if what in CURVES else what
-            for (what, _), one in zip(tests.what, tests.p[k], strict=True) if np.isfinite(one)
+            for (what, _), one in zip(tests.what, of_tests, strict=True) if np.isfinite(one)
         )  # fmt: skip
         odd_curve = named & set(CURVES)
         fine = tuple(w for w in tested if w not in named | silent and not (w == "shape" and odd_curve))
@@ -218,19 +217,19 @@ class _Words:
             for axis in sorted({axis for what, axis in p if what in CURVES and what not in silent})
         }
         outliers = [
-            self._of_curve(tests.names[k], reason, min(of_curve.get(axis, 1.0) for axis in reason.axes), fine)
+            self._of_curve(soaked.unit, reason, min(of_curve.get(axis, 1.0) for axis in reason.axes), fine)
             for reason in self.reasons.of(J, h, lot, tuple(of_curve))
             if not self._of_loop(k, p, reason)
         ]
         for (what, axis), value in p.items():
             if what in FIGURES and what not in silent:
-                outliers.append(self._of_figure(k, what, axis, value, fine))
+                outliers.append(self._of_figure(soaked.unit, tests.figure(k, what, axis), what, axis, value, fine))
         return tuple(sorted(outliers, key=lambda odd: odd.p))
 
     def _of_loop(self, k: int, p: Mapping[tuple[str, int], float], reason: Reason) -> bool:
         """Return True if a curve is off by no more than its hysteresis, which ends where the temperature turns."""
         loops = [own for what, own in p if what == "hysteresis" and own in reason.axes]
-        value = [float(self.tests.values[k, self.tests.what.index(("hysteresis", own))]) for own in loops]
+        value = [self.tests.figure(k, "hysteresis", own) for own in loops]
         return bool(value) and abs(reason.off) < max(value)
 
     def _of_curve(self, name: str, reason: Reason, p: float, fine: tuple[str, ...]) -> Outlier:
@@ -249,18 +248,17 @@ class _Words:
         what = reason.what if reason.what in ("sign", "swap", "scale", "level") else "shape"
         return Outlier(name, what, axis, p, reason.off, reason.T, sentence, fine)
 
-    def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
-        tests, shown = self.tests, _shown(what, self.unit)
-        value = float(tests.values[k, tests.what.index((what, axis))])
+    def _of_figure(self, name: str, value: float, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
+        shown = _shown(what, self.unit)
         size, called = f"{_number(value, shown)} {shown.shown}{PER.get(what, '')}", self._axis(axis)
-        law = tests.laws.figures.get(what)
+        law = self.tests.laws.figures.get(what)
         sentence = {
             "hysteresis": f"{called} differs by {size} between warming and cooling",
             "soaks": f"two soaks differ more than one unit can: by {size} on {called}",
         }.get(what, f"{figure_name(what)} of {called} is {size}")
-        usual = () if law is None else [_number(of_most, shown) for of_most in _usual(what, law, axis)]
+        usual = () if law is None else [_number(end, shown) for end in _usual(what, law, axis)]
         sentence += f", of most units {' to '.join(usual)}" if usual else ", more than noise explains"
-        return Outlier(tests.names[k], what, self.family.axes[axis], p, value, None, sentence, fine)
+        return Outlier(name, what, self.family.axes[axis], p, value, None, sentence, fine)
 
     def _axis(self, axis: int) -> str:
         """Return the name of an axis: its letter, or its channel where it is the only one."""
@@ -313,14 +311,14 @@ def _odd_lots(family: Family, tests: Tests, unit: BiasUnit) -> tuple[LotOutlier,
                     "units are held against one another"
                 )
                 odd.append(LotOutlier(name, SHAPE, called, sentence))
-    for name, axis, lot_name, times in tests.lots:
+    for name, axis, lot_name, times in tests.odd_lots():
         differs = f"{times:.2g} times that of"
         if name in TERM_FIGURES:
             shown = _shown(name, unit)
             differs = f"{_number(times, shown)} {shown.shown} off"
         sentence = (
             f"lot {lot_name}: {figure_name(name)} of {family.axes[axis]} is {differs} the other lots; its "
-            f"{tests.of_lots.count(lot_name)} units are held against one another"
+            f"{np.sum(tests.of_lots == lot_name)} units are held against one another"
         )
         odd.append(LotOutlier(lot_name, name, family.axes[axis], sentence))
     return tuple(odd)

@@ -7,7 +7,7 @@ row of columns, with texts that it has in common with others.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -23,6 +23,7 @@ OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
 
 # key, error, repeated soaks and parabolas of the terms, where a stimulus measured them
 _Alone = tuple[str, str, tuple[RepeatedSoak, ...], TermParabolas | None]
+Rows = NDArray[np.integer[Any]]
 
 
 class UnitRecords:
@@ -33,149 +34,157 @@ class UnitRecords:
     """
 
     def __init__(self) -> None:
-        self._rows: dict[str, int] = {}
-        self._keys = bytearray()  # 32 bytes a row
-        self._codes = array("I")  # of what rows have in common with others
-        self._common, self._texts, self._known = list[tuple[Any, ...]](), dict[Any, Any](), dict[tuple[Any, ...], int]()
-        self._numbers, self._sigmas = array("d"), array("f")
-        self._starts = array("Q"), array("Q")  # of numbers and sigmas
+        self._rows, self.units = dict[str, int](), list[str]()  # of each row its unit
+        self.codes, self.common = array("I"), list[tuple[Any, ...]]()  # of what rows have in common with others
+        self._texts, self._known = dict[Any, Any](), dict[tuple[Any, ...], int]()
+        # of each row 32 bytes of its key, the table of those with the same axes and figures, and its place there
+        self._keys, self._kinds, self._places = bytearray(), array("I"), array("I")
+        self._tables: dict[tuple[tuple[str, ...], ...], tuple[int, array[float], array[float]]] = {}
         self._alone: dict[int, _Alone] = {}
 
     def __contains__(self, unit: str) -> bool:
         return unit in self._rows
 
     def __setitem__(self, unit: str, record: UnitRecord) -> None:
-        row, d = len(self._codes), len(record.axes)
+        row, axes = len(self.units), record.axes
         limits = tuple(tuple((name, row[name]) for name in OF_LIMITS if name in row) for row in record.limits)
         names = tuple(name for name in HELD if name in record.figures)
-        common = (record.state, record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit,
-                  record.axes, record.driftlab, limits, names)  # fmt: skip
-        values, sigmas = record.table(names, d)
+        texts = (record.state, record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit,
+                 record.driftlab, limits)  # fmt: skip
+        common = tuple([self._texts.setdefault(text, text) for text in texts])
+        values, sigmas = record.table(names, len(axes))
         hashed = len(record.key) == 64 and set(record.key) <= HEX
         if record.error or record.repeats or record.parabolas or not hashed:
             self._alone[row] = record.key, record.error, tuple(record.repeats), record.parabolas
         self._rows[unit] = row
+        self.units.append(unit)
         self._keys += bytes.fromhex(record.key) if hashed else bytes(32)
-        self._codes.append(self._code(tuple(self._texts.setdefault(text, text) for text in common)))
-        for starts, column in zip(self._starts, (self._numbers, self._sigmas), strict=True):
-            starts.append(len(column))
-        self._numbers.extend([*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds])
-        self._numbers.extend(values.ravel().tolist())
-        self._sigmas.extend(sigmas.ravel().tolist())
+        code = self._known.setdefault(common, len(self.common))
+        if code == len(self.common):
+            self.common.append(common)
+        table = (len(self._tables), array("d"), array("f"))
+        kind, numbers, deviations = self._tables.setdefault((axes, names), table)
+        self.codes.append(code)
+        self._kinds.append(kind)
+        self._places.append(len(numbers) // (NUMBERS + values.size))
+        numbers.extend([*(record.domain or (np.nan, np.nan)), record.hours, record.samples, record.seconds])
+        numbers.extend(values.ravel().tolist())
+        deviations.extend(sigmas.ravel().tolist())
 
     def __getitem__(self, unit: str) -> UnitRecord:
-        row = self._rows[unit]
-        state, lot, date, more, channel, bias_unit, axes, driftlab, limits, names = self._common[self._codes[row]]
-        key, error, repeats, parabolas = self._alone.get(row) or (
-            self._keys[32 * row : 32 * row + 32].hex(),
-            "",
-            (),
-            None,
-        )
-        start, own, d = self._starts[0][row], self._starts[1][row], len(axes)
-        low, high, hours, samples, seconds = self._numbers[start : start + NUMBERS]
+        return self.at(self._rows[unit])
+
+    def at(self, row: int) -> UnitRecord:
+        """Return the record of a row."""
+        state, lot, date, more, channel, bias_unit, driftlab, limits = self.common[self.codes[row]]
+        unhashed = self._keys[32 * row : 32 * row + 32].hex(), "", (), None
+        key, error, repeats, parabolas = self._alone.get(row, unhashed)
+        (axes, names), (_, numbers, deviations) = [*self._tables.items()][self._kinds[row]]
+        place, d = self._places[row], len(axes)
+        start, own = place * (NUMBERS + d * len(names)), place * d * len(names)
+        low, high, hours, samples, seconds = numbers[start : start + NUMBERS]
         figures = {}
         for k, name in enumerate(names):
-            columns = ((self._numbers, start + NUMBERS + k * d), (self._sigmas, own + k * d))
+            columns = ((numbers, start + NUMBERS + k * d), (deviations, own + k * d))
             value, sigma = (tuple(None if v != v else v for v in part[at : at + d]) for part, at in columns)
             figures[name] = Figure.model_construct(value=value, sigma=sigma)
         return UnitRecord.model_construct(
-            key=key, unit=unit, lot=lot, date=date, more=dict(more), state=state, error=error, channel=channel,
-            bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
-            samples=int(samples), figures=figures, limits=[dict(row) for row in limits], seconds=seconds,
+            key=key, unit=self.units[row], lot=lot, date=date, more=dict(more), state=state, error=error,
+            channel=channel, bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
+            samples=int(samples), figures=figures, limits=[dict(limit) for limit in limits], seconds=seconds,
             driftlab=driftlab, repeats=list(repeats), parabolas=parabolas,
         )  # fmt: skip
 
-    def of(self, units: Sequence[str]) -> RecordsOfUnits:
+    def of(self, units: Iterable[str]) -> RecordsOfUnits:
         """Return the records of some units, in that order."""
-        return RecordsOfUnits(self, units)
+        return RecordsOfUnits(self, np.fromiter((self._rows[unit] for unit in units), dtype=np.uint32))
 
-    def column(self, units: Sequence[str], name: str, d: int) -> Array:
-        """Return values and deviations (2, n, d) of a figure of some units, NaN where they are not known."""
-        rows = self._places(units)
-        table, codes = np.full((2, len(units), d), np.nan), np.asarray(self._codes)[rows]
-        for code in np.unique(codes):
-            *_, axes, _, _, names = self._common[code]
+    def column(self, rows: Rows, name: str, d: int) -> Array:
+        """Return values and deviations (2, n, d) of a figure of some rows, NaN where they are not known."""
+        table, kinds = np.full((2, len(rows), d), np.nan), np.asarray(self._kinds)[rows]
+        for (axes, names), (kind, *held) in self._tables.items():
             if name not in names or len(axes) != d:
                 continue
-            of_code, at = np.flatnonzero(codes == code), d * names.index(name) + np.arange(d)
-            for held, starts, before, out in zip(
-                (self._numbers, self._sigmas), self._starts, (NUMBERS, 0), table, strict=True
-            ):
-                first = np.asarray(starts)[rows[of_code]].astype(np.intp) + before
-                out[of_code] = np.asarray(held)[first[:, None] + at]
+            own = np.flatnonzero(kinds == kind)
+            places, first = np.asarray(self._places)[rows[own]], d * names.index(name)
+            for column, before, out in zip(held, (NUMBERS, 0), table, strict=True):
+                of_kind = np.asarray(column).reshape(-1, before + d * len(names))
+                out[own] = of_kind[places, before + first : before + first + d]
         return table
 
-    def keys(self, units: Sequence[str]) -> NDArray[np.uint64]:
-        """Return the keys (n, 4) of the work on some units: hashes of recordings and config, 0 where none is known."""
-        return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[self._places(units)]
+    def keys(self, rows: Rows) -> NDArray[np.uint64]:
+        """Return the keys (n, 4) of the work on some rows: hashes of recordings and config, 0 where none is known."""
+        return np.frombuffer(self._keys, dtype=np.uint64).reshape(-1, 4)[rows]
 
-    def _places(self, units: Sequence[str]) -> NDArray[np.intp]:
-        """Return the rows (n,) of some units."""
-        return np.fromiter((self._rows[unit] for unit in units), dtype=np.intp, count=len(units))
-
-    def names(self, units: Sequence[str]) -> set[str]:
-        """Return the names of the figures that any of some units has."""
-        codes = {self._codes[self._rows[unit]] for unit in units}
-        return {name for code in codes for name in self._common[code][-1]}
-
-    def state(self, unit: str) -> str:
-        """Return the state of a unit: `done` or `failed`."""
-        return str(self._common[self._codes[self._rows[unit]]][0])
-
-    def _code(self, common: tuple[Any, ...]) -> int:
-        """Return the number of what a row has in common with others."""
-        if common not in self._known:
-            self._known[common] = len(self._common)
-            self._common.append(common)
-        return self._known[common]
+    def names(self, rows: Rows) -> set[str]:
+        """Return the names of the figures that any of some rows has."""
+        return {name for kind in np.unique(np.asarray(self._kinds)[rows]) for name in [*self._tables][kind][1]}
 
 
 class RecordsOfUnits(Sequence[UnitRecord]):
     """Records of some units in order."""
 
-    def __init__(self, records: UnitRecords, units: Sequence[str]) -> None:
-        self.records, self.units = records, units
+    def __init__(self, records: UnitRecords, rows: Rows) -> None:
+        self.records, self.rows = records, rows
+
+    @property
+    def units(self) -> list[str]:
+        """The names of the units."""
+        return [self.records.units[row] for row in self.rows]
 
     def __len__(self) -> int:
-        return len(self.units)
+        return len(self.rows)
 
     @overload
     def __getitem__(self, k: int) -> UnitRecord: ...
     @overload
-    def __getitem__(self, k: slice) -> RecordsOfUnits: ...
-    def __getitem__(self, k: int | slice) -> UnitRecord | RecordsOfUnits:
-        if isinstance(k, slice):
-            return RecordsOfUnits(self.records, self.units[k])
-        return self.records[self.units[k]]
+    def __getitem__(self, k: slice | Rows) -> RecordsOfUnits: ...
+    def __getitem__(self, k: int | slice | Rows) -> UnitRecord | RecordsOfUnits:
+        if isinstance(k, int):
+            return self.records.at(int(self.rows[k]))
+        return RecordsOfUnits(self.records, self.rows[k])
 
     def __iter__(self) -> Iterator[UnitRecord]:
-        return map(self.records.__getitem__, self.units)
+        return map(self.records.at, map(int, self.rows))
 
     def same_recordings(self) -> list[list[str]]:
         """Return the names of units whose recordings are the same, byte by byte, in groups."""
-        keys = self.records.keys(self.units)
+        keys = self.records.keys(self.rows)
         _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
         twice = np.flatnonzero((count[group] > 1) & keys.any(axis=1))
         found: dict[int, list[str]] = {}
-        for k in twice.tolist():
-            found.setdefault(int(group[k]), []).append(self.units[k])
+        for k, unit in zip(twice.tolist(), self[twice].units, strict=True):
+            found.setdefault(int(group[k]), []).append(unit)
         return list(found.values())
 
     def in_state(self, state: str) -> RecordsOfUnits:
         """Return those that are in a state."""
-        return RecordsOfUnits(self.records, [unit for unit in self.units if self.records.state(unit) == state])
+        of_codes = np.array([common[0] == state for common in self.records.common], dtype=bool)
+        return self[np.flatnonzero(of_codes[np.asarray(self.records.codes)[self.rows]])]
+
+
+def at_places(records: Sequence[UnitRecord], places: NDArray[np.intp]) -> Sequence[UnitRecord]:
+    """Return the records at some places, in that order."""
+    return records[places] if isinstance(records, RecordsOfUnits) else [records[k] for k in places]
+
+
+def of_units(records: Sequence[UnitRecord], units: Iterable[str]) -> Sequence[UnitRecord]:
+    """Return the records of some units, in that order; of one that is not done, or has none, one without figures."""
+    if isinstance(records, RecordsOfUnits):
+        return records.records.of(units)
+    done = {record.unit: record for record in records if record.state == "done"}
+    return [done.get(unit) or UnitRecord(key="", unit=unit, state="failed") for unit in units]
 
 
 def figure_of(records: Sequence[UnitRecord], name: str, d: int) -> Array:
     """Return values and deviations (2, n, d) of a figure of records, NaN where they are not known."""
     if isinstance(records, RecordsOfUnits):
-        return records.records.column(records.units, name, d)
+        return records.records.column(records.rows, name, d)
     return np.array([record.table((name,), d)[:, 0] for record in records]).reshape(len(records), 2, d).swapaxes(0, 1)
 
 
 def figures_in(records: Sequence[UnitRecord]) -> set[str]:
     """Return the names of the figures that any of some records has."""
     if isinstance(records, RecordsOfUnits):
-        return records.records.names(records.units)
+        return records.records.names(records.rows)
     return {name for record in records for name in record.figures}

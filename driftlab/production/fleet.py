@@ -270,10 +270,9 @@ class _Command:
         # of matrices of forty rows more threads make less
         engine, seen = jobs.engine() if len(status.done) > ALONE else (serial, folder.place)
         with threadpool_limits(1), seen.scratch() as scratch:
-            units, whole = (
-                stored_units(folder.units, of.units, [record.lot for record in of], engine, scratch)
-                for of in (status.done, status.records)
-            )
+            stored = partial(stored_units, folder.units, engine=engine, scratch=scratch)
+            whole = stored(status.records.units, [record.lot for record in status.records])
+            units = stored(status.done.units, [record.lot for record in status.done]) if status.failed else whole
             learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
@@ -355,9 +354,8 @@ class _Command:
     def _mark(self, **more: Any) -> dict[str, Any]:
         """Write `fleet.json`, and return its content."""
         jobs, folder, status = self.jobs, self.jobs.folder, self.status
-        names = set(jobs.manifest.names)
-        left = [unit for unit in folder.units.names() if unit not in names]
-        counts = {"units": len(names), "done": len(status.done), "failed": len(status.failed)}
+        left = [unit for unit in folder.units.names() if unit not in folder.records]
+        counts = {"units": len(status.records), "done": len(status.done), "failed": len(status.failed)}
         summary = FleetSummary(
             plugins=participants(self.config),
             units_from=jobs.manifest.name,

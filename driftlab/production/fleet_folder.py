@@ -297,10 +297,7 @@ class StoredUnits(Sequence[UnitOfLot]):
 
 
 def stored_units(
-    folders: UnitFolders,
-    units: Sequence[str],
-    lots: Sequence[str],
-    engine: Engine = serial,
+    folders: UnitFolders, units: Sequence[str], lots: Sequence[str], engine: Engine = serial,
     scratch: Scratch | None = None,
 ) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
     """Return units in folders by names and lots; workers keep files in `scratch`."""

@@ -12,6 +12,7 @@ import io
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,7 +24,7 @@ from driftlab.config import Config
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import Family
-from driftlab.family.partitions import Partitions, Scratch, UnitOfLot
+from driftlab.family.partitions import Partitions, Scratch, ScratchFolder, UnitOfLot, serial
 from driftlab.family.posterior_map import UnitPosterior, informed_where_unknown, posterior_of
 from driftlab.family.record import TERM_FIGURES, UnitRecord
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, without_effects
@@ -73,10 +74,9 @@ def write_fleet(
     more = list(dict.fromkeys(name for record in status.records for name in record.more))
     drawn = _drawn(status, analysis)
     table = _Table(folder.units, scratch, analysis.family, analysis.common.effects, tuple(more))
-    stage = Stage("tables and maps", total=len(status.records))
-    progress(stage)
-    names = status.records.units
-    shown = np.isin(np.array(names), np.array(drawn))
+    progress(stage := Stage("tables and maps", total=len(status.records)))
+    names, chosen = status.records.units, set(drawn)
+    shown = np.array([name in chosen for name in names])
     of_units = (
         [of.get(name) for name in names] for of in (analysis.reasons, analysis.common.noise, analysis.common.of_units)
     )
@@ -88,7 +88,10 @@ def write_fleet(
         stage.done += count
         progress(stage)
     with scratch.files(parts) as paths:
-        join_tables(folder.hidden(TABLE), paths, more, {"driftlab": __version__, "SI": status.bias_unit})
+        about = {"driftlab": __version__, "SI": status.bias_unit}
+        join = partial(join_tables, folder.hidden(TABLE), more=more, metadata=about)
+        engine = units.engine if isinstance(scratch, ScratchFolder) else serial  # a worker sees what is in the folder
+        list(engine(join, [paths]))
     progress(Stage("report"))
     title = f"Fleet {(folder.out.name or folder.path.name).removeprefix('fleet').strip(' _-')}".strip()
     links = {name: f"{folder.units.root}/{name}/page/report.html" for name in pages}

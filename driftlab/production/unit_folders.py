@@ -146,7 +146,7 @@ class UnitPlace(UnitFolders):
 
     def names(self, name: str = RECORD) -> list[str]:
         """Return the names of the units that have a file, in order."""
-        return sorted(path.name for path in (self.path / UNITS).iterdir() if (path / name).is_file())
+        return sorted(unit for unit in os.listdir(self.address) if os.path.isfile(f"{self.address}/{unit}/{name}"))
 
     def read(self, unit: str, name: str) -> bytes:
         """Return the content of a file of a unit; raises OSError."""
@@ -215,7 +215,7 @@ class UnitPlace(UnitFolders):
     def finish(self) -> None:
         """Finish what a command that was killed had begun to replace."""
         (self.path / UNITS).mkdir(exist_ok=True)
-        for path in sorted(path for path in (self.path / UNITS).iterdir() if path.name[0] == "."):
+        for path in sorted(self.path / UNITS / name for name in os.listdir(self.address) if name[0] == "."):
             if path.name.endswith(OLD):
                 place = path.with_name(path.name[1:].removesuffix(OLD))
                 if os.path.lexists(place):

@@ -19,6 +19,7 @@ import numpy as np
 from driftlab.evaluation.limits import verdict_of_units, worst
 from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
+from driftlab.family.unit_records import at_places
 from driftlab.reports.fleet_charts import FleetOverview, map_charts
 from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
 from driftlab.reports.pages import embedded, write_page
@@ -149,7 +150,7 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
     others, step = np.flatnonzero(~special), 1
     while len(others[::step]) > ROWS:
         step *= 2
-    records = [overview.records[k] for k in sorted([*np.flatnonzero(special).tolist(), *others[::step].tolist()])]
+    records = at_places(overview.records, np.sort([*np.flatnonzero(special), *others[::step]]).astype(np.intp))
     places = {lot: k for k, lot in enumerate(sorted({record.lot for record in records}))}
     axes = next((record.axes for record in overview.records if record.axes), ())
     unit, figures = overview.unit, []
@@ -161,7 +162,6 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
             figures.append({"name": figure_name(name), "unit": unit.shown + PER.get(name, ""), "columns": columns})
     domains = [record.domain or (None, None) for record in records]
     why = [record.error if record.state == "failed" else reasons.get(record.unit, "") for record in records]
-    links = [overview.links.get(record.unit, "") for record in records]
     more = dict.fromkeys(name for record in records for name in record.more)
     return {
         "axes": list(axes), "lots": list(places), "verdicts": list(VERDICTS), "figures": figures,
@@ -175,7 +175,7 @@ def _table(overview: FleetOverview, reasons: Mapping[str, str]) -> dict[str, Any
         "low": [rounded(low, 4) for low, _ in domains],
         "high": [rounded(high, 4) for _, high in domains],
         "why": {k: text for k, text in enumerate(why) if text},
-        "links": {k: link for k, link in enumerate(links) if link},
+        "links": {k: link for k, record in enumerate(records) if (link := overview.links.get(record.unit))},
         "more": {name: [record.more.get(name, "") for record in records] for name in more},
     }  # fmt: skip
 

@@ -84,15 +84,14 @@ class ControlChart:
         One of FIGURES, or `level`; the unit is SI.
     at : (m,) int array
         Places of the units in the line.
-    value : (m,) array
+    figures : callable
+        Returns the values (m,), SI, and the deviations (m,) of their measurements in the scale, by the records.
     scale : Scale
         In which the limits lie alike above and below.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
         Middle of a line in control, SI.
-    own : (m,) array
-        Deviations of the units' measurements in the scale, single precision.
     changes : tuple of Change
     lots : tuple of Lot
         In the order of their first units.
@@ -112,11 +111,10 @@ class ControlChart:
     axis: str
     unit: str
     at: NDArray[np.intp]
-    value: Array
+    figures: Callable[[], tuple[Array, Array]]
     scale: ChartScale
     basis: tuple[int, int]
     centre: float
-    own: NDArray[np.float32]
     changes: tuple[StepChange, ...]
     lots: tuple[LotPoint, ...]
     law: InControl
@@ -128,6 +126,11 @@ class ControlChart:
     # what follows of the above is computed where it is asked for: of a million units it would be gigabytes
 
     @property
+    def value(self) -> Array:
+        """Values (m,), SI."""
+        return self.figures()[0]
+
+    @property
     def of_family(self) -> bool:
         """True if centre and limits are those of a family that was known."""
         return self.frozen is not None
@@ -135,7 +138,8 @@ class ControlChart:
     @property
     def sigma(self) -> Array:
         """Deviations (m,) in control, in the scale."""
-        return np.maximum(self.law.sigma(self.own.astype(np.float64)), 1e-100)  # of values that do not vary
+        # no less than that of values that do not vary
+        return np.maximum(self.law.sigma(self.figures()[1].astype(np.float32).astype(np.float64)), 1e-100)
 
     @property
     def z(self) -> Array:

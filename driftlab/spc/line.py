@@ -15,6 +15,7 @@ from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +26,7 @@ from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord
 from driftlab.family.tail_law import TailLaw
-from driftlab.family.unit_records import RecordsOfUnits, figure_of
+from driftlab.family.unit_records import RecordsOfUnits, at_places, figure_of
 from driftlab.spc.capability import Capability, indices, share_beyond, why_no_index
 from driftlab.spc.change_points import Course, LevelStep, course_of
 from driftlab.spc.charts import (
@@ -78,16 +79,15 @@ def line_of(
     line, place = _ordered(done, unit)
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     part = _partial(line, baseline)
-    quantities = _Quantities(done, place, line.axes, levels, part, known)
+    levels = None if levels is None else levels[place]
+    quantities = _Quantities(at_places(done, place), line.axes, levels, part, known)
     line = replace(line, baseline=baseline, partial=int(np.sum(part)))
     enough = quantities.enough()
     alpha = FALSE / max(sum(enough.values()), 1)
     of_rules, everywhere = RULES.get(rules or "", {}), np.arange(len(line.units))
-    names = dict.fromkeys(name for (name, _), there in enough.items() if there)
     controls = tuple(
-        _control(line, name, k, figures[:, :, k], alpha, known.get((name, axis)), of_rules, everywhere)
-        for name, figures in ((name, quantities.read(name)) for name in names)
-        for k, axis in enumerate(line.axes) if enough[name, axis]
+        _control(line, name, line.axes.index(axis), quantities, alpha, known.get((name, axis)), of_rules, everywhere)
+        for (name, axis), there in enough.items() if there
     )  # fmt: skip
     too_few = tuple(f"{axis} {name}" for (name, axis), there in enough.items() if not there)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
@@ -108,7 +108,6 @@ class _Quantities:
     """The quantities of units in the order of a line, read one at a time, as a line may be long."""
 
     records: Sequence[UnitRecord]
-    place: NDArray[np.intp]  # of each unit, among the records
     axes: tuple[str, ...]
     levels: Array | None
     partial: NDArray[np.bool_]
@@ -117,8 +116,8 @@ class _Quantities:
     def read(self, name: str) -> Array:
         """Return values and deviations (2, n, d) of a quantity, NaN where they are not known."""
         if name == LEVEL and self.levels is not None:
-            return np.stack([self.levels[self.place], np.full(self.levels.shape, np.nan)])
-        values = figure_of(self.records, name, len(self.axes))[:, self.place]
+            return np.stack([self.levels, np.full(self.levels.shape, np.nan)])
+        values = figure_of(self.records, name, len(self.axes))
         if name in OF_THE_RANGE:
             values[:, self.partial] = np.nan
         for k, axis in enumerate(self.axes):
@@ -138,18 +137,18 @@ class _Quantities:
 
 
 def _control(
-    line: LineReport, name: str, k: int, figures: Array, alpha: float, known: FrozenLimits | None,
+    line: LineReport, name: str, k: int, quantities: _Quantities, alpha: float, known: FrozenLimits | None,
     rules: Mapping[str, Callable[[Array], NDArray[np.bool_]]], everywhere: NDArray[np.intp],
 ) -> ControlChart:  # fmt: skip
-    """Return the chart of values and deviations (2, n) of a quantity of axis k."""
-    values, sigmas = figures
-    at = np.flatnonzero(np.isfinite(values))
+    """Return the chart of a quantity of axis k."""
+    at = np.flatnonzero(np.isfinite(quantities.read(name)[0, :, k]))
     at = everywhere if len(at) == len(everywhere) else at  # charts of all units have the same places
-    value, lots = values[at], np.array(line.lots, dtype=np.str_)[at]
+    value, lots = quantities.read(name)[0, at, k], np.array(line.lots, dtype=np.str_)[at]
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
     usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
-    x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at], usual)
+    figures = partial(_figures, quantities, name, k, at, scale, usual)
+    x, own = scale.to(value), figures()[1]
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
     course = course_of(x, whole, alpha, _runs(lots.tolist()))
     level_steps, trend = course.steps, _trend(course, scale)
@@ -157,11 +156,10 @@ def _control(
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop]) if frozen is None else frozen
-    single = own.astype(np.float32)
-    sigma = np.maximum(law.sigma(single.astype(np.float64)), 1e-100)  # of values that do not vary
+    sigma = np.maximum(law.sigma(own.astype(np.float32).astype(np.float64)), 1e-100)  # of values that do not vary
     return ControlChart(
-        quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
-        basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))), own=single,
+        quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, scale=scale, figures=figures,
+        basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))),
         changes=_changes(level_steps, stretches, x, sigma, scale, at),
         lots=_lots(lots, x, sigma, law, scale, known=known is not None),
         trend=trend, law=law, rules=rules, phi=course.phi, frozen=known,
@@ -250,15 +248,19 @@ def _about_stretches(line: LineReport, chart: ControlChart) -> Array:
     return z
 
 
-def _of_the_usual(scale: ChartScale, value: Array, sigma: Array, usual: float) -> Array:
-    """Return the deviations (n,) that values (n,) would have in the scale, were each as `usual` (SI).
+def _figures(
+    quantities: _Quantities, name: str, k: int, at: NDArray[np.intp], scale: ChartScale, usual: float
+) -> tuple[Array, Array]:
+    """Return the values (m,), SI, of a quantity of axis k, and the deviations in the scale that they would have.
 
-    What comes out large by chance has a large deviation of its own, and what comes out small a small one.
+    Were each as `usual` (SI): what comes out large by chance has a large deviation of its own, what comes out small a
+    small one.
     """
+    value, sigma = quantities.read(name)[:, at, k]
     if not usual > 0:
-        return scale.sigma(value, sigma)
+        return value, scale.sigma(value, sigma)
     own = scale.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
-    return np.maximum(own, np.median(own))
+    return value, np.maximum(own, np.median(own))
 
 
 def _trend(course: Course, scale: ChartScale) -> Trend | None:

@@ -106,7 +106,10 @@ def test_simes_and_the_choice_of_units_are_those_of_statsmodels() -> None:
     p[:20, 2] *= 1e-5
     of_unit = np.array([np.min(multipletests(row, method="fdr_bh")[1]) for row in p])
     assert_allclose(simes(p), of_unit)
-    assert np.array_equal(np.any(chosen(p), axis=1), multipletests(of_unit, alpha=0.05, method="fdr_bh")[0])
+    places, own, reported = chosen(p.__getitem__, len(p))
+    assert np.array_equal(places, np.flatnonzero(multipletests(of_unit, alpha=0.05, method="fdr_bh")[0]))
+    assert np.array_equal(own, p[places])
+    assert np.all(np.any(reported, axis=1))
     p[:, 5] = np.nan
     assert_allclose(simes(p), [np.min(multipletests(row[:5], method="fdr_bh")[1]) for row in p])
 

@@ -69,7 +69,7 @@ def _found(units: Partitions[list[partitions.UnitOfLot]]) -> tuple[Family, np.nd
     family = fit_family(units)
     family = family.model_copy(update={"bands": measure_bands(family, units)})
     statistics = outlier_tests.CurveStatistics(family, fitted=True)
-    return family, outlier_tests.tests_of(family, statistics, units, [], None).values
+    return family, outlier_tests.tests_of(family, statistics, units, [], None).curves
 
 
 @pytest.mark.parametrize("sample", [1500, 40])  # all units, and some of them
