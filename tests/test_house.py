@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3720
+    assert 0 < count <= 3718
 
 
 def imports():
@@ -257,38 +257,38 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 633,
-    "driftlab/commands": 3755,
+    "driftlab/commands": 3754,
     "driftlab/evaluation": 1466,
-    "driftlab/family": 3279,
-    "driftlab/filtering": 1245,
-    "driftlab/identification": 2174,
+    "driftlab/family": 3259,
+    "driftlab/filtering": 1248,
+    "driftlab/identification": 2205,
     "driftlab/live": 848,
-    "driftlab/maps": 1789,
-    "driftlab/noise": 1211,
+    "driftlab/maps": 1806,
+    "driftlab/noise": 1215,
     "driftlab/planning": 1259,
-    "driftlab/production": 3160,
+    "driftlab/production": 3149,
     "driftlab/products": 6,
-    "driftlab/recordings": 456,
-    "driftlab/reports": 3506,
-    "driftlab/soak": 658,
-    "driftlab/spc": 1517,
-    "driftlab/starter": 850,
+    "driftlab/recordings": 466,
+    "driftlab/reports": 3524,
+    "driftlab/soak": 657,
+    "driftlab/spc": 1520,
+    "driftlab/starter": 871,
     "driftlab/storage": 1278,
-    "driftlab/triad": 592,
-    "fusion_core": 1855,
+    "driftlab/triad": 589,
+    "fusion_core": 1859,
     "fusion_core/contracts": 1955,
-    "fusion_core/fast": 822,
+    "fusion_core/fast": 823,
     "fusion_core/host": 748,
     "fusion_core/testing": 1002,
-    "fusion_core/thermal": 1061,
+    "fusion_core/thermal": 1054,
     "fusion_core/units": 431,
     "plugins": 302,
     "plugins/bias_models": 254,
     "plugins/effects": 750,
     "plugins/exporters": 1754,
     "plugins/framings": 641,
-    "plugins/measurement_models": 774,
-    "plugins/sources": 5314,
+    "plugins/measurement_models": 775,
+    "plugins/sources": 5414,
     "plugins/stimuli": 288,
     "plugins/thermal_maps": 897,
 }
