@@ -93,11 +93,12 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     place = (chart.at + 1).astype(np.float64)
     few = np.unique(np.linspace(0, len(place) - 1, LIMITS).astype(int))
     out = np.flatnonzero(chart.beyond)
-    value = chart.value[np.isfinite(chart.value)]
+    every = chart.value
+    value = every[np.isfinite(every)]
     low, high = without_spikes(value, MANY)
-    cut = np.flatnonzero((chart.value < low) | (chart.value > high))
+    cut = np.flatnonzero((every < low) | (every > high))
     wide = not len(cut) and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
-    drawn_at, (ewma, *ewma_limits) = np.clip(chart.value, low, high), chart.ewma
+    drawn_at, (ewma, *ewma_limits) = np.clip(every, low, high), chart.ewma
     lines = [
         *_usual(chart, shown),
         Line(place[drawn], shown(drawn_at[drawn]), "unit", "data", style="points"),
@@ -108,7 +109,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     ]
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
     span = None if wide else _span(chart, (low, high), unit.factor)
-    names = ", ".join(f"{line.units[chart.at[k]]} at {chart.value[k] * unit.factor:.3g}" for k in cut[:NAMED])
+    names = ", ".join(f"{line.units[chart.at[k]]} at {every[k] * unit.factor:.3g}" for k in cut[:NAMED])
     names += f" and {len(cut) - NAMED} more" if len(cut) > NAMED else ""
     label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"
     return Panel(tuple(lines), label, shades, log=wide, span=span)
@@ -256,10 +257,10 @@ def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> 
     `out` is where the lot's mean is beyond the limits of the line.
     """
     low, high = span
-    factor, names = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at]
+    factor, names, of_units = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at], chart.value
     boxes = {}
     for lot in chart.lots:
-        values = np.percentile(chart.value[names == lot.name], SHARES)
+        values = np.percentile(of_units[names == lot.name], SHARES)
         places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
         places = dict(zip(("low", "quarter", "half", "most", "high"), places, strict=True))
         boxes[lot.name] = {"n": lot.n, "text": number(values[2] * factor, zeros=True), "out": lot.out, **places}

@@ -313,8 +313,8 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
             part = chart.at >= since
             if np.sum(part) < MIN_UNITS:
                 continue
-            x = chart.scale.to(chart.value[part])
-            n, beyond = len(x), int(np.sum(chart.value[part] > limit))
+            values = chart.value[part]
+            x, n, beyond = chart.scale.to(values), len(values), int(np.sum(values > limit))
             limit_x = float(chart.scale.to(np.array(limit)))
             normal, why_not = why_no_index(x, far_out(x), limit_x)
             found = (np.nan,) * 6 if why_not else indices(x, limit_x)

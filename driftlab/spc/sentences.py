@@ -71,9 +71,9 @@ def alarms(line: LineReport) -> dict[int, list[Alarm]]:
             text = f"{about}, limit {joint.limit[k]:.3g} (of it {most})"
             found.setdefault(int(joint.at[k]), []).append(Alarm(about, text))
     for chart in line.controls:
-        unit, limits = line.shown(chart.quantity), chart.limits
+        unit, of_units = line.shown(chart.quantity), (chart.value, *chart.limits)
         for k in np.flatnonzero(chart.beyond & chart.of_family).tolist():
-            value, low, high = (values[k] * unit.factor for values in (chart.value, *limits))
+            value, low, high = (values[k] * unit.factor for values in of_units)
             low = low if chart.quantity == "level" else max(low, 0.0)
             about = f"{_called(chart)} {number(value)} {unit.shown}"
             alarm = Alarm(about, f"{about}, limits {number(low)} to {number(high)}")

@@ -190,3 +190,15 @@ def test_a_sharp_bend_without_noise_is_no_memory(bend):
     bias = np.tanh((T - 31) / bend)[:, None] * [60.0, -30.0] + 0.02 * np.random.default_rng(4).normal(size=(len(T), 2))
     assert memory_of(brief(T, bias, [0], DT)).answer != "seen"
     assert memory_of(brief(T, np.zeros((len(T), 1)), [0], DT)).answer != "seen"
+
+
+def test_a_walk_over_what_was_not_recorded_is_no_memory():
+    """Up to the hot third and down from it; without their times the samples seem to follow one another."""
+    t = np.arange(0, 6 * 3600, DT)
+    kept, T, answers = np.abs(t / t[-1] - 0.5) > 0.13, temperature("once", 6.0), []
+    for seed in (0, 9, 10, 11):
+        rng = np.random.default_rng([seed, 20])
+        walk, white = (rng.normal(size=(len(T), 3)) for _ in range(2))
+        bias = curve(T) + np.cumsum(0.03 * np.sqrt(DT) * walk, axis=0) + 2 / np.sqrt(DT) * white
+        answers.append([memory_of(brief(T[kept], bias[kept], [0], DT, times)).answer for times in (t[kept], None)])
+    assert all(timed != "seen" == untimed for timed, untimed in answers)
