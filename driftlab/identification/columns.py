@@ -114,18 +114,14 @@ def free_starts(
 
     Columns are those of the starts from `first` on.
     """
-    A = equations.A.copy()
-    A[np.diag_indices(len(A))] += TINY * max(float(np.mean(np.diag(A))), 1e-300)
-    inverse = np.linalg.inv(A)
-    beta = inverse @ equations.b
-    yy = equations.yy
-    slow = colour * max(yy - float(equations.b @ beta), 1e-12 * yy, 1e-300) / rows
+    beta, variances = equations.solution, equations.variances
+    slow = colour * max(equations.left, 1e-12 * equations.yy, 1e-300) / rows
     sd, at = np.zeros(len(starts)), first
     for k, own in enumerate(starts):
         part = np.arange(at, at + len(own))
         at += len(own)
         if len(own):
-            sd[k] = np.sqrt(max(float(np.mean(beta[part] ** 2 - slow * inverse[part, part])), 0.0))
+            sd[k] = np.sqrt(max(float(np.mean(beta[part] ** 2 - slow * variances[part])), 0.0))
     return sd, slow
 
 

@@ -33,6 +33,7 @@ from driftlab.spc.capability import D2, Capability
 from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
+from fusion_core.recursions import drift
 
 MIN_UNITS = 10  # for a chart
 LEVEL = "level"
@@ -363,9 +364,9 @@ def ewma(z: Array, most: float = SIGMAS) -> Array:
     Values further out belong to Shewhart's chart; else one odd unit would hold the EWMA out of its limits for ten.
     Clipped at three, it alarms once in 530 units.
     """
-    from scipy.signal import lfilter
-
-    return np.asarray(lfilter([LAMBDA], [1, LAMBDA - 1], np.clip(z, -most, most)))
+    steps, left = LAMBDA * np.clip(z, -most, most), np.full((1, 1, 1), 1 - LAMBDA)
+    each = [drift(np.zeros(1), left, row[:, None]) for row in steps.reshape(-1, steps.shape[-1])]
+    return np.reshape(each, steps.shape)
 
 
 def ewma_limit(n: int) -> Array:
