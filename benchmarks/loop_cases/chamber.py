@@ -88,7 +88,7 @@ class Unit(maker.Unit):
         """Write one recording; keep what the oracle is told of it; return its true bias."""
         self.parts: list[Array] = []
         bias = super().record(path, t, T)
-        seen = maker.first_order(T, 150.0) if "thermal_lag" in self.effects else T
+        seen = late(T, 150.0) if "thermal_lag" in self.effects else T
         with h5py.File(path) as file:
             z = np.deg2rad(file["gyro"][()])
         S = np.stack(self.parts, axis=1) if self.parts else np.empty((len(t), 0))

@@ -90,16 +90,16 @@ class CandidateEvidence:
 def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) -> tuple[bool, str]:
     """Judge the evidence for a candidate beside channels that are named already; return the reason where it fails.
 
-    An effect that is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time
-    alone; a further term of a channel, by the first one's misfit.
+    An effect that is easily imitated needs more: what runs with time alone, by any walk; a further term of a channel,
+    by the first one's misfit.
     """
     own = set(effect.requires) - {"temperature", "temperature_rate"}
     if own & set(named):
         accepted = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
-    elif effect.walks and (evidence.beside or effect.course == "trend"):
+    elif effect.walks:
         needed = SECOND if evidence.beside else DRIFTING
         accepted = evidence.better(SURELY) and evidence.left_out > CHANCE and evidence.ratio < needed
-        return accepted, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
+        return accepted, "a walk imitates it, and left-out parts are not predicted better by as much as that needs"
     else:
         accepted = evidence.fast or evidence.slow
     return accepted, "" if accepted else evidence.reason()
