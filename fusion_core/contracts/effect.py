@@ -46,8 +46,8 @@ class Effect(Plugin):
     # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
     continuous: ClassVar[Mapping[str, float]] = {}
     unit: ClassVar[str] = "bias"  # of a coefficient; `bias` stands for the unit of the bias
-    # how an effect of time alone runs: any walk imitates a steady trend, and beside other effects a transient; no line
-    course: ClassVar[Literal["transient", "trend", "line"]] = "transient"
+    # how an effect of time alone runs: any walk imitates what is no line of one frequency
+    course: ClassVar[Literal["transient", "line"]] = "transient"
     several: ClassVar[bool] = False  # whether a model may have it more than once of one subject
 
     axes: Axes = Field(default_factory=usual_axes)

@@ -14,7 +14,6 @@ class Drift(Effect):
     """The time since the recording's first sample."""
 
     unit: ClassVar = "bias/s"
-    course: ClassVar = "trend"
     requires: ClassVar = ()
     explanation: ClassVar = (
         "A leak, an ageing resonator or charge that builds up moves the bias at a steady rate, whatever the "
