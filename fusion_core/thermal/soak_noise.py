@@ -224,8 +224,8 @@ def _expected(own: Array, u: Array) -> tuple[float, float]:
     and is right on average with their means: k / s and log s are as probable everywhere before (A. Gelman, Prior
     distributions for variance parameters in hierarchical models, Bayesian Analysis 1 (2006) 515).
     """
-    if not np.any(u):
-        return 0.0, 0.0
+    if len(u) < 3 or not np.any(u):
+        return 0.0, float(u @ u) / max(len(u), 1)
     variances = np.outer(RATIOS, own) + 1.0
     squares = np.sum(u**2 / variances, axis=1)
     log_density = np.log(RATIOS) / 2 - len(u) / 2 * np.log(squares) - np.sum(np.log(variances), axis=1) / 2

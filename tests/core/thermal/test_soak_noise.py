@@ -50,3 +50,15 @@ def test_a_walk_that_the_likelihood_denies_by_chance_is_not_none() -> None:
         means.append(Contrasts(blocks).noise(blocks.y[:, 0], np.eye(len(blocks.T))).walk / (N * 0.02**2))
     assert min(means) > 0.02
     assert 0.7 < np.median(means) < 3
+
+
+def test_a_map_that_leaves_one_contrast_leaves_no_walk() -> None:
+    """As a network that follows all but one shape of the samples: two variances do not follow from one number."""
+    rng = np.random.default_rng(3)
+    blocks = blocks_of(20 - 30 * np.cos(6 * np.pi * np.arange(4000) / 4000), rng.normal(size=(4000, 1)))
+    contrasts = Contrasts(blocks)
+    v = contrasts.Z[:, 0]
+    found = contrasts.noise(v * (v @ blocks.y[:, 0]), np.outer(v, v))
+    assert found.walk == 0
+    assert found.white > 0
+    assert np.all(np.isfinite(found.root))
