@@ -324,7 +324,8 @@ def test_half_of_the_units_are_in_the_narrow_band():
 def test_a_badly_measured_unit_does_not_squeeze_the_chart_of_the_others():
     found = line_of(line(60), LIMITS)
     control = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
-    wide = replace(control, own=np.where(control.at == 30, 10 * control.sigma, control.own))
+    value, own = control.figures()
+    wide = replace(control, figures=lambda: (value, np.where(control.at == 30, 10 * control.sigma, own)))
     (chart,) = control_charts(replace(found, controls=(wide,)))
     low, high = chart.panels[0].span
     usual = [*map(np.median, control.limits), *control.value, *np.concatenate(control.ewma[1:])]
