@@ -274,7 +274,7 @@ BUDGET = {
     "driftlab/spc": 1522,
     "driftlab/starter": 871,
     "driftlab/storage": 1278,
-    "driftlab/triad": 589,
+    "driftlab/triad": 592,
     "fusion_core": 1859,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 823,

@@ -127,6 +127,11 @@ class TriadTerms:
         """Return M (N, 3, 3)."""
         return self.at(T)[:, 3:12].reshape(-1, 3, 3)
 
+    def sensitivity(self, T: Array) -> Array:
+        """Return G (N, 3, 3); zero where it was not asked for."""
+        values = self.at(T)[:, 12:]
+        return values.reshape(-1, 3, 3) if values.shape[1] else np.zeros((len(values), 3, 3))
+
 
 def laws_of(curves: Sequence[TermCurve]) -> Array:
     """Return the precision (n, n) of the coefficients of curves by their own laws, zero of those that have none."""

@@ -18,7 +18,7 @@ def soak(hours, low=-15.0, high=50.0):
     t = np.arange(0, hours * 3600, 1 / RATE)
     stairs = np.concatenate([np.arange(low, high, 5.0), np.arange(high, low - 1, -5.0)])
     where = np.minimum((t / t[-1] * len(stairs)).astype(int), len(stairs) - 1)
-    return t, late(stairs[where], 150.0)
+    return t, late(stairs[where], 150.0, 1 / RATE)
 
 
 def day(hours, rng, low=-8.0, high=47.0):
@@ -30,7 +30,7 @@ def day(hours, rng, low=-8.0, high=47.0):
         knots_t += [knots_t[-1] + abs(target - knots_T[-1]) / rng.uniform(0.01, 0.04), 0]
         knots_t[-1] = knots_t[-2] + rng.uniform(60, 900)
         knots_T += [target, target]
-    return t, late(np.interp(t, knots_t, knots_T), 120.0)
+    return t, late(np.interp(t, knots_t, knots_T), 120.0, 1 / RATE)
 
 
 class Unit:
@@ -56,7 +56,7 @@ class Unit:
             noise = r.normal(size=n)
             noise[0] = 0.0  # else it begins tens of deviations away
             # bounded, as a regulator keeps it: beyond what was fitted on, an effect holds
-            return level + spread * 1.5 * np.tanh(late(noise, tau) / np.sqrt(1 / (2 * tau)) / 1.5)
+            return level + spread * 1.5 * np.tanh(late(noise, tau, 1 / RATE) / np.sqrt(1 / (2 * tau)) / 1.5)
 
         made = {
             "voltage": (
@@ -77,7 +77,7 @@ class Unit:
         """Write one recording; return its true gyro bias (N, 3)."""
         r, n = self.rng, len(t)
         extra = self.auxiliary(t, T)
-        seen = late(T, 150.0) if "thermal_lag" in self.effects else T
+        seen = late(T, 150.0, 1 / RATE) if "thermal_lag" in self.effects else T
         bias = (
             self.curve(seen)
             + r.normal(0, 2e-4, 3)
@@ -108,7 +108,7 @@ class Unit:
             "square": lambda: 1.5e-4 * (x["flow"] - 2) ** 2 / 0.25,
             "periodic": lambda: 8e-5 * np.sin(2 * np.pi * t / 97.0),
             "bands": lambda: 2e-4 * (x["voltage"] - 5) * np.cos(2 * np.pi * (T - 20) / 30),
-            "late": lambda: 6e-5 * late(x["flow"] - 2, 900.0) / 0.3,
+            "late": lambda: 6e-5 * late(x["flow"] - 2, 900.0, 1 / RATE) / 0.3,
             "gradient": lambda: 4e-5 * (x["temperature_case"] - T),
             "telegraph": lambda: 8e-5 * np.sign(np.sin(2 * np.pi * (t / 3300.0) ** 1.3)),
         }[effect]()
