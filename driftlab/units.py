@@ -14,6 +14,8 @@ from fusion_core.units import convert
 if TYPE_CHECKING:
     from fusion_core.contracts import MeasurementModel, Sensor
 
+YEARS = (8e8, 4e9)  # s since 1970, 1995 to 2096: a time between them is a date
+
 
 @dataclass(frozen=True)
 class BiasUnit:

@@ -22,7 +22,7 @@ from driftlab.config import Config, paths_of, with_recording
 from driftlab.evaluation.limits import RULE, LimitResult, outcome, verdict
 from driftlab.recordings.identity import identity, of_source, sha256
 from driftlab.storage.recorder import started_at
-from driftlab.units import BiasUnit, tracked_unit
+from driftlab.units import YEARS, BiasUnit, tracked_unit
 from fusion_core.contracts import FileSource, FittedMap, Source
 from fusion_core.errors import FusionError
 from fusion_core.faults import Faults
@@ -30,7 +30,6 @@ from fusion_core.host.provenance import Participant, participants
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
 FIRST = 100  # rows, of which one says when it was
-YEARS = (8e8, 4e9)  # s since 1970, 1995 to 2096: a time that is a date
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from driftlab.noise.quick import QuickNoise, noise_of
 from driftlab.starter.names import NO_SENSOR, Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
+from driftlab.units import YEARS
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
 from fusion_core.errors import ConfigError, quote
@@ -240,7 +241,6 @@ def _seconds(time: GuessedChannel | None) -> Array | None:
 
 
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
-YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
 DAYS = {25569.0: "as Excel counts", 719529.0: "as MATLAB counts"}  # numbers of 1970-01-01 among days
 DAY = 86_400.0  # s
 FALLS = 0.01  # of the steps of a time, where a clock was set

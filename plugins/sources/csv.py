@@ -27,8 +27,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of, unpacked_at_most
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, Source, Table, foreign, recognised
 from fusion_core.contracts.file_source import problem
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -44,7 +44,7 @@ from fusion_plugins.sources.dialect import (
     numbers_of,
     seconds_of,
 )
-from fusion_plugins.sources.joining import bridged
+from fusion_plugins.sources.joining import TableSource
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
@@ -63,7 +63,7 @@ DAY = 86_400.0  # s
 GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
 
 
-class Csv(FileSource):
+class Csv(TableSource):
     """A text file with a header line, or a gzip archive of one; the path `-` is standard input."""
 
     suffixes: ClassVar[tuple[str, ...]] = (".csv", ".tsv", ".txt", ".csv.gz")
@@ -111,10 +111,6 @@ class Csv(FileSource):
         }
         defaults = {name: cls.model_fields[name].default for name in settings}
         return {**{k: v for k, v in settings.items() if v == 0 or (v and v != defaults[k])}, **known}
-
-    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
-        """Yield the range; where few rows have a temperature, it is drawn between them."""
-        return bridged(super().chunks(size, faults), size, faults)
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:

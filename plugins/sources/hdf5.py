@@ -20,29 +20,25 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from fusion_core.budget import rows_at_once
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, Source, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.joining import bridged
+from fusion_plugins.sources.joining import TableSource
 from fusion_plugins.sources.unpacked import damaged, unpacking
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
-class Hdf5(FileSource):
+class Hdf5(TableSource):
     """An HDF5 or NetCDF-4 file."""
 
     signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".nc")
 
     kind: Literal["hdf5"] = "hdf5"
-
-    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
-        """Yield the range; where few rows have a temperature, it is drawn between them."""
-        return bridged(super().chunks(size, faults), size, faults)
 
     @unpacking
     @contextmanager

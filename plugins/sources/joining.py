@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FileSource
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import RANGES, Faults
 
@@ -109,6 +110,14 @@ def joined(t: Array, sampled: Array, values: Array, step: float | None = None, s
     good = np.where((t < sampled[0]) | (t > sampled[-1]), near, (width <= HOLE * spacing) | near)
     result[good] = ((1 - share) * values[before] + share * values[after])[good]
     return result
+
+
+class TableSource(FileSource):
+    """A file of rows with one time; the temperature of one that few rows have is drawn between these."""
+
+    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
+        """Yield the range."""
+        return bridged(super().chunks(size, faults), size, faults)
 
 
 def bridged(chunks: Iterable[Chunk], size: int, faults: Faults) -> Iterator[Chunk]:

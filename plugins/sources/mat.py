@@ -23,14 +23,14 @@ from typing import Any, BinaryIO, ClassVar, Literal
 import numpy as np
 
 from fusion_core.budget import DEEPEST, NAMES, rows_at_once
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, Source, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.mat_elements import Elements, Old, Variable
-from fusion_plugins.sources.joining import bridged
+from fusion_plugins.sources.joining import TableSource
 from fusion_plugins.sources.unpacked import translated, unpacking
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
@@ -42,17 +42,13 @@ PLAIN = ["double", "single", "logical", "int8", "uint8", "int16", "uint16", "int
 AS_STRUCT = "in MATLAB, S = table2struct(timetable2table(TT), 'ToScalar', true); save('FILE', 'S', '-v7')"
 
 
-class Mat(FileSource):
+class Mat(TableSource):
     """A MAT file of MATLAB or Octave."""
 
     signatures: ClassVar[tuple[bytes, ...]] = SIGNATURES
     suffixes: ClassVar[tuple[str, ...]] = (".mat",)
 
     kind: Literal["mat"] = "mat"
-
-    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
-        """Yield the range; where few rows have a temperature, it is drawn between them."""
-        return bridged(super().chunks(size, faults), size, faults)
 
     @unpacking
     @contextmanager

@@ -33,12 +33,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from fusion_core.budget import PIECE, TimeBudget, check_count, check_size
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, Source, Table, foreign, head
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.joining import bridged
+from fusion_plugins.sources.joining import TableSource
 from fusion_plugins.sources.unpacked import damaged, translated, unpacking
 
 if TYPE_CHECKING:
@@ -49,17 +49,13 @@ SIGNATURE = b"PAR1"
 WIDE = 1024  # values of a list that can be channels
 
 
-class Parquet(FileSource):
+class Parquet(TableSource):
     """A Parquet file."""
 
     signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
     suffixes: ClassVar[tuple[str, ...]] = (".parquet", ".pq")
 
     kind: Literal["parquet"] = "parquet"
-
-    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
-        """Yield the range; where few rows have a temperature, it is drawn between them."""
-        return bridged(super().chunks(size, faults), size, faults)
 
     @unpacking
     @contextmanager
