@@ -120,9 +120,10 @@ class OverviewAccumulator:
             self._coldest = min(self._coldest, float(np.min(block["temperature"])))
             self._warmest = max(self._warmest, float(np.max(block["temperature"])))
         self._last = _rows(block, len(used) - 1, None)
-        self._scores.add(block, block["reference"])
+        errors = errors_of(block, block["reference"])
+        self._scores.add(block, errors)
         self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
-        self._envelope.add(block, after)
+        self._envelope.add(block, errors, after)
         self._curves.add(block)
         if self.averages is not None:
             self.averages.add(block)
@@ -230,9 +231,8 @@ class Envelope:
         self.sums = np.zeros((K, 3))  # of the updates that count: their number, sum of t, sum of nis
         self.nis_total = self.nis_highest = 0.0
 
-    def add(self, block: Mapping[str, Array], counts: Flags) -> None:
-        """Take the next block with its `reference`, without which no error is known; `counts` says whose nis does."""
-        errors = errors_of(*(block[name] for name in ("bias", "coast", "coast", "reference")))
+    def add(self, block: Mapping[str, Array], errors: Array, counts: Flags) -> None:
+        """Take the next block with its errors (N, 3 d), NaN where not known; `counts` says whose nis counts."""
         while self.at + len(counts) > len(self.sums) * self.length:
             self.length *= 2
             for table, merged, empty in (

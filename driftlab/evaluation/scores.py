@@ -105,27 +105,23 @@ class ScoreAccumulator:
         self._integrals = {name: Integral(3 * d, length) for name, length in lengths.items()}
         self._cells = Cells(d)
 
-    def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
-        """Count the next rows of the estimates, with their reference (N, d) in SI, NaN where there is none."""
-        t = estimates["t"]
+    def add(self, estimates: Mapping[str, Array], errors: Array) -> None:
+        """Count the next rows of the estimates, with their errors (N, 3 d) (`errors_of`) in SI, NaN where not known."""
+        t, coast = estimates["t"], estimates["coast"]
         if len(t) == 0:
             return
         self.end = float(t[-1])
-        first = int(np.argmax(np.isfinite(estimates["coast"][:, 0])))  # no earlier row is coasting, and each later one
-        if np.isnan(estimates["coast"][first, 0]):
+        first = int(np.argmax(np.isfinite(coast[:, 0])))  # no earlier row is coasting, and each later one
+        if np.isnan(coast[first, 0]):
             return
-        rows = slice(first, None)
-        t, tau, reference = t[rows], np.asarray(estimates["tau"][rows], dtype=np.float64), reference[rows]
+        t, coast, errors, rate = t[first:], coast[first:], errors[first:], estimates["rate"][first:]
+        tau = np.asarray(estimates["tau"][first:], dtype=np.float64)
         self.start = min(self.start, float(t[0] - tau[0]))
-        self.moved += float(np.sum(tau[~estimates["still"][rows].astype(bool)]))
-        coast, known = estimates["coast"][rows], np.isfinite(reference[:, 0])
-        columns = (np.asarray(estimates[name][rows], dtype=np.float64) for name in ("bias", "coast", "coast_sigma"))
-        errors = errors_of(*columns, reference)
+        self.moved += float(np.sum(tau[~estimates["still"][first:].astype(bool)]))
+        known = np.isfinite(errors[:, 0])
         for integral in self._integrals.values():
             integral.add(t, tau, errors, known, self.start)
-        d = coast.shape[1]
-        raw = coast - estimates["rate"][rows]
-        self._cells.add(t - tau / 2 - self.start, tau * known, errors[:, d : 2 * d], raw)
+        self._cells.add(t - self.start, tau, known, errors, np.asarray(coast - rate, dtype=np.float64))
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Scores:
         """Return the scores of the rows that were added; an alignment lasts `align` s."""
@@ -160,15 +156,15 @@ class Cells:
         # number, time at rest [s], integrals of error, of its square, and of c - rate, of each cell with rows at rest
         self._cells = [np.array([[-1.0] + [0.0] * (1 + 3 * d)])]
 
-    def add(self, t: Array, tau: Array, error: Array, raw: Array) -> None:
-        """Take the next rows: times t (N,) from the start, s, at rest for tau (N,), with their errors (N, d)."""
-        numbers, rest = np.maximum(np.floor(t / CELL), 0.0), tau > 0
-        self.size = float(numbers[-1]) + 1
-        new = np.diff(numbers[rest], prepend=-1.0) > 0  # time only moves on
-        cells = np.zeros((np.count_nonzero(new), 2 + 3 * self.d))
-        cells[:, 0] = numbers[rest][new]
-        _sum_cells(np.cumsum(new) - 1, tau[rest], error[rest], raw[rest], cells[:, 1:])
-        if len(cells) and self._cells[-1][-1, 0] == cells[0, 0]:
+    def add(self, t: Array, tau: Array, known: Flags, errors: Array, raw: Array) -> None:
+        """Take the next rows: ends t (N,) from the start, s, lengths tau (N,), errors (N, 3 d) where they are known.
+
+        `raw` (N, d) is the prediction less the rate.
+        """
+        cells = np.zeros((min(len(t), int((t[-1] - t[0]) / CELL) + 2), 2 + 3 * self.d))
+        count, last = _sum_cells(t, tau, known, errors, raw, cells)
+        self.size, cells = last + 1.0, cells[:count]
+        if count and self._cells[-1][-1, 0] == cells[0, 0]:
             self._cells[-1][-1, 1:] += cells[0, 1:]
             cells = cells[1:]
         if len(cells):
@@ -197,15 +193,24 @@ class Cells:
 
 
 @compiled
-def _sum_cells(rows: NDArray[np.int64], tau: Array, error: Array, raw: Array, sums: Array) -> None:
-    d = error.shape[1]
-    for k in range(len(rows)):
-        cell = sums[rows[k]]
-        cell[0] += tau[k]
+def _sum_cells(t: Array, tau: Array, known: Flags, errors: Array, raw: Array, cells: Array) -> tuple[int, float]:
+    """Fill a row of `cells` (K, 2 + 3 d) for each cell with rows at rest; return how many, and the last row's cell."""
+    d, at, number = raw.shape[1], -1, 0.0
+    for k in range(len(t)):
+        number = max(np.floor((t[k] - tau[k] / 2) / CELL), 0.0)
+        if not known[k] or tau[k] <= 0:
+            continue
+        if at < 0 or cells[at, 0] != number:
+            at += 1
+            cells[at, 0] = number
+        cell = cells[at]
+        cell[1] += tau[k]
         for j in range(d):
-            cell[1 + j] += tau[k] * error[k, j]
-            cell[1 + d + j] += tau[k] * error[k, j] ** 2
-            cell[1 + 2 * d + j] += tau[k] * raw[k, j]
+            error = errors[k, d + j]
+            cell[2 + j] += tau[k] * error
+            cell[2 + d + j] += tau[k] * error**2
+            cell[2 + 2 * d + j] += tau[k] * raw[k, j]
+    return at + 1, number
 
 
 class Integral:
@@ -265,10 +270,16 @@ def _integrate(
             last[1 + j] = error[k, j]
 
 
+def errors_of(estimates: Mapping[str, Array], reference: Array) -> Array:
+    """Return errors (N, 3 d) of bias and prediction less the reference (N, d), and the prediction's deviation."""
+    columns = (np.ascontiguousarray(estimates[n], dtype=np.float64) for n in ("bias", "coast", "coast_sigma"))
+    errors: Array = _errors(*columns, np.ascontiguousarray(reference))
+    return errors
+
+
 @compiled
-def errors_of(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
-    """Return errors (N, 3 d) of bias and prediction, and the latter's deviation: rows of three take NumPy too long."""
-    N, d = bias.shape
+def _errors(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
+    N, d = bias.shape  # rows of three take NumPy too long
     errors = np.empty((N, 3 * d))
     for k in range(N):
         for j in range(d):
@@ -282,7 +293,8 @@ def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...
     """Return the scores of a run by its estimates, all of them at once; the arguments are those of `yardsticks`."""
     tally = ScoreAccumulator(estimates["bias"].shape[1])
     still = estimates["still"].astype(bool)
-    tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], still))
+    reference = moving_average(estimates["t"], estimates["rate"], estimates["tau"], still)
+    tally.add(estimates, errors_of(estimates, reference))
     return tally.yardsticks(up, axes)
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from driftlab.evaluation.overview import STRETCHES, Envelope
+from driftlab.evaluation.scores import errors_of
 
 
 def rows(N, seed=0):
     rng = np.random.default_rng(seed)
-    block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "reference")}
+    block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "coast_sigma", "reference")}
     return {"t": np.arange(N) / 10.0, "nis": np.ones(N), **block}
 
 
@@ -17,7 +18,7 @@ def of(block, size):
     found = Envelope(2)
     for start in range(0, N, size):
         part = {name: values[start : start + size] for name, values in block.items()}
-        found.add(part, part["nis"] > 0)
+        found.add(part, errors_of(part, part["reference"]), part["nis"] > 0)
     return found.curves()
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.evaluation.overview import OverviewAccumulator
-from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, rms_over_time, score
+from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, errors_of, rms_over_time, score
 
 UP = np.array([0.6, 0.0, -0.8])
 AXES = ("x", "y", "z")
@@ -83,7 +83,7 @@ def integrated(rows, error, known, start, horizon, length):
 def test_scores_are_the_integrals_over_time(seed):
     rows, reference = recording(seed)
     tally = ScoreAccumulator(3)
-    tally.add(rows, reference)
+    tally.add(rows, errors_of(rows, reference))
     found = tally.yardsticks(UP, AXES)
     first = int(np.argmax(np.isfinite(rows["coast"][:, 0])))
     rows, reference = {name: values[first:] for name, values in rows.items()}, reference[first:]
@@ -113,10 +113,10 @@ def test_scores_are_the_integrals_over_time(seed):
 def test_rows_may_come_in_any_blocks(seed, cuts):
     rows, reference = recording(seed)
     whole, split = ScoreAccumulator(3), ScoreAccumulator(3)
-    whole.add(rows, reference)
-    N = len(reference)
+    errors, N = errors_of(rows, reference), len(reference)
+    whole.add(rows, errors)
     for start, stop in pairwise([0, *sorted(min(cut, N) for cut in cuts), N]):
-        split.add({name: values[start:stop] for name, values in rows.items()}, reference[start:stop])
+        split.add({name: values[start:stop] for name, values in rows.items()}, errors[start:stop])
     one, two = whole.yardsticks(UP, AXES), split.yardsticks(UP, AXES)
     for name in HORIZONS:
         np.testing.assert_allclose(two.coast[name], one.coast[name], rtol=1e-12)

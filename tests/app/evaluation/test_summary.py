@@ -75,7 +75,7 @@ def test_no_reference_no_heading_error():
     """Without a used sample there is no average to measure against: the error is not known, and not zero."""
     tally, none = ScoreAccumulator(3), np.zeros((400, 3))
     moved = {"t": np.arange(400.0), "tau": np.ones(400), "still": np.zeros(400), "bias": none, "coast": none}
-    tally.add({**moved, "coast_sigma": none, "rate": none + 1}, none * np.nan)
+    tally.add({**moved, "rate": none + 1}, np.full((400, 9), np.nan))
     found = tally.yardsticks(np.array([0.0, 0.0, 1.0]), ("x", "y", "z"))
     assert all(np.isnan(value) for value in found.heading.values())
     assert np.all(np.isnan(found.filter_whole))
