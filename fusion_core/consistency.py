@@ -89,23 +89,22 @@ class Whiteness:
     def add(self, white: Array) -> None:
         """Count the next innovations (N, m)."""
         self.N += len(white)
-        self._total += np.sum(white, axis=0)
         self._first = np.concatenate([self._first, white[: self.lags - len(self._first)]])
         rows = np.concatenate([self._last, white])
         count = max(0, len(rows) - self.lags)
-        _lagged(rows, count, self._products)
+        _lagged(rows, count, self._products, self._total)
         self._last = rows[count:]
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""
-        products = self._products.copy()
-        _lagged(np.concatenate([self._last, np.zeros((self.lags, len(self._total)))]), len(self._last), products)
+        products, total = self._products.copy(), self._total.copy()
+        _lagged(np.concatenate([self._last, np.zeros((self.lags, len(total)))]), len(self._last), products, total)
         lag = np.arange(self.lags + 1)[:, None]
-        mean = self._total / self.N
+        mean = total / self.N
         none = np.zeros((1, len(mean)))
         edges = (np.cumsum(np.concatenate([none, part]), axis=0) for part in (self._first, self._last[::-1]))
         ends = sum(edge[np.minimum(lag[:, 0], len(edge) - 1)] for edge in edges)
-        covariances: Array = products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
+        covariances: Array = products - mean * (2 * total - ends) + np.maximum(self.N - lag, 0) * mean**2
         return covariances
 
     def autocorrelation(self) -> Array:
@@ -128,8 +127,8 @@ class Whiteness:
 
 
 @partial(compiled, fastmath={"reassoc", "contract"})
-def _lagged(rows: Array, stop: int, products: Array) -> None:
-    """Add sum_k rows[k] rows[k + lag] over k < stop to products (lags + 1, m), piece by piece in the cache."""
+def _lagged(rows: Array, stop: int, products: Array, sums: Array) -> None:
+    """Add sum_k rows[k] rows[k + lag] and rows[k], k < stop, to products (lags + 1, m) and sums (m,), in the cache."""
     lags, m = len(products) - 1, rows.shape[1]
     some = np.empty(PIECE + lags)
     for start in range(0, stop, PIECE):
@@ -137,6 +136,8 @@ def _lagged(rows: Array, stop: int, products: Array) -> None:
         for j in range(m):
             for k in range(N + lags):
                 some[k] = rows[start + k, j]
+            for k in range(N):
+                sums[j] += some[k]
             for lag in range(lags + 1):
                 total = 0.0
                 for k in range(N):

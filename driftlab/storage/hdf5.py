@@ -139,7 +139,7 @@ class GrowingFile:
         for name, data in self._data.items():
             begun = [self._begun[name]] if name in self._begun else []
             values = _one_by_one([*begun, *(part[name] for part in parts)], data.dtype)
-            data.resize(end, axis=0)
+            data.id.set_extent((end, *values.shape[1:]))
             for at in range(start, end, PIECE):
                 new = at >= written  # a piece that is there in part keeps its place
                 self._put(name, at, values[at - start : min(at + PIECE, end) - start], new=new)
