@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3718
+    assert 0 < count <= 3816
 
 
 def imports():
@@ -258,7 +258,7 @@ def test_tests_mirror_the_tree():
 BUDGET = {
     "driftlab": 634,
     "driftlab/commands": 3754,
-    "driftlab/evaluation": 1466,
+    "driftlab/evaluation": 1471,
     "driftlab/family": 3259,
     "driftlab/filtering": 1248,
     "driftlab/identification": 2201,
@@ -270,17 +270,17 @@ BUDGET = {
     "driftlab/products": 6,
     "driftlab/recordings": 466,
     "driftlab/reports": 3524,
-    "driftlab/soak": 657,
+    "driftlab/soak": 618,
     "driftlab/spc": 1522,
     "driftlab/starter": 871,
     "driftlab/storage": 1278,
     "driftlab/triad": 592,
-    "fusion_core": 1859,
+    "fusion_core": 1860,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 823,
     "fusion_core/host": 748,
     "fusion_core/testing": 1002,
-    "fusion_core/thermal": 1054,
+    "fusion_core/thermal": 1151,
     "fusion_core/units": 431,
     "plugins": 302,
     "plugins/bias_models": 254,

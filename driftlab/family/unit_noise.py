@@ -26,8 +26,8 @@ from driftlab.family.basis import STEP, SplineBasis
 from driftlab.family.unit_information import UnitInformation
 from driftlab.noise.local_level import LevelLikelihood
 from driftlab.soak.blocks import SoakRows
-from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
+from fusion_core.thermal.sweeps import directions, sweeps_of
 
 GRID = np.linspace(-18.0, 14.0, 44)  # of log (walk over the whole soak / white noise of a row), its variance
 GAIN = 2.71  # of - 2 log likelihood: a walk that gains less does not show, 95 % on one side

@@ -24,13 +24,13 @@ from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
 from driftlab.soak.blocks import means
-from driftlab.soak.sweeps import one_way, ways
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Effect
 from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.thermal.sweeps import one_way, ways
 
 FINE = 10.0  # s: longest mean that effects are computed on
 ROWS = 3000  # of a recording, at most

@@ -26,7 +26,6 @@ from driftlab.maps.kind_selection import TURN
 from driftlab.planning.request import read_range
 from driftlab.soak.blocks import GrowingSoak
 from driftlab.soak.rest import Used, at_rest
-from driftlab.soak.sweeps import sweeps_of
 from driftlab.soak.temperature import soak_temperature
 from driftlab.storage.map_file import check_place, save
 from driftlab.units import RATE, BiasUnit, tracked_unit
@@ -35,6 +34,7 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, FusionError
 from fusion_core.faults import Faults
 from fusion_core.thermal.curve_uncertainty import HOLE
+from fusion_core.thermal.sweeps import sweeps_of
 from fusion_core.thermal.thermometer import steps_of
 from fusion_core.units import to_si
 

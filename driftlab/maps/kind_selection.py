@@ -35,10 +35,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.sweeps import Index, sweeps_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, NetworkMap, Plugin, ThermalMap
 from fusion_core.errors import ConfigError, FusionError
+from fusion_core.thermal.sweeps import Index, sweeps_of
 
 ERROR_RANGES = 50  # of temperature, over which the errors of a part are averaged
 NEGLIGIBLE = 1e-4  # of the error without a map: less is no difference

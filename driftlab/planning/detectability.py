@@ -28,10 +28,10 @@ from driftlab.identification.trials import AS_GOOD
 from driftlab.noise.local_level import effective, one_step
 from driftlab.planning.simulated_search import Body, Information, measured, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
-from driftlab.soak.sweeps import one_way
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
+from fusion_core.thermal.sweeps import one_way
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
 TWICE = 2.0  # times the smallest size that is found: the size at which effects are to be distinguished

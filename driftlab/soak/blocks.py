@@ -7,7 +7,7 @@ order is that of time. N samples, d axes, R rows, K runs.
 
 The summary of a soak: rows with the turns of the temperature, cells of temperature, and the white noise.
 
-- *rows*, at most about SLOTS of equally many samples, with the way of the temperature (`driftlab.soak.sweeps`);
+- *rows*, at most about SLOTS of equally many samples, with the way of the temperature (`fusion_core.thermal.sweeps`);
 - *cells*, CELLS equal ranges of temperature, with the samples of each way in them, read a slab at a time;
 - white noise, from the differences between neighbouring samples: var = mean((b_k+1 - b_k)^2) / 2, to which neither a
   curve nor a walk adds much.
@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.noise.local_level import whitened
-from driftlab.soak.sweeps import Index, directions
 from fusion_core.chunk import Array
 from fusion_core.contracts import SLAB
+from fusion_core.thermal.sweeps import Index, directions
 
 MAX_BLOCKS = 8192  # half as many, at least, once there are as many samples
 

@@ -18,6 +18,7 @@ from fusion_core.chunk import Array
 from fusion_core.errors import SingularFit
 from fusion_core.thermal.curve_error import CurveError, Misfit, modes_of_axes, nested
 from fusion_core.thermal.fitted_map import FittedMap
+from fusion_core.thermal.ripple import Ripple, ripple_modes, ripples
 from fusion_core.thermal.soak_noise import (
     MIN_BLOCKS,
     BlockNoise,
@@ -52,15 +53,21 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     domain = (float(T.min()), float(T.max()))
     grid = np.linspace(*domain, GRID)
     d = bias.shape[1]
-    blocks = blocks_of(T, bias - predict(T))
+    left = bias - predict(T)
+    blocks = blocks_of(T, left)
     holes = find_holes(T)
     fitted = predict(np.sort(blocks.T))
     swing = np.ptp(fitted, axis=0)
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
     smoothed = _smoothed(cells_of(T, bias), grid, predict, smoother)
+    found_ripples = ripples(T, left, float(np.median(np.diff(contrasts.knots))))
     per_axis, misfits = zip(
-        *(_axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis]) for axis in range(d)), strict=True
+        *(
+            _axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis], found_ripples[axis])
+            for axis in range(d)
+        ),
+        strict=True,
     )
     found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
     _check_holes(kind, found, swing)
@@ -190,11 +197,12 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
 
 
 def _axis_modes(
-    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int, smoothed: Array
-) -> tuple[Array, Misfit | None]:
+    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int, smoothed: Array,
+    ripple: Ripple | None,
+) -> tuple[Array, Misfit | None]:  # fmt: skip
     """Return the modes (r, G) of the curve's error, and where a misfit is seen.
 
-    They are of the noise's part, of what is `smoothed` (G,), and of the misfit.
+    They are of the noise's part, of what is `smoothed` (G,), of the misfit, and of a ripple that is narrower.
     """
     G, K = len(grid), len(blocks.T)
     both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
@@ -205,6 +213,9 @@ def _axis_modes(
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
     if misfit is not None:
         modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
+    if ripple is not None:
+        modes = np.column_stack([modes, ripple_modes(ripple, grid)])
+        misfit = misfit or Misfit(axis=axis, T=ripple.T, left=ripple.rms, noise=ripple.chance)
     return _largest(modes), misfit
 
 

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
-from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
+from fusion_core.thermal.sweeps import Index
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about

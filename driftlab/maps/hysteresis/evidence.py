@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, TINY, SoakContrasts, log_mean
-from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
+from fusion_core.thermal.sweeps import Index
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %

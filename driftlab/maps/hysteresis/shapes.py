@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.soak.blocks import SoakSummary
-from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import FusionError
 from fusion_core.host.registry import registry
+from fusion_core.thermal.sweeps import Index
 
 SUBJECT = "temperature"
 NARROWER = (4.0, 2.0)  # than the narrowest of a grid

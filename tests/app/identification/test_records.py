@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from driftlab.identification.records import Evidence, Record, missing_excitation
-from driftlab.soak.sweeps import ways
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
+from fusion_core.thermal.sweeps import ways
 
 
 def evidence(*temperatures, **channels):

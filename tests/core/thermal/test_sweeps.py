@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.soak.sweeps import directions, rise_and_fall, sweeps_of, turning_points
+from fusion_core.thermal.sweeps import directions, rise_and_fall, sweeps_of, turning_points
 
 T = np.array([0, 5, 10, 9, 10, 4, 0, 1, 0, 6, 10], dtype=float)
 
