@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import numpy as np
 from driftlab.evaluation.overview import ScoredRun, map_of
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
-from driftlab.units import axis_name
+from driftlab.filtering.setup import noise_remark
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest
-from fusion_core.contracts import FittedMap, Sensor
+from fusion_core.contracts import FittedMap
 from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
@@ -79,7 +80,8 @@ def remarks(run: ScoredRun) -> list[str]:
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
-    return [*lines, *(line for sensor in model.sensors for line in _noise(sensor, first.noise_ratio)), *_seen(run)]
+    noises = (noise_remark(sensor, first.noise_ratio[sensor.channel]) for sensor in model.sensors)
+    return [*lines, *chain.from_iterable(noises), *_seen(run)]
 
 
 def _seen(run: ScoredRun) -> list[str]:
@@ -105,21 +107,6 @@ def inconsistency(mean: float) -> str:
     size, deviations = ("larger", "small") if mean > 1 else ("smaller", "large")
     off = 100 * abs(np.sqrt(mean) - 1)
     return f"innovations are {off:.2g} % {size} than the model says, so its deviations are too {deviations}"
-
-
-def _noise(sensor: Sensor, ratio: dict[str, Array]) -> list[str]:
-    """Return the noise of a sensor where it is not as declared."""
-    name, ratios = sensor.channel, ratio[sensor.channel]
-    if all(0.5 <= r <= 2 for r in ratios):
-        return []
-    pairs = zip(sensor.axes, ratios, strict=True)
-    single = axis_name(name, sensor.axes[0]) == name
-    off = [f"{r:.2g}" if single else f"{axis} {r:.2g}" for axis, r in pairs if single or not 0.5 <= r <= 2]
-    path = f", or correct unit and path of source.channels.{name}" if any(not 0.2 <= r <= 5 for r in ratios) else ""
-    return [
-        f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
-        f"set {sensor.section}.noise{path}"
-    ]
 
 
 def _rejected(run: ScoredRun) -> list[str]:

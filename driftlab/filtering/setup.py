@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import (
     Alignment,
@@ -31,12 +32,34 @@ from fusion_core.settings import nearest
 
 FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
+OFF = 5.0  # factor between measured and declared noise: more may be a wrong unit or path
 
 
 def turned(one: Alignment, other: Alignment, channel: str) -> bool:
     """Return True if a unit lies in another way, by the input of a sensor."""
     a, b = one.inputs[channel], other.inputs[channel]
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
+
+
+def noise_remark(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str]:
+    """Return a sentence on a sensor whose noise is not as declared, by a factor of `least`; nothing where it is.
+
+    `ratios` (d,) are measured over declared noise.
+    """
+
+    def off(ratio: float, factor: float) -> bool:
+        return not 1 / factor <= ratio <= factor
+
+    if not any(off(r, least) for r in ratios):
+        return []
+    pairs = zip(sensor.axes, ratios, strict=True)
+    single = axis_name(sensor.channel, sensor.axes[0]) == sensor.channel
+    each = [f"{r:.2g}" if single else f"{axis} {r:.2g}" for axis, r in pairs if single or off(r, least)]
+    path = f", or correct unit and path of source.channels.{sensor.channel}" if any(off(r, OFF) for r in ratios) else ""
+    return [
+        f"{sensor.channel}: white noise is not as declared (measured / declared: {', '.join(each)}); "
+        f"set {sensor.section}.noise{path}"
+    ]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.segment import runs
-from driftlab.filtering.setup import TURNED, check_channels, corrected, other_calibrations
+from driftlab.filtering.setup import OFF, TURNED, check_channels, corrected, noise_remark, other_calibrations
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
@@ -116,6 +116,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             yield RestStretch(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
         return
     channel = model.tracked.channel
+    squares, counted = np.zeros(len(model.tracked.axes)), 0  # of measured over declared noise, and of how many epochs
     others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
     cutting = _Cutting(config, model, others, used)
@@ -128,6 +129,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             refused -= len(part)
             model.check(part, config.site)
             alignment = model.aligned(corrected(part, others), config.site)
+            squares, counted = squares + len(part) * alignment.noise_ratio[channel] ** 2, counted + len(part)
             if placing is not None:
                 alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])
             moved = False
@@ -140,6 +142,8 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             used.moving += refused
             used.first = used.first or f"at {faults.when(window.t[0])}"
             faults.add("epochs in stretches with motion, left out", refused, f"at {faults.when(window.t[0])}")
+    for line in noise_remark(model.tracked, np.sqrt(squares / max(counted, 1)), OFF) if counted else ():
+        faults.note(line)
 
 
 class _Cutting:

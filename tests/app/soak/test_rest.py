@@ -138,3 +138,16 @@ def test_the_curve_of_a_fog_is_found_on_its_own_ramp():
     truth = 10 * DEG_H * (0.8 * T + 0.2 * 10 * np.log(np.cosh((T - 5) / 10)))
     off = found.map.bias(T)[:, 0] - truth
     assert np.sqrt(np.mean((off - off.mean()) ** 2)) < 0.1 * DEG_H
+
+
+@pytest.mark.parametrize(("factor", "noted"), [(1.0, False), (3.0, False), (1e-3, True), (8.0, True)])
+def test_an_axis_in_another_unit_than_its_noise_is_named(factor, noted):
+    faults = Faults()
+    t, T, rates = soak(MEMS, 22, 1.0, seconds=1800.0)
+    rates[:, 1] *= factor
+    list(at_rest(config(MEMS), [of(t, T, rates)], faults))
+    lines = [line for line in faults.lines() if "noise is not as declared" in line]
+    assert len(lines) == noted
+    for line in lines:
+        assert "or correct unit and path of source.channels.gyro" in line
+        assert float(line.split("declared: y ")[1].split(")")[0]) == pytest.approx(factor, rel=0.05)
