@@ -47,6 +47,8 @@ class Faults:
         Why a live source has nothing to read at the moment, in a few words; empty while it can be read.
     rows, usable : int
         How many rows came, and how many of them are used.
+    doubts : list of str
+        Sentences on why the recording may not be what its config says: no limit passes on it.
     """
 
     found: dict[str, Fault] = field(default_factory=dict)
@@ -54,6 +56,7 @@ class Faults:
     unavailable: str = ""
     rows: int = 0
     usable: int = 0
+    doubts: list[str] = field(default_factory=list)
 
     def add(self, what: str, count: int, first: str) -> None:
         """Count `count` more cases of `what`; `first` says where the first of them is."""
@@ -64,6 +67,11 @@ class Faults:
     def note(self, text: str) -> None:
         """Keep a sentence about the recording that counts nothing: which of several sensors was read."""
         self.found.setdefault(text, Fault(0, ""))
+
+    def doubt(self, text: str) -> None:
+        """Note a sentence on why the recording may not be what its config says."""
+        self.note(text)
+        self.doubts += [text] * (text not in self.doubts)
 
     def when(self, t: float) -> str:
         """Return the moment t, in the recording's own seconds, as text: `812.0 s (t = 1760000812.0 s in the file)`."""

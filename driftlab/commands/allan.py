@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,12 @@ class AllanResult(Result):
 
     command = "allan"
 
-    def __init__(self, config: Config, analysis: Analysis) -> None:
+    def __init__(self, config: Config, analysis: Analysis, doubts: Sequence[str] = ()) -> None:
         self.config, self.found, self.name = config, analysis, analysis.name
         channel = config.filter.tracked.channel if config.filter else "gyro"
         items = analysis.coefficients.get(channel)
         measured = of_allan(items, analysis.axes[channel], analysis.used_s) if items else {}
-        self.judged = check_limits(config.limits, measured)
+        self.judged = check_limits(config.limits, measured, doubts)
         self.limits_verdict = self.verdict = verdict(self.judged)
         limits = [row.as_json(tracked_unit(config.filter)) for row in self.judged]
         self.summary = {**document(analysis, curves=False), "serial": config.serial, "limits": limits}
@@ -105,7 +105,7 @@ def allan(
         faults = Faults()
         analysis = analyse(understood, faults, progress)
         analysis.notes[:0] = faults.lines()
-        return AllanResult(understood, analysis)
+        return AllanResult(understood, analysis, faults.doubts)
 
     return in_folder(out, "allan", understood.files(), analysed)
 

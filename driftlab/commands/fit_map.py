@@ -83,7 +83,7 @@ class FitMapResult(Result):
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.measured = of_map(fitted, self.unit)
-        self.limits = check_limits(config.limits, self.measured)
+        self.limits = check_limits(config.limits, self.measured, faults.doubts)
         self.limits_verdict = verdict_line(self.limits)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)

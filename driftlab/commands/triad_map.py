@@ -74,7 +74,7 @@ class TriadMapResult(Result):
         self.fit, self.map, self.faults = fit, fitted, faults
         self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
         self.measured = of_map(fitted, self.unit)
-        self.limits = check_limits(config.limits, self.measured)
+        self.limits = check_limits(config.limits, self.measured, faults.doubts)
         self.limits_verdict = verdict_line(self.limits)
         self.written: tuple[Path, ...] = ()
         self.name = f"map of the {gathered.sensor.channel}, with scale factor and misalignment"

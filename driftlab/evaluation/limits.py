@@ -149,16 +149,24 @@ class LimitResult:
         return f"{name}, at most {limit}: {value}, {verdict} ({note})"
 
 
-def check_limits(limits: Limits | None, measured: Mapping[str, Measured]) -> list[LimitResult]:
+def check_limits(
+    limits: Limits | None, measured: Mapping[str, Measured], doubts: Sequence[str] = ()
+) -> list[LimitResult]:
     """Hold what was measured against the limits that are set, in the order of the config's keys.
+
+    Where there are `doubts` whether the recording is what its config says (`Faults.doubts`), nothing passes.
 
     A limit of which nothing is in `measured` has the verdict `not measured`, and its note names the command that
     measures it.
     """
     declared = {} if limits is None else limits.declared
     rows = [_result(name, limit, measured.get(name)) for name, limit in declared.items()]
-    beside = "; ".join(one.beside for name, one in measured.items() if one.beside and name not in declared)
-    return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
+    beside = [one.beside for name, one in measured.items() if one.beside and name not in declared]
+    if doubts:
+        beside.append(f"the recording is in doubt: {doubts[0]}")
+        doubtful = {"decision": "undecided", "needs": "the recording is in doubt"}
+        rows = [replace(row, **doubtful) if row.decision == "pass" else row for row in rows]
+    return [replace(row, beside="; ".join(beside) if row is rows[0] else "") for row in rows]
 
 
 def verdict(rows: Sequence[LimitResult]) -> str:

@@ -23,6 +23,7 @@ from driftlab.evaluation.measurements import Averages, of_coast, of_map
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog
+from driftlab.filtering.setup import noise_doubts
 from driftlab.recordings.prefetch import prefetch
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array
@@ -362,7 +363,10 @@ class ScoredRun:
     @cached_property
     def judged(self) -> list[LimitResult]:
         """The limits of the config, each held against its measurement."""
-        return [] if self.config.limits is None else check_limits(self.config.limits, self.measured)
+        if self.config.limits is None:
+            return []
+        noise = noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
+        return check_limits(self.config.limits, self.measured, [*self.journal.faults.doubts, *noise])
 
 
 def accumulator_of(run: Run) -> OverviewAccumulator:

@@ -12,7 +12,7 @@ import numpy as np
 from driftlab.evaluation.overview import ScoredRun, map_of
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
-from driftlab.filtering.setup import noise_remark
+from driftlab.filtering.setup import noise_remarks
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest
 from fusion_core.contracts import FittedMap
@@ -80,7 +80,7 @@ def remarks(run: ScoredRun) -> list[str]:
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
-    noises = (noise_remark(sensor, first.noise_ratio[sensor.channel]) for sensor in model.sensors)
+    noises = (noise_remarks(sensor, first.noise_ratio[sensor.channel]) for sensor in model.sensors)
     return [*lines, *chain.from_iterable(noises), *_seen(run)]
 
 

@@ -41,7 +41,7 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
 
 
-def noise_remark(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str]:
+def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str]:
     """Return a sentence on a sensor whose noise is not as declared, by a factor of `least`; nothing where it is.
 
     `ratios` (d,) are measured over declared noise.
@@ -60,6 +60,14 @@ def noise_remark(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str]
         f"{sensor.channel}: white noise is not as declared (measured / declared: {', '.join(each)}); "
         f"set {sensor.section}.noise{path}"
     ]
+
+
+def noise_doubts(sensor: Sensor, ratios: Array) -> list[str]:
+    """Return that sentence where the noise is far less than declared.
+
+    So it is of an axis in another unit, of one that is not there, at its range, or filtered, and so is its bias.
+    """
+    return noise_remarks(sensor, ratios, OFF) if np.min(ratios) < 1 / OFF else []
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,8 @@ def limits(t: Array, stretches: Index) -> tuple[float, float]:
 
 IMU = ("gyro", "accel")
 
+SPARSE = 0.2  # of the time that samples at their interval fill, at least
+
 
 class TooShort(DataError):
     """There are too few samples for an Allan deviation, or too few without a gap."""
@@ -224,6 +226,11 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     coefficients = {c: list(map(fit, of_axes)) for c, of_axes in curves.items()}
     axes = {c: _axes(sensors.get(c), len(of_axes)) for c, of_axes in curves.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
+    if len(whole) * dt < SPARSE * total:
+        faults.doubt(
+            f"rows follow one another at {dt:.3g} s, enough for {len(whole) * dt:.3g} s of {total:.6g} s: "
+            "packets that were buffered have the time of their arrival; set source.interval"
+        )
     first = next(iter(curves.values()))[0]
     notes = [*_gap_notes(first, whole, cut, faults), *_motion_notes(config, rest, faults)]
     for c, of_axes in coefficients.items():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.config import Config
+from driftlab.recordings.plausibility import Copies, Thermometer
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
@@ -36,6 +37,7 @@ def read(
     gaps, look = Gaps(faults), getattr(_suspect, "py_func", _suspect) if few else _suspect
     chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
     runs: dict[str, Array] = {}
+    copies, thermometer = Copies(faults), Thermometer(faults)
     empty = True
     for chunk in chunks:
         taken = sorted(DERIVED & set(chunk.channels))
@@ -45,8 +47,11 @@ def read(
             )
         chunk = _with_sensors(chunk, sensors)
         keep = np.ones(len(chunk), dtype=bool)
+        if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
+            thermometer.look(chunk)
         for name in (name for name in chunk.channels if name in chunk.sensors):
             sensor = (sensors or {}).get(name)
+            copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             before = runs.get(name, np.zeros(chunk[name].shape[1]))
             suspect, runs[name] = look(chunk[name], _value_before(chunk, name), before, limit)

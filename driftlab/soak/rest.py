@@ -19,7 +19,15 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.segment import runs
-from driftlab.filtering.setup import OFF, TURNED, check_channels, corrected, noise_remark, other_calibrations
+from driftlab.filtering.setup import (
+    OFF,
+    TURNED,
+    check_channels,
+    corrected,
+    noise_doubts,
+    noise_remarks,
+    other_calibrations,
+)
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
@@ -142,8 +150,11 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             used.moving += refused
             used.first = used.first or f"at {faults.when(window.t[0])}"
             faults.add("epochs in stretches with motion, left out", refused, f"at {faults.when(window.t[0])}")
-    for line in noise_remark(model.tracked, np.sqrt(squares / max(counted, 1)), OFF) if counted else ():
-        faults.note(line)
+    if counted:
+        ratios = np.sqrt(squares / counted)
+        for line in noise_remarks(model.tracked, ratios, OFF):
+            faults.note(line)
+        faults.doubts += noise_doubts(model.tracked, ratios)
 
 
 class _Cutting:

@@ -1,0 +1,109 @@
+"""Readings that no sensor gives: two axes that are one column, a thermometer that stands still, jumps or is in kelvin.
+
+What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit passes on them.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.units import axis_name
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Sensor
+from fusion_core.faults import Faults
+
+LIVELY = 100  # changes of a reading that show its habit
+STUCK = 100  # times its longest repetition before: a thermometer that repeats a reading for longer is stuck
+LASTING = 60.0  # s that it stands, at least
+JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
+FASTEST = 1.0  # K/s: no body of a sensor warms faster
+MOVED = 5.0  # K over which that is looked at
+KELVIN = (200.0, 450.0)  # degC: colder there is no kelvin, and hotter no sensor
+
+
+class Copies:
+    """Axes of a sensor that have shown the very same values so far."""
+
+    def __init__(self, faults: Faults) -> None:
+        self.faults = faults
+        self._same: dict[str, dict[tuple[int, int], int]] = {}  # pairs of axes, and how often both have changed
+
+    def look(self, chunk: Chunk, name: str, sensor: Sensor | None) -> None:
+        """Look at the next rows of a sensor (N, d)."""
+        values = chunk[name]
+        same = self._same.setdefault(name, dict.fromkeys(combinations(range(values.shape[1]), 2), 0))
+        for i, j in list(same):
+            if not np.array_equal(values[:100, i], values[:100, j]) or not np.array_equal(values[:, i], values[:, j]):
+                del same[i, j]
+                continue
+            before, same[i, j] = same[i, j], same[i, j] + int(np.count_nonzero(np.diff(values[:, i])))
+            if before < LIVELY <= same[i, j]:
+                axes = sensor.axes if sensor is not None and len(sensor.axes) == values.shape[1] else "xyz?"
+                one, other = (axis_name(name, axes[k]) for k in (i, j))
+                self.faults.doubt(f"{other} shows what {one} shows, row by row; correct source.channels.{name}.path")
+
+
+class Thermometer:
+    """The habit of a thermometer: how long it repeats a reading, how far it moves from row to row."""
+
+    def __init__(self, faults: Faults) -> None:
+        self.faults = faults
+        self.changes = self.longest = self.run = 0  # changes, rows of the longest repetition, and of the present one
+        self.since = np.nan  # when that began, s
+        self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
+        self.fast = False  # whether it has moved faster than any
+
+    def look(self, chunk: Chunk) -> None:
+        """Look at the next temperatures (N,), in degC."""
+        t, T = chunk.t, chunk["temperature"]
+        if chunk.previous is not None:
+            t, T = np.append(chunk.previous.t[-1:], t), np.append(chunk.previous["temperature"][-1:], T)
+        steps = np.abs(np.diff(T))
+        self._repeats(t, T, np.flatnonzero(steps) + 1, known=len(t) - len(chunk))
+        if np.max(steps, initial=0.0) > JUMP:
+            self._jumps(t, T, steps)
+        self._range(t, T)
+
+    def _repeats(self, t: Array, T: Array, changed: NDArray[np.intp], known: int) -> None:
+        """Look for a repetition far beyond the habit; `changed` are rows with another reading than the one before."""
+        edges = np.concatenate([[known - self.run], changed, [len(T)]])
+        runs, last = np.diff(edges), edges[1:] - 1
+        begins = np.append(t[0] if np.isnan(self.since) else self.since, t[changed])
+        before = np.maximum.accumulate(np.append(self.longest, runs[:-1]))
+        lively = self.changes + np.arange(len(runs)) >= LIVELY
+        for k in np.flatnonzero(lively & (runs > STUCK * before) & (t[last] - begins >= LASTING))[:1]:
+            self.faults.doubt(
+                f"temperature shows exactly {T[last[k]]:.6g} °C from {self.faults.when(begins[k])} on, and had never "
+                f"shown one reading in more than {before[k]} rows: the thermometer is stuck; leave that part out with "
+                "PATH::START:STOP"
+            )
+            self.longest = int(runs[k])
+        self.changes, self.longest = self.changes + len(changed), max(self.longest, int(before[-1]))
+        self.run, self.since = int(runs[-1]), float(begins[-1])
+
+    def _jumps(self, t: Array, T: Array, steps: Array) -> None:
+        usual = float(np.median(steps[steps > 0]))
+        for k in np.flatnonzero((steps > max(JUMP, USUAL * usual)) & (steps > FASTEST * np.diff(t)))[:1]:
+            self.faults.doubt(
+                f"temperature jumps from {T[k]:.4g} to {T[k + 1]:.4g} °C within {t[k + 1] - t[k]:.3g} s at "
+                f"{self.faults.when(t[k + 1])}, as no body does; leave that part out, or correct the thermometer"
+            )
+
+    def _range(self, t: Array, T: Array) -> None:
+        if self.first is None:
+            self.first = float(t[0]), float(T[0])
+            if KELVIN[0] < T.min() and T.max() < KELVIN[1]:
+                self.faults.doubt(
+                    f"temperature is {T[0]:.4g} °C in the first row: that looks like kelvin; set "
+                    "source.channels.temperature.unit to K"
+                )
+        seconds, warmer = float(t[-1]) - self.first[0], abs(float(T[-1]) - self.first[1])
+        if warmer > MOVED and warmer > FASTEST * seconds and not self.fast:
+            self.fast = True
+            self.faults.doubt(
+                f"temperature moves by {warmer:.3g} K in {seconds:.3g} s: no body does; correct "
+                "source.channels.time.unit, or source.interval"
+            )

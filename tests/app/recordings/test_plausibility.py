@@ -1,0 +1,97 @@
+"""Readings that no sensor gives are doubts; those of ordinary sensors, coarse ones and steady ones are none."""
+
+import numpy as np
+import pytest
+
+from driftlab.recordings.plausibility import Copies, Thermometer
+from fusion_core.chunk import Chunk
+from fusion_core.faults import Faults
+
+N, DT = 40_000, 0.1
+RNG = np.random.default_rng(0)
+RAMP = 20 + 30 * np.sin(np.arange(N) * DT / 1500)
+
+
+def doubts(T, size=7000, dt=DT):
+    """Return the doubts of temperatures (N,), which come in chunks of `size`."""
+    faults = Faults(first_row=0.0)
+    thermometer, t, previous = Thermometer(faults), np.arange(len(T)) * dt, None
+    for start in range(0, len(T), size):
+        chunk = Chunk(t[start : start + size], {"temperature": T[start : start + size]}, previous)
+        thermometer.look(chunk)
+        previous = Chunk(chunk.t[-1:], {"temperature": chunk["temperature"][-1:]})
+    return faults.doubts
+
+
+def held(T, start, stop):
+    return np.where((np.arange(N) >= start) & (np.arange(N) < stop), T[start], T)
+
+
+NOISY = RAMP + 0.01 * RNG.normal(size=N)
+ORDINARY = {
+    "fine": NOISY,
+    "fine, without noise": RAMP,
+    "steps of 0.06 K": np.rint(NOISY * 16) / 16,
+    "steps of 1 K": np.rint(NOISY),
+    "steps of 2 K": np.rint(NOISY / 2) * 2,
+    "read once a second": np.repeat(NOISY[::10], 10),
+    "read once a minute": np.repeat(NOISY[::600], 600)[:N],
+    "steps of 0.06 K, then steady": np.rint(16 * (20 + 30 * np.exp(-np.arange(N) * DT / 400))) / 16,
+    "frozen": np.full(N, 21.5),
+    "another chip that warms fast": 25 + 20 * (1 - np.exp(-np.arange(N) * DT / 30)) + 0.01 * RNG.normal(size=N),
+}
+
+
+@pytest.mark.parametrize("T", ORDINARY.values(), ids=ORDINARY)
+@pytest.mark.parametrize("size", [313, N])
+def test_an_ordinary_thermometer_is_in_no_doubt(T, size):
+    assert doubts(T, size) == []
+
+
+@pytest.mark.parametrize("size", [1, 7000, N])
+def test_a_stuck_one_is_named_where_it_begins(size):
+    rows = 20_000 if size > 1 else 3_000
+    (text,) = doubts(held(NOISY, rows, N)[: rows + 1_500], size)
+    assert f"from {rows * DT:.1f} s on" in text
+    assert f"{NOISY[rows]:.6g} °C" in text
+
+
+def test_one_that_is_read_once_a_second_is_stuck_later():
+    (text,) = doubts(np.repeat(held(NOISY, 2_000, N)[:4_000], 10), dt=DT)
+    assert "in more than 10 rows" in text
+
+
+@pytest.mark.parametrize(("T", "word"), [
+    (np.where(np.arange(N) > 9_000, NOISY + 3, NOISY), "jumps"),
+    (np.where(np.arange(N) == 9_000, 85.0, NOISY), "jumps"),
+    (held(NOISY, 0, 20_000), "jumps"),
+    (NOISY + 273.15, "kelvin"),
+])  # fmt: skip
+def test_jumps_and_kelvin_are_named(T, word):
+    (text,) = doubts(T)
+    assert word in text
+
+
+def test_time_in_another_unit_is_named():
+    (text,) = doubts(NOISY, dt=DT / 1000)
+    assert "source.channels.time.unit" in text
+
+
+def test_an_axis_that_copies_another_is_named_once():
+    values = RNG.normal(size=(N, 3))
+    values[:, 2] = values[:, 0]
+    faults = Faults()
+    copies = Copies(faults)
+    for start in range(0, N, 999):
+        part = values[start : start + 999]
+        copies.look(Chunk(np.arange(len(part)) * DT, {"gyro": part}), "gyro", None)
+    assert faults.doubts == ["gyro z shows what gyro x shows, row by row; correct source.channels.gyro.path"]
+
+
+def test_axes_that_are_alike_for_a_while_or_stand_still_are_no_copies():
+    values = np.zeros((N, 3))
+    values[:, 2] = RNG.normal(size=N)
+    values[:, 0] = np.where(np.arange(N) < 50, values[:, 2], 1.0)
+    faults = Faults()
+    Copies(faults).look(Chunk(np.arange(N) * DT, {"gyro": values}), "gyro", None)
+    assert faults.doubts == []
