@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,6 @@ from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
 from driftlab.family.partitions import serial
-from driftlab.family.unit_records import RecordsOfUnits
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
@@ -150,7 +149,8 @@ def fleet(
     )  # fmt: skip
     manifest, options = _checked(understood, str(units), options)
     read = [] if options.family is None else [options.family]
-    with _database(to) as database, fleet_folder(Path(out), read, store) as folder:
+    held = nullcontext() if to is None else closing(Database(to))  # reached before anything is computed
+    with held as database, fleet_folder(Path(out), read, store) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
         jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), options, report)
         command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
@@ -158,15 +158,12 @@ def fleet(
         if database is not None:
             command.to_database(database, summary)
         if not command.status.done:
-            raise _none_done(command.status.failed)
+            failed = command.status.failed
+            raise DataError(
+                f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors "
+                "are in the column `error` of units.parquet"
+            )
         return FleetResult(Path(out), summary)
-
-
-def _none_done(failed: RecordsOfUnits) -> DataError:
-    return DataError(
-        f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors are in "
-        "the column `error` of units.parquet"
-    )
 
 
 def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifest, FleetOptions]:
@@ -202,16 +199,6 @@ def _check_stimulus(config: Config, manifest: Manifest) -> None:
         )
     if config.stimulus is None:
         raise ConfigError(f"{has}, and the config no stimulus; add `stimulus: {{kind: rate_table}}` with its segments")
-
-
-@contextmanager
-def _database(url: str | None) -> Iterator[Database | None]:
-    """Give the database that results go to, reached before anything is computed; None where none is asked for."""
-    if url is None:
-        yield None
-        return
-    with closing(Database(url)) as database:
-        yield database
 
 
 @contextmanager
