@@ -16,6 +16,7 @@ from driftlab.commands.console import say, terminal
 from driftlab.commands.inputs import ConfigLike, Place, config_of
 from driftlab.config import Config, with_recording
 from driftlab.family.partitions import serial
+from driftlab.family.unit_records import RecordsOfUnits
 from driftlab.production.database import Database, tables_of
 from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
@@ -158,12 +159,15 @@ def fleet(
         if database is not None:
             command.to_database(database, summary)
         if not command.status.done:
-            failed = command.status.failed
-            raise DataError(
-                f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors "
-                "are in the column `error` of units.parquet"
-            )
+            raise _none_done(command.status.failed)
         return FleetResult(Path(out), summary)
+
+
+def _none_done(failed: RecordsOfUnits) -> DataError:
+    return DataError(
+        f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors are in "
+        "the column `error` of units.parquet"
+    )
 
 
 def _checked(config: Config, units: str, options: FleetOptions) -> tuple[Manifest, FleetOptions]:

@@ -37,20 +37,6 @@ class Penalised:
     root: Array
 
 
-def even_knots(domain: tuple[float, float], count: int) -> Array:
-    """Return the knots (count + 7,) of cubic B-splines on equal intervals of a domain."""
-    low, high = domain
-    step = (high - low) / count * np.arange(1, 4)
-    return np.concatenate([low - step[::-1], np.linspace(low, high, count + 1), high + step])
-
-
-def splines(domain: tuple[float, float], count: int, T: Array) -> Array:
-    """Return the cubic B-splines (N, count + 3) on equal intervals at T (N,), beyond the domain those at its ends."""
-    from scipy.interpolate import BSpline
-
-    return np.asarray(BSpline.design_matrix(np.clip(T, *domain), even_knots(domain, count), 3).toarray())
-
-
 def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAMBDAS) -> Penalised:
     """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); the undetermined are zero."""
     (m, n), w = B.shape, w / np.mean(w)

@@ -12,8 +12,8 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Function, Signal
 from fusion_core.hookspecs import hookimpl
-from fusion_core.thermal.penalised import splines
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.thermal_maps.spline import splines
 
 
 class MapMisfit(Effect):

@@ -28,7 +28,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from fusion_core import contracts
 from fusion_core.chunk import Array
 from fusion_core.hookspecs import hookimpl
-from fusion_core.thermal.penalised import LAMBDAS, even_knots, penalised, splines
+from fusion_core.thermal.penalised import LAMBDAS, penalised
 from fusion_core.thermal.soak_noise import Blocks, Smoother
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
@@ -180,10 +180,23 @@ def _smooth(B: Array, y: Array, w: Array, lambdas: Array, breaks: Array) -> tupl
     return fit.coefficients, np.linalg.norm(breaks @ fit.root, axis=1), fit.operator
 
 
+def _knots(domain: tuple[float, float], count: int) -> Array:
+    low, high = domain
+    step = (high - low) / count * np.arange(1, 4)
+    return np.concatenate([low - step[::-1], np.linspace(low, high, count + 1), high + step])
+
+
+def splines(domain: tuple[float, float], count: int, T: Array) -> Array:
+    """Return the cubic B-splines (N, count + 3) on equal intervals at T (N,), beyond the domain those at its ends."""
+    from scipy.interpolate import BSpline
+
+    return np.asarray(BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3).toarray())
+
+
 def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:
     from scipy.interpolate import BSpline
 
-    return BSpline(even_knots(domain, len(coefficients) - 3), coefficients, 3)
+    return BSpline(_knots(domain, len(coefficients) - 3), coefficients, 3)
 
 
 @hookimpl
