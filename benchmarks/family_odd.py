@@ -29,11 +29,10 @@ from odd_oracles import Truth, modes_of
 
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import FALSE, Outlier, find_outliers
-from driftlab.family.record import UnitRecord
+from driftlab.family.record import Figure, UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import soaked_of
-from driftlab.production.unit_map import figure
 from driftlab.soak.blocks import SoakRows
 
 AXES, STEP, DRAWN = ("x", "y", "z"), 2.5, 20_000
@@ -149,7 +148,7 @@ def soaked(unit: Dealt) -> tuple[UnitInformation, UnitRecord]:
     """Return the information of a unit's soaks, and its record."""
     found, noise = soaked_of(unit.name, AXES, unit.rows, STEP)
     figures = {
-        "noise": figure(noise.white, noise.white_sigma), "walk": figure(noise.walk, noise.walk_sigma),
+        "noise": Figure.of(noise.white, noise.white_sigma), "walk": Figure.of(noise.walk, noise.walk_sigma),
         "hysteresis": hysteresis_of(unit.rows, noise.white, noise.likely, STEP), "soaks": soaks_of(unit.rows, STEP),
     }  # fmt: skip
     return found, UnitRecord(key="", unit=unit.name, state="done", axes=AXES, figures=figures)

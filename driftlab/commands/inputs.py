@@ -45,13 +45,9 @@ def config_of(given: ConfigLike, *, measuring: bool = False) -> Config:
     )
 
 
-def _is_yaml(text: str) -> bool:
-    return "\n" in text or ": " in text
-
-
 def is_file(given: object) -> bool:
-    """Tell whether a config is given as the file that it is read from."""
-    return isinstance(given, PathLike) or (isinstance(given, str) and not _is_yaml(given))
+    """Tell whether a config is given as the file that it is read from, and not as text in YAML."""
+    return isinstance(given, PathLike) or (isinstance(given, str) and "\n" not in given and ": " not in given)
 
 
 def recording_of(data: DataLike, units: Units | None = None, title: str = "data") -> str:

@@ -390,18 +390,8 @@ def _ignored(number: int) -> bool:
 
 @contextmanager
 def _reporting(run: Live, json: bool, watch: LiveHistory | None) -> Iterator[None]:
-    def both(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
-        seldom = _every(period, run, report)
-
-        def report_to_both(status: Status) -> None:
-            if watch is not None:
-                watch.report(status)
-            seldom(status)
-
-        return report_to_both
-
     if json:
-        run.report = both(JSON_PERIOD, lambda status: _write(status.as_json()))
+        run.report = _every(JSON_PERIOD, run, watch, lambda status: _write(status.as_json()))
         yield
         return
     from rich.live import Live as Screen
@@ -409,19 +399,26 @@ def _reporting(run: Live, json: bool, watch: LiveHistory | None) -> Iterator[Non
     console = terminal()
     try:
         with Screen(console=console, auto_refresh=False) as live_screen:
-            run.report = both(SCREEN_PERIOD, lambda status: live_screen.update(screen(status), refresh=True))
+            run.report = _every(SCREEN_PERIOD, run, watch, lambda now: live_screen.update(screen(now), refresh=True))
             yield
     finally:
         if not console.is_terminal:  # a file gets the last screen, without the end of its line
             console.line()
 
 
-def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callable[[Status], None]:
-    """Return a report that is made seldom. When no one reads it any more, the run ends: nothing measured is lost."""
+def _every(
+    period: float, run: Live, watch: LiveHistory | None, report: Callable[[Status], None]
+) -> Callable[[Status], None]:
+    """Return a report that is made seldom, and to `watch` each time.
+
+    When no one reads it any more, the run ends: nothing measured is lost.
+    """
     last = -period
 
     def seldom(status: Status) -> None:
         nonlocal last
+        if watch is not None:
+            watch.report(status)
         if time.monotonic() - last >= period:
             last = time.monotonic()
             try:

@@ -100,7 +100,7 @@ class TriadMapResult(Result):
         return [words.frame_line(self.fit), *levels, *of_family, *words.verdict(self.fit)]
 
     def _chart(self) -> Chart:
-        return words.chart(self.fit, self.unit)
+        return words.chart(self.fit)
 
     def save(
         self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False

@@ -301,11 +301,6 @@ def _page(result: VehicleResult, recordings: Sequence[str], folder: Path) -> str
     return report.page_of(result.product, recordings, sections, replace(sheet, maps=facts), result.loss, result.problem)
 
 
-def content_of(result: VehicleResult, given: Mapping[str, Any]) -> Any:
-    """Return the content of vehicle.json."""
-    return result.summary
-
-
 def show(result: VehicleResult, given: Mapping[str, Any]) -> None:
     """Print how good each map is, what is lost, and the files."""
     say_lines(result.lines())

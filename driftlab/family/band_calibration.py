@@ -44,9 +44,9 @@ GAINED = 0.05  # of a variance, that the whole soak must have taken away
 SAMPLE = 400  # units of a larger family that the bands are to be measured on
 
 
-def sample_of(count: int) -> list[int]:
-    """Return the places of the sampled units, of so many."""
-    return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int))]
+def sample_of(count: int, most: int = SAMPLE) -> list[int]:
+    """Return the places of the sampled units, of so many: at most `most`, evenly spread."""
+    return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))]
 
 
 def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
@@ -67,7 +67,7 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
-    long = long[np.unique(np.linspace(0, len(long) - 1, min(len(long), MAX_LEFT_OUT)).astype(int))]
+    long = long[sample_of(len(long), MAX_LEFT_OUT)]
     fold = np.full(len(units), -1)
     fold[long] = np.arange(len(long)) % FOLDS
     bare = units.keep("bare", _bare)
@@ -118,8 +118,7 @@ def _measured(
 def _alike(units: Partitions[Sequence[UnitOfLot]]) -> list[UnitInformation]:
     """Return some units that have rows, which tell a walk that units have alike."""
     have = [k for k, known in enumerate(one for own in units.map(_have_rows) for one in own) if known]
-    some = np.unique(np.linspace(0, len(have) - 1, ALIKE if have else 0).astype(int))
-    return [soaked for soaked, _ in units.chosen(have[k] for k in some).read()]
+    return [soaked for soaked, _ in units.chosen(have[k] for k in sample_of(len(have), ALIKE)).read()]
 
 
 def _have_rows(units: Sequence[UnitOfLot]) -> list[bool]:

@@ -82,6 +82,12 @@ class Figure(BaseModel):
     value: tuple[float | None, ...]
     sigma: tuple[float | None, ...]
 
+    @classmethod
+    def of(cls, values: Array, sigma: Array) -> Figure:
+        """Return the figure of values and their deviations (d,), None where they are not finite."""
+        both = ([float(v) if np.isfinite(v) else None for v in part] for part in (values, sigma))
+        return cls(value=tuple(next(both)), sigma=tuple(next(both)))
+
 
 class Figures(BaseModel):
     """Figures by name."""

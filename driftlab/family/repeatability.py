@@ -51,7 +51,7 @@ def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, ste
     size = np.sqrt(1 / (2 * np.arange(SHAPES) + 1))[:, None]  # rms of a Legendre polynomial
     value = np.sqrt(np.sum((size * H @ np.concatenate([rows.bias for rows in recordings])) ** 2, axis=0))
     sigma = np.sqrt(_covariance(size * H, recordings, white, walk))
-    return Figure(value=tuple(value.tolist()), sigma=tuple(sigma.tolist()))
+    return Figure.of(value, sigma)
 
 
 def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
@@ -78,7 +78,7 @@ def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
         return Figure(value=(None,) * d, sigma=(None,) * d)
     value, sigma = (np.array(part) for part in zip(*differences, strict=True))
     largest = np.argmax(value / sigma, axis=0), np.arange(d)
-    return Figure(value=tuple(value[largest].tolist()), sigma=tuple(sigma[largest].tolist()))
+    return Figure.of(value[largest], sigma[largest])
 
 
 def _curve(rows: SoakRows, at: Array, step: float) -> Array:

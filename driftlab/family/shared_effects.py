@@ -15,13 +15,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
-from driftlab.family.contrasts import EffectContrasts
 from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes
 from driftlab.family.shared_effect_search import (
     CHANCE,
     Candidate,
-    Offer,
     between_lots,
     choose,
     contrasts_of,
@@ -121,7 +119,7 @@ class _Search:
             pass
         for k in reversed(range(len(self.taken) - 1)):
             old, rivals = self.taken[k]
-            new = evaluate([old.offer], self._contrasts([old.offer], self._others(k)), self.lots)[0]
+            new = evaluate([old.offer], contrasts_of(self.sample, [old.offer], self._others(k)), self.lots)[0]
             price = float(np.log(len(self.offers))) if not old.lot else old.price
             if new.chance <= price + CHANCE or new.total <= 0:
                 del self.taken[k]
@@ -134,7 +132,7 @@ class _Search:
         kinds = {effect.kind for effect in effects if not effect.several}
         acting = any(effect.acts_on_input for effect in effects)
         offers = [o for o in self.offers if o.effect.kind not in kinds and not (acting and o.effect.acts_on_input)]
-        contrasts = self._contrasts(offers, effects)
+        contrasts = contrasts_of(self.sample, offers, effects)
         candidates = evaluate(offers, contrasts, self.lots)
         self.last = {}
         for one in candidates:
@@ -156,9 +154,6 @@ class _Search:
     def _others(self, k: int | None) -> list[Effect]:
         """Return the effects in the model, all but the k-th."""
         return [taken.effect for place, (taken, _) in enumerate(self.taken) if place != k]
-
-    def _contrasts(self, offers: list[Offer], beside: list[Effect]) -> EffectContrasts:
-        return contrasts_of(self.sample, offers, beside)
 
     def rejected(self) -> tuple[RejectedEffect, ...]:
         """Return the best of every kind that was not added in the last round, and why; and what was refused."""
@@ -183,7 +178,7 @@ class _Search:
         effects = []
         laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken])
         for k, ((taken, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
-            contrasts = self._contrasts([taken.offer], self._others(k))
+            contrasts = contrasts_of(self.sample, [taken.offer], self._others(k))
             where = np.flatnonzero([law.has(lot) for lot in self.lots])
             effects.append(
                 SharedEffect(

@@ -137,8 +137,7 @@ class UnitInformation:
             channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
             recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
         knots = SplineBasis(int(first), int(intervals), float(step))
-        low, high = file["seen"].tolist() if "seen" in file else knots.domain  # of a file from before
         return cls(
-            str(file["unit"]), tuple(file["axes"].tolist()), knots, (low, high), file["J"], file["h"],
+            str(file["unit"]), tuple(file["axes"].tolist()), knots, tuple(file["seen"].tolist()), file["J"], file["h"],
             int(file["count"]), file["white"], file["walk"], tuple(recordings),
         )  # fmt: skip

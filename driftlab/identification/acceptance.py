@@ -16,7 +16,7 @@ counts what stands on few independent rows: a left-out gain beyond 5 nats and a 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,17 +128,19 @@ def whitened(
 
 def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[LocalLevel]) -> tuple[float, float]:
     """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
+    pairs = (whitened(squares, base, term, axis, noise) for axis, noise in enumerate(noises))
+    return matched_on_axes(filter(None, pairs), len(term.effect.continuous) + int(term.free))
+
+
+def matched_on_axes(axes: Iterable[tuple[Array, Array]], parameters: int) -> tuple[float, float]:
+    """Return the same of e (n,) and Z (n, p) of each axis, both white; `parameters` is beside the coefficients."""
     wald, gain, dof, rows = 0.0, 0.0, 0, 0
-    for axis, noise in enumerate(noises):
-        both = whitened(squares, base, term, axis, noise)
-        if both is None:
-            continue
-        one = matched(*both)
-        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(both[0]))
+    for e, Z in axes:
+        one = matched(e, Z)
+        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(e))
     if dof == 0:
         return 0.0, -np.inf
-    parameters = dof + len(term.effect.continuous) + int(term.free)
-    return nats_of(wald, dof), gain - 0.5 * parameters * float(np.log(rows))
+    return nats_of(wald, dof), gain - 0.5 * (dof + parameters) * float(np.log(rows))
 
 
 def matched(e: Array, Z: Array) -> tuple[float, float, int]:

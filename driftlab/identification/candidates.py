@@ -10,19 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
-from typing import Annotated, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError
 
 from driftlab.identification.columns import EffectRegressors, Indices
-from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
 from driftlab.identification.records import with_residuals
 from driftlab.identification.state import Search, name_of
 from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.plugin import built_in
 from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, quote
 from fusion_core.host.registry import kind_of, registry
@@ -205,10 +205,6 @@ class Probe(Effect):
     def requires(self) -> tuple[str, ...]:
         """The channel, and temperature where it matters."""
         return (self.channel, "temperature") if self.form == "with temperature" else (self.channel,)
-
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself."""
-        yield self
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the probe's regressors on each axis."""

@@ -9,6 +9,7 @@ from typing import Any
 from driftlab.config import Config, maps_of
 from driftlab.units import BiasUnit
 from fusion_core.contracts import BiasModel, Effect, ThermalBias, ThermalMap
+from fusion_core.contracts.plugin import built_in
 from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 from fusion_core.units import bias_unit
@@ -40,11 +41,6 @@ def host_of(declared: BiasModel) -> ThermalBias:
             f"explain: bias model {declared.kind} takes no effects; declare {known or 'one that does'} or random_walk"
         )
     return hosts[0].from_random_walk(declared)
-
-
-def built_in(cls: type[Any]) -> bool:
-    """Return True if a plugin came with driftlab."""
-    return cls.__module__.startswith("fusion_plugins.")
 
 
 def with_map(config: Config, **update: Any) -> Config:

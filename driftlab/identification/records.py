@@ -148,7 +148,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         progress(f"reading {name}")
         journal, ends = RunLog(), dict[str, Array]()
         run = Run(with_recording(config, name), journal)
-        chunks.append(_joined(epochs(_at_rest(run, tracked.channel, ends), least), name))
+        chunks.append(_joined(epochs(_at_rest(run, ends), least), name))
         ranges.append(ends)
         first, *later = journal.alignments
         unknown = settings.length_of_input(config.site) is not None
@@ -187,7 +187,7 @@ def lengths(longest: float, least: float) -> tuple[float, float]:
     return float(fine), float(fine * max(1.0, np.ceil(longest / fine / ROWS)))
 
 
-def _at_rest(segments: Iterable[RunSegment], channel: str, ends: dict[str, Array]) -> Iterator[Chunk]:
+def _at_rest(segments: Iterable[RunSegment], ends: dict[str, Array]) -> Iterator[Chunk]:
     """Yield the epochs at which the unit stood still; `ends` takes the range (columns, 2) of each channel in all.
 
     Means draw these in. The model may refuse just what the effect does: its inputs were measured all the same.

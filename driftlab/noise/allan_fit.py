@@ -259,11 +259,13 @@ class ProfileTrial:
 
 def _interval(trial: ProfileTrial, theta: Array) -> tuple[float, float]:
     """Return the limits of the trial's coefficient; theta (p,) is the estimate, squared."""
-    value, visible = float(np.sqrt(theta[trial.c])), trial.visible
-    low = 0.0
-    if trial.exceeds(0.0) <= TAIL:
-        low = _bisect(lambda t: trial.exceeds(t) > TAIL, value / 30, value)
-    return low, _upper(trial, max(value, 1e-3 * visible))
+    value = float(np.sqrt(theta[trial.c]))
+    return _lower(trial, value), _upper(trial, max(value, 1e-3 * trial.visible))
+
+
+def _lower(trial: ProfileTrial, start: float) -> float:
+    """Return the value below `start` up to which so large an estimate is unlikely; 0 where it is likely without any."""
+    return 0.0 if trial.exceeds(0.0) > TAIL else _bisect(lambda t: trial.exceeds(t) > TAIL, start / 30, start)
 
 
 def _upper(trial: ProfileTrial, start: float) -> float:
@@ -279,7 +281,7 @@ def _widened(trial: ProfileTrial, low: float, high: float) -> tuple[float, float
     if trial.falls_short(high) > TAIL:
         high = _upper(trial, high)
     if low > 0 and trial.exceeds(low) > TAIL:
-        low = 0.0 if trial.exceeds(0.0) > TAIL else _bisect(lambda t: trial.exceeds(t) > TAIL, low / 30, low)
+        low = _lower(trial, low)
     return low, high
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.identification.acceptance import CHANCE, CandidateEvidence, accept, matched, nats_of
+from driftlab.identification.acceptance import CHANCE, CandidateEvidence, accept, matched_on_axes
 from driftlab.identification.candidates import candidates_of
 from driftlab.identification.columns import Indices
 from driftlab.identification.cross_validation import LeftOutPart
@@ -344,13 +344,9 @@ class _Case:
     def _fast(self, k: int, j: int, size: float) -> tuple[float, float]:
         """Return the figures of the matched filter, as `driftlab.identification.acceptance.fast_evidence`."""
         number = self._chosen(-1, k, j, size)
-        effect, wald, gain, dof = self.effects[number], 0.0, 0.0, 0
-        for axis, left in enumerate(self._white):
-            one = matched(left[:, k] + size * left[:, j], self._columns(number, axis, k, j, size))
-            wald, gain, dof = wald + one[0], gain + one[1], dof + one[2]
-        if dof == 0:
-            return 0.0, -np.inf
-        return nats_of(wald, dof), gain - 0.5 * (dof + len(effect.continuous)) * float(np.log(len(left)))
+        left = (own[:, k] + size * own[:, j] for own in self._white)
+        axes = ((e, self._columns(number, axis, k, j, size)) for axis, e in enumerate(left))
+        return matched_on_axes(axes, len(self.effects[number].continuous))
 
     def _columns(self, number: int, axis: int, k: int, j: int, size: float) -> Array:
         """Return an effect's columns (n - 1, p), the map out of them, as white."""

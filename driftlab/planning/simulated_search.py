@@ -23,7 +23,7 @@ from driftlab.config import Config
 from driftlab.identification.columns import EffectRegressors, NormalEquations
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.least_squares import LeastSquares
-from driftlab.identification.records import Evidence, Record, lengths
+from driftlab.identification.records import Evidence, Record, lengths, row_starts
 from driftlab.identification.state import Search
 from driftlab.noise.local_level import LocalLevel, one_step
 from driftlab.planning.unit_model import UnitModel
@@ -81,8 +81,7 @@ def _search(unit: UnitModel, recordings: Sequence[tuple[Array, Array, Array]], i
     records = []
     for k, (t, T, bias) in enumerate(recordings):
         chunk = Chunk(t, {"temperature": T, unit.channel: bias}, sensors=frozenset({unit.channel}))
-        number = np.floor((t - t[0] + 1e-6) / interval)
-        records.append(Record(str(k), True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0))))
+        records.append(Record(str(k), True, True, chunk, row_starts(t, interval)))
     evidence = Evidence(tuple(records), unit.channel, unit.axes, unit.unit, interval, unit.align)
     T = np.concatenate([T for _, T, _ in recordings])
     domain = float(T.min()), float(T.max())

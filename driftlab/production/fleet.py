@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -150,7 +150,8 @@ def fleet(
     )  # fmt: skip
     manifest, options = _checked(understood, str(units), options)
     read = [] if options.family is None else [options.family]
-    with _database(to) as database, fleet_folder(Path(out), read, store) as folder:
+    held = nullcontext() if to is None else closing(Database(to))  # reached before anything is computed
+    with held as database, fleet_folder(Path(out), read, store) as folder:
         plain = understood.model_copy(update={"certificate": None})  # its texts change no result
         jobs = UnitJobs(manifest, folder, plain.as_yaml(), versions_of(understood), options, report)
         command = _Command(understood, jobs, folder.mark.get("id") or (uuid4().hex if database else None))
@@ -202,16 +203,6 @@ def _check_stimulus(config: Config, manifest: Manifest) -> None:
         )
     if config.stimulus is None:
         raise ConfigError(f"{has}, and the config no stimulus; add `stimulus: {{kind: rate_table}}` with its segments")
-
-
-@contextmanager
-def _database(url: str | None) -> Iterator[Database | None]:
-    """Give the database that results go to, reached before anything is computed; None where none is asked for."""
-    if url is None:
-        yield None
-        return
-    with closing(Database(url)) as database:
-        yield database
 
 
 @contextmanager

@@ -183,7 +183,7 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
         If a recording cannot be used.
     """
     if unit.config.filter is None:
-        nothing: Figure = figure(np.full(len(unit.axes), np.nan), np.full(len(unit.axes), np.nan))
+        nothing = Figure.of(np.full(len(unit.axes), np.nan), np.full(len(unit.axes), np.nan))
         return CoastResult(
             "", in_sample=False, figures=dict.fromkeys(NAMES.values(), nothing), limits=[], notes=[], result=None
         )
@@ -211,10 +211,10 @@ def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities)
     """Return the figures of map and soak."""
     measured = of_map(fitted)
     return {
-        "residual": figure(measured["residual"].values, residual_sigma(measured["residual"].values, soaked)),
-        "noise": figure(densities.white, densities.white_sigma),
-        "walk": figure(densities.walk, densities.walk_sigma),
-        "swing": figure(measured["swing"].values, _sigma(measured["swing"])),
+        "residual": Figure.of(measured["residual"].values, residual_sigma(measured["residual"].values, soaked)),
+        "noise": Figure.of(densities.white, densities.white_sigma),
+        "walk": Figure.of(densities.walk, densities.walk_sigma),
+        "swing": Figure.of(measured["swing"].values, _sigma(measured["swing"])),
         "hysteresis": hysteresis_of(soaked.recordings, densities.white, densities.likely, soaked.knots.step),
         "soaks": soaks_of(soaked.recordings, soaked.knots.step),
     }
@@ -247,7 +247,7 @@ def repeated(config: Config, soaks: Mapping[str, str], tests: Sequence[str]) -> 
         unit = units[name]
         soaked, densities = soaked_of(name, unit.axes, unit.soak.rows(unit.fitted.record.channel))
         level = unit.fitted.bias(T).mean(axis=0)
-        own = {**figures_of(unit.fitted, soaked, densities), LEVEL: figure(level, np.full(len(level), np.nan))}
+        own = {**figures_of(unit.fitted, soaked, densities), LEVEL: Figure.of(level, np.full(len(level), np.nan))}
         try:
             own |= coasted(unit, tests, [soak], soaked.walk).figures
         except FusionError as error:
@@ -269,14 +269,8 @@ def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> d
         walked = np.minimum(walk**2 * min(HORIZONS[horizon], length) / 2, values**2)  # a map fitted on it took the rest
         positive = np.where(values > 0, values, np.nan)
         spread = 4 * (_sigma(measured) / positive) ** 2 + 4 / 3 * (walked / positive**2) ** 2 if known else values
-        coasts[NAMES[horizon]] = figure(values, _rms_sigma(values, spread))
+        coasts[NAMES[horizon]] = Figure.of(values, _rms_sigma(values, spread))
     return coasts
-
-
-def figure(values: Array, sigma: Array) -> Figure:
-    """Return a figure of values and their deviations (d,), None where they are not known."""
-    both = ([float(v) if np.isfinite(v) else None for v in part] for part in (values, sigma))
-    return Figure(value=tuple(next(both)), sigma=tuple(next(both)))
 
 
 def _sigma(measured: Measured) -> Array:

@@ -42,14 +42,7 @@ def _by_axis(values: Array, sigma: Array, known: NDArray[np.bool_]) -> dict[str,
     M, S = (np.where(known, part, np.nan)[3:12].reshape(3, 3) for part in (values, sigma))
     diagonal, off = np.diag(M), np.where(np.eye(3, dtype=bool), np.nan, M)
     columns = [(diagonal, np.diag(S)), *((off[:, j], np.where(np.isnan(off[:, j]), np.nan, S[:, j])) for j in range(3))]
-    return {
-        name: Figure(value=_known(value), sigma=_known(own))
-        for name, (value, own) in zip(TERM_FIGURES, columns, strict=True)
-    }
-
-
-def _known(values: Array) -> tuple[float | None, ...]:
-    return tuple(float(value) if np.isfinite(value) else None for value in values)
+    return {name: Figure.of(value, own) for name, (value, own) in zip(TERM_FIGURES, columns, strict=True)}
 
 
 def terms_of_units(records: Iterable[UnitRecord]) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ single readings of a thermometer show of its steps is looked at before they are 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     previous: Chunk | None = None
     carry: Chunk | None = None  # the rows of the epoch that is not over
     last = -np.inf  # its number
-    for chunk in _with_readings(_chain(first, stream)):
+    for chunk in _with_readings(chain([first], stream)):
         starts, last = _starts(chunk.t, t_0, interval, last)
         if len(starts) == 0:
             carry = chunk if carry is None else concatenate([carry, chunk])
@@ -71,11 +71,6 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
         if len(done[0]):
             yield done[0]
-
-
-def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
-    yield first
-    yield from rest
 
 
 def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:

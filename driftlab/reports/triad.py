@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ MOTIONS = {  # by the unit of the bias: a motion, its size in the unit of the er
 }
 HOURLY = {"rad/s": (3600 * 180 / np.pi, "deg an hour"), "m/s^2": (1e3, "mm/s a second")}
 FOREIGN = 1e-3  # share of units beyond which one is not of its family
+TermsOfAxis = Callable[[int], Iterable[tuple[int, str, str]]]  # place, name in a chart and role of each that is drawn
 POOR = 0.1  # of a usual size: a term that is known better is well known
 
 
@@ -162,29 +163,25 @@ def use(fit: TriadFit, unit: BiasUnit) -> str:
 
 def charts(fit: TriadFit, unit: BiasUnit) -> list[Chart]:
     """Return the charts of scale factor and misalignment, of the bias, of g-sensitivity, and of the residuals."""
-    T = fit.grid
-    values, sigma = fit.terms.at(T) * unit.factor, fit.sigma(T) * unit.factor
+    charts = [chart(fit)]
+    if fit.has_bias:
+        charts.append(_term_chart(fit, "Bias", "bias", unit_of(0, unit), lambda k: [(k, "bias", "estimate")]))
+    if len(fit.names) > len(TERMS):
+        along = [(f"force along {other}", f"series:{j}") for j, other in enumerate(AXES)]
+        terms: TermsOfAxis = lambda k: [(len(TERMS) + 3 * k + j, *along[j]) for j in range(3)]  # noqa: E731
+        charts.append(_term_chart(fit, "g-sensitivity", "g-sensitivity", unit_of(len(TERMS), unit), terms))
+    return [*charts, _residual_chart(fit, unit)]
+
+
+def _term_chart(fit: TriadFit, title: str, quantity: str, unit: tuple[str, float], terms: TermsOfAxis) -> Chart:
+    """Return terms of each axis with their bands."""
+    T, (shown, factor) = fit.grid, unit
+    values, reach = fit.terms.at(T) * factor, 2 * fit.sigma(T) * factor
 
     def lines(k: int) -> Iterator[Line]:
-        yield band(T, values[:, k], 2 * sigma[:, k], "bias")
+        return (band(T, values[:, at], reach[:, at], name, role) for at, name, role in terms(k))
 
-    bias = Chart(axis_panels(tuple(AXES), lines, "bias", unit.shown), TEMPERATURE, "Bias", "Bands: two sigma.")
-    strained = [_sensitivity_chart(fit, unit)] if len(fit.names) > len(TERMS) else []
-    return [chart(fit, unit), *([bias] if fit.has_bias else []), *strained, _residual_chart(fit, unit)]
-
-
-def _sensitivity_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
-    """Return the g-sensitivities of each axis with their bands."""
-    T, (shown, factor) = fit.grid, unit_of(len(TERMS), unit)
-    values, sigma = fit.terms.at(T) * factor, fit.sigma(T) * factor
-
-    def lines(k: int) -> Iterator[Line]:
-        for j, other in enumerate(AXES):
-            at = len(TERMS) + 3 * k + j
-            yield band(T, values[:, at], 2 * sigma[:, at], f"force along {other}", f"series:{j}")
-
-    panels = axis_panels(tuple(AXES), lines, "g-sensitivity", shown)
-    return Chart(panels, TEMPERATURE, "g-sensitivity", "Bands: two sigma.")
+    return Chart(axis_panels(tuple(AXES), lines, quantity, shown), TEMPERATURE, title, "Bands: two sigma.")
 
 
 def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
@@ -211,20 +208,16 @@ def _residual_chart(fit: TriadFit, unit: BiasUnit) -> Chart:
     return Chart((*panels, warm), "segment or placement", "Residuals", caption)
 
 
-def chart(fit: TriadFit, unit: BiasUnit) -> Chart:
+def chart(fit: TriadFit) -> Chart:
     """Return, of each axis, its scale factor and its misalignments with their bands."""
-    T = fit.grid
-    values, sigma = fit.terms.at(T), fit.sigma(T)
 
-    def lines(k: int) -> Iterator[Line]:
+    def terms(k: int) -> Iterator[tuple[int, str, str]]:
         for j, other in enumerate(AXES):
-            at = 3 + 3 * k + j
-            if fit.free[at]:
-                what = "scale" if j == k else f"misalignment to {other}"
-                yield band(T, values[:, at] * 1e3, 2 * sigma[:, at] * 1e3, what, f"series:{3 if j == k else j}")
+            if fit.free[at := 3 + 3 * k + j]:
+                yield (at, "scale", "series:3") if j == k else (at, f"misalignment to {other}", f"series:{j}")
 
-    panels = axis_panels(tuple(AXES), lines, "scale (0.1 %) and misalignment", "mrad")
-    return Chart(panels, TEMPERATURE, "Scale factor and misalignment", "Bands: two sigma.")
+    title = "Scale factor and misalignment"
+    return _term_chart(fit, title, "scale (0.1 %) and misalignment", ("mrad", 1e3), terms)
 
 
 def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Sequence[str], sheet: Sheet) -> str:

@@ -422,17 +422,12 @@ def scale_of(values: Array, *, size: bool) -> ChartScale:
 def _straightness(x: Array) -> float:
     from scipy.special import ndtri
 
-    n, core = len(x), _core(x)
+    n, core = len(x), np.sort(x[~far_out(x)])  # odd units say nothing of the law
     if np.ptp(core) == 0:
         return 0.0
     cut = (n - len(core)) // 2
     normal = ndtri((np.arange(cut, cut + len(core)) + 0.625) / (n + 0.25))
     return float(np.corrcoef(core, normal)[0, 1])
-
-
-def _core(x: Array) -> Array:
-    """Return the values in order without those that are far out: odd units say nothing of the law."""
-    return np.sort(x[~far_out(x)])
 
 
 def far_out(x: Array) -> NDArray[np.bool_]:

@@ -164,11 +164,6 @@ class _Reader:
     def _next(self) -> str | None:
         return self.tokens[self.at][0] if self.at < len(self.tokens) else None
 
-    def _take(self, *texts: str) -> bool:
-        taken = self.at < len(self.tokens) and self.tokens[self.at][1] in texts
-        self.at += taken
-        return taken
-
     def _product(self, depth: int, unit: Unit) -> Unit:
         """Multiply by what follows, up to a closing bracket or the end."""
         while self.at < len(self.tokens) and self.tokens[self.at][1] != ")":
@@ -208,8 +203,9 @@ class _Reader:
             return self._raised(self._base(depth + 1), Fraction(1, 2))
         if text == "(":
             unit = self._product(depth + 1, self._power(depth + 1))
-            if not self._take(")"):
+            if self._next() is None:  # a product goes up to a ')' or to the end
                 raise _wrong(self.whole, "a '(' has no ')'", "write as many of the one as of the other")
+            self.at += 1
             return unit
         where = "at the end" if kind == "end" else f"where '{quote(text)}' stands"
         raise _wrong(self.whole, f"the name of a unit is missing {where}", "write e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'")

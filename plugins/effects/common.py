@@ -24,6 +24,21 @@ class OfChannel(Effect):
         return (self.channel,)
 
 
+class FadingLag(Effect):
+    """An effect whose state is that of one first-order lag of `tau`, a hyper-parameter."""
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return exp(-dt / tau), 1 at the first sample of all; the memory is whether there were samples before."""
+        from fusion_core.recursions import lag_fading
+
+        return lag_fading(chunk.dt, len(chunk), self.hyper_parameters["tau"], memory is not None), True
+
+    @property
+    def memory_span(self) -> float:
+        """Of the lag."""
+        return self.hyper_parameters["tau"]
+
+
 def lag_of(chunk: Chunk, u: Array, tau: float, memory: Memory) -> tuple[Array, Memory]:
     """Return a signal u (N,) through a first-order lag, from equilibrium; the memory is the last input and output."""
     from fusion_core.recursions import lag
@@ -31,13 +46,6 @@ def lag_of(chunk: Chunk, u: Array, tau: float, memory: Memory) -> tuple[Array, M
     before, y = (u[0], u[0]) if memory is None else memory
     output = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, tau, before, y)
     return output, (float(u[-1]), float(output[-1]))
-
-
-def fading_of_lag(chunk: Chunk, tau: float, memory: Memory) -> tuple[Array, Memory]:
-    """Return exp(-dt / tau), 1 at the first sample of all; the memory is whether there were samples before."""
-    from fusion_core.recursions import lag_fading
-
-    return lag_fading(chunk.dt, len(chunk), tau, memory is not None), True
 
 
 def auxiliary(recordings: Sequence[Chunk]) -> list[str]:

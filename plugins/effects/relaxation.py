@@ -12,14 +12,14 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import OfChannel, auxiliary, fading_of_lag, lag_of, longest_span, up_to
+from fusion_plugins.effects.common import FadingLag, OfChannel, auxiliary, lag_of, longest_span, up_to
 
 _SHORTEST, _LONGEST = 20.0, 36_000.0  # s
 _OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
 _OF_SPAN = 0.5  # longest time constant to try, of the longest recording: beyond, it is the channel itself
 
 
-class Relaxation(OfChannel):
+class Relaxation(FadingLag, OfChannel):
     """u - lag(u): what of the channel u a first-order lag tau has not followed yet; or, where it acts late, lag(u)."""
 
     continuous: ClassVar = {"tau": 2.0}
@@ -68,19 +68,10 @@ class Relaxation(OfChannel):
         u, tau = Reading(self.channel), float(self.tau)
         return (lagged(u, tau) if self.form == "late" else Behind(u, tau),)
 
-    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the factors of the lag."""
-        return fading_of_lag(chunk, self.tau, memory)
-
     @property
     def variant(self) -> str:
         """Its form."""
         return self.form
-
-    @property
-    def memory_span(self) -> float:
-        """Of its lag."""
-        return float(self.tau)
 
     @property
     def units(self) -> tuple[str, ...]:

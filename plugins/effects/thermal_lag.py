@@ -12,10 +12,10 @@ from fusion_core.contracts import Effect, Memory
 from fusion_core.contracts.effect import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import fading_of_lag, lag_of
+from fusion_plugins.effects.common import FadingLag, lag_of
 
 
-class ThermalLag(Effect):
+class ThermalLag(FadingLag):
     """The map sees the temperature through a first-order lag tau; no coefficient."""
 
     continuous: ClassVar = {"tau": 2.0}
@@ -52,15 +52,6 @@ class ThermalLag(Effect):
     def realised_input(self, temperature: Signal) -> Signal:
         """Return the lagged temperature."""
         return lagged(temperature, float(self.tau))
-
-    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the factors of the lag, where the map is straight nearby."""
-        return fading_of_lag(chunk, self.tau, memory)
-
-    @property
-    def memory_span(self) -> float:
-        """Of the lag."""
-        return float(self.tau)
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -53,11 +53,6 @@ def corrections(sensor: Calibrated) -> Corrections:
     ConfigError
         If no exponent makes it better than none.
     """
-    if len(sensor.axes) != 1:
-        raise ConfigError(
-            f"export ardupilot: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one; give the map of one "
-            "barometer"
-        )
     low, high = sensor.fitted.domain
     T = np.linspace(low, high, TEMPERATURES)
     curve = sensor.fitted.bias(T)[:, 0]

@@ -247,13 +247,18 @@ def _without_repeats(parameters: Sequence[Parameter]) -> list[Parameter]:
 
 def kind_of(kinds: Sequence[Kind], sensor: Calibrated, exporter: str, corrected: str) -> Kind:
     """Return the firmware's kind of a sensor, by its unit; raises ConfigError with `corrected`, the kinds in words."""
-    for kind in kinds:
-        if same_dimension(sensor.unit, kind.unit):
-            return kind
-    raise ConfigError(
-        f"export {exporter}: the map of the {sensor.channel} is in {sensor.unit or 1}, {corrected}; give the map of "
-        "one of those"
-    )
+    kind = next((kind for kind in kinds if same_dimension(sensor.unit, kind.unit)), None)
+    if kind is None:
+        raise ConfigError(
+            f"export {exporter}: the map of the {sensor.channel} is in {sensor.unit or 1}, {corrected}; give the map "
+            "of one of those"
+        )
+    if len(kind.axes) == 1 and len(sensor.axes) != 1:
+        raise ConfigError(
+            f"export {exporter}: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one; give the map of "
+            "one barometer"
+        )
+    return kind
 
 
 def read_back(

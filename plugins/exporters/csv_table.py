@@ -11,13 +11,12 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Exporter, Loss, SensorLoss, beyond_a_map
 from fusion_core.errors import ConfigError
 from fusion_core.escaping import csv_cell, csv_comment
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.exporters.mat import rows_of
+from fusion_plugins.exporters.mat import between, rows_of
 
 DIGITS = ".9g"
 
@@ -42,11 +41,8 @@ class CsvTable(Exporter):
         header = ["temperature", *(f"{name}_{axis}" for name in ("bias", "sigma") for axis in first.axes)]
         cells = np.column_stack([T, fitted.bias(T), fitted.sigma(T)])
         rows = [[format(value, DIGITS) for value in row] for row in cells]
-        knots, *biases = np.array(rows, dtype=np.float64).T[: 1 + len(first.axes)]
-
-        def straight(T: Array) -> Array:
-            return np.stack([np.interp(T, knots, bias) for bias in biases], axis=1)
-
+        written = np.array(rows, dtype=np.float64)
+        straight = between(written[:, 0], written[:, 1 : 1 + len(first.axes)], "linear")
         _, effects = beyond_a_map(first)
         loss = Loss((SensorLoss.measured(first, straight),), ("what is beyond the first and the last row", *effects))
         head = [

@@ -122,11 +122,6 @@ class Px4(Autopilot):
         """Return the polynomial of a sensor, and of a gyro the constant offset that is zero beside it."""
         kind = autopilot.kind_of(SENSORS, sensor, self.kind, CORRECTED)
         device = self._device(sensor, kind)
-        if len(kind.axes) == 1 and len(sensor.axes) != 1:
-            raise ConfigError(
-                f"export px4: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one; give the map of one "
-                "barometer"
-            )
         low, high = (np.float32(end) for end in sensor.fitted.domain)
         T_ref = np.float32((low + high) / 2)
 

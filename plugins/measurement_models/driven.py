@@ -16,7 +16,6 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import pydantic
 
 from fusion_core import contracts
 from fusion_core import units as quantities
@@ -26,7 +25,7 @@ from fusion_core.settings import Settings
 from fusion_core.statespace import Block
 from fusion_core.thermal.record_texts import Name
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.measurement_models.held import Held, unit_of
+from fusion_plugins.measurement_models.held import Held
 
 RATE = 1.0  # in SI: of the input that is made up
 
@@ -51,14 +50,9 @@ class Driven(Held):
     matrix: MatrixStates = MatrixStates()
     """Scale factor and misalignment."""
 
-    @pydantic.model_validator(mode="wrap")
     @classmethod
-    def _in_its_own_unit(cls, data: Any, handler: pydantic.ModelWrapValidatorHandler[Self]) -> Self:
-        """Read the quantities of the section in the unit of its noise; its axes are those of a triad."""
-        if not isinstance(data, dict):
-            return handler(data)
-        with quantities.bias_unit(*unit_of(data.get("noise"))):
-            return handler(data)
+    def _usual_axes(cls, channel: Any) -> tuple[str, ...]:
+        return quantities.usual_axes()  # those of a triad
 
     @classmethod
     def examples(cls) -> Iterable[Self]:

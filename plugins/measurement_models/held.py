@@ -83,11 +83,13 @@ class Held(contracts.MeasurementModel):
         """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
         if not isinstance(data, dict):
             return handler(data)
-        with (
-            quantities.bias_unit(*unit_of(data.get("noise"))),
-            quantities.section_axes((contracts.axis_of(str(data.get("channel"))),)),
-        ):
+        axes = cls._usual_axes(data.get("channel"))
+        with quantities.bias_unit(*unit_of(data.get("noise"))), quantities.section_axes(axes):
             return handler(data)
+
+    @classmethod
+    def _usual_axes(cls, channel: Any) -> tuple[str, ...]:
+        return (contracts.axis_of(str(channel)),)
 
     @pydantic.model_validator(mode="after")
     def _fits_together(self) -> Self:
