@@ -164,8 +164,8 @@ def check_limits(
     beside = [one.beside for name, one in measured.items() if one.beside and name not in declared]
     if doubts:
         beside.append(f"the recording is in doubt: {doubts[0]}")
-        doubtful = {"decision": "undecided", "needs": "the recording is in doubt"}
-        rows = [replace(row, **doubtful) if row.decision == "pass" else row for row in rows]
+        why = "the recording is in doubt"
+        rows = [replace(row, decision="undecided", needs=why) if row.decision == "pass" else row for row in rows]
     return [replace(row, beside="; ".join(beside) if row is rows[0] else "") for row in rows]
 
 

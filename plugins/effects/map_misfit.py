@@ -13,7 +13,6 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Function, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.thermal_maps.spline import splines
 
 
 class MapMisfit(Effect):
@@ -64,7 +63,14 @@ class MapMisfit(Effect):
         )
 
     def _splines(self, temperature: Array) -> Array:
-        return splines((self.low, self.high), self.intervals, temperature)
+        from scipy.interpolate import BSpline
+
+        step = (self.high - self.low) / self.intervals
+        beyond = step * np.arange(1, 4)
+        inside = np.linspace(self.low, self.high, self.intervals + 1)
+        knots = np.concatenate([self.low - beyond[::-1], inside, self.high + beyond])
+        T = np.clip(temperature, self.low, self.high)
+        return np.asarray(BSpline.design_matrix(T, knots, 3).toarray())
 
     @property
     def terms(self) -> tuple[str, ...]:

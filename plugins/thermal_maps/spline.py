@@ -93,7 +93,7 @@ class _Fits:
 
     def smoother(self, blocks: Blocks, grid: Array, axis: int) -> Array:
         shares = blocks.shares(self.bins.of_sample, len(self.bins.T))
-        return np.asarray(splines(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
+        return np.asarray(_basis(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
 
 
 class Spline(contracts.ThermalMap):
@@ -109,7 +109,7 @@ class Spline(contracts.ThermalMap):
         """Return the B-splines, with the penalty on their coefficients' second differences."""
         count = self._count(domain)
         D = np.diff(np.eye(count + 3), n=2, axis=0)
-        return contracts.Basis(lambda T: splines(domain, count, T), D.T @ D)
+        return contracts.Basis(lambda T: _basis(domain, count, T), D.T @ D)
 
     def _count(self, domain: tuple[float, float]) -> int:
         return int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
@@ -142,8 +142,8 @@ class Spline(contracts.ThermalMap):
         domain = (float(T.min()), float(T.max()))
         count = self._count(domain)
         bins = bin_samples(T, bias, count * _BINS)
-        B = splines(domain, count, bins.T)
-        breaks = splines(domain, count, np.linspace(*domain, count + 1))
+        B = _basis(domain, count, bins.T)
+        breaks = _basis(domain, count, np.linspace(*domain, count + 1))
         lambdas = LAMBDAS if self.smoothing is None else np.array([self.smoothing])
         axes = zip(bins.bias.T, bins.variance.T, strict=True)
         return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, lambdas, breaks) for y, variance in axes])
@@ -151,7 +151,7 @@ class Spline(contracts.ThermalMap):
     def from_curve(self, T: Array, bias: Array, record: contracts.MapRecord) -> SplineMap:
         """Return the spline that is nearest to the points."""
         count = self._count(record.domain)
-        coefficients = np.asarray(np.linalg.lstsq(splines(record.domain, count, T), bias, rcond=None)[0])
+        coefficients = np.asarray(np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0])
         record = record.model_copy(update={"kind": self.kind})
         return SplineMap(record, coefficients, np.zeros((count + 1, record.d)), outside=self.outside)
 
@@ -186,8 +186,7 @@ def _knots(domain: tuple[float, float], count: int) -> Array:
     return np.concatenate([low - step[::-1], np.linspace(low, high, count + 1), high + step])
 
 
-def splines(domain: tuple[float, float], count: int, T: Array) -> Array:
-    """Return the cubic B-splines (N, count + 3) on equal intervals at T (N,), beyond the domain those at its ends."""
+def _basis(domain: tuple[float, float], count: int, T: Array) -> Array:
     from scipy.interpolate import BSpline
 
     return np.asarray(BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3).toarray())
