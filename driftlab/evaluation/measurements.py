@@ -36,6 +36,8 @@ LONGER = "a longer stimulus would decide it, or larger rates"
 WHOLE = "`driftlab allan` measures it over the whole of a recording"
 SHORTEST = 1.0  # s, of an average
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
+WHITE_ALIKE, ALIKE = -0.5, -0.4  # correlation of neighbouring differences of white noise; with more it is not white
+SURE = 4.0  # deviations of such a correlation, 1 / sqrt(n)
 Less = Callable[[Mapping[str, Array]], Array]
 
 
@@ -288,8 +290,18 @@ class Averages:
         if n < MIN_SAMPLES:
             text = f"{n * self.step:.4g} s at rest in a row; record {MIN_SAMPLES * self.step:.4g} s or more"
             return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
-        variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
-        measured = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
+        steps = np.where(
+            pairs[:, None], np.diff(rows[:, 3:] / time, axis=0) / np.sqrt(1 / time[1:] + 1 / time[:-1]), 0.0
+        )
+        square = np.sum(steps**2, axis=0)
+        alike = np.max(np.sum(steps[1:] * steps[:-1], axis=0) / np.maximum(square, np.finfo(float).tiny))
+        if alike > ALIKE and (alike - WHITE_ALIKE) * np.sqrt(n) > SURE:
+            text = (
+                f"neighbouring averages of {self.step:.3g} s are alike (differences correlate by {alike:.2f}, those of "
+                f"white noise by {WHITE_ALIKE}): filtered or interpolated data do not show it"
+            )
+            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
+        measured = Measured(np.sqrt(square / n), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
         return normal(measured, measured.values * np.sqrt(0.75 / n), n * self.step)
 
     def _rows(self) -> Array:

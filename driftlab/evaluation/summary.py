@@ -13,6 +13,7 @@ from driftlab.evaluation.overview import ScoredRun, map_of
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_remarks
+from driftlab.units import axis_name
 from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest
 from fusion_core.contracts import FittedMap
@@ -20,6 +21,7 @@ from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
 COMPLETE = 0.9  # of the time: a score that stands on less says why
+FAR_OFF = 4.0  # deviations of a prediction: a right model is off by more in one axis of 10,000
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
 Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
@@ -62,7 +64,7 @@ def summarise(run: ScoredRun) -> dict[str, Any]:
 def remarks(run: ScoredRun) -> list[str]:
     """Return the remarks on a run for its user, one sentence each."""
     overview, model, journal = run.overview, run.model, run.journal
-    lines = [*journal.faults.lines(), *_rejected(run), *_scored(run)]
+    lines = [*journal.faults.lines(), *_rejected(run), *_scored(run), *_mispredicted(run)]
     first, *again = journal.alignments
     if again:
         when = f"at {moment(again[0].t, journal.faults.first_row)}"
@@ -173,6 +175,23 @@ def _scored(run: ScoredRun) -> list[str]:
             "in between the error is taken to go straight"
         )
     return lines
+
+
+def _mispredicted(run: ScoredRun) -> list[str]:
+    """Return the longest prediction that is off by far more than its deviation, and what may be the cause."""
+    scores, unit = run.yardsticks, run.unit
+    for name in LONGEST_FIRST:
+        ratio = scores.coast[name] / np.maximum(scores.coast_sigma[name], np.finfo(float).tiny)
+        if np.any(ratio > FAR_OFF):
+            k = int(np.nanargmax(ratio))
+            axis = axis_name(run.sensor.channel, scores.axes[k])
+            by = f"{axis} {scores.coast[name][k] * unit.factor:.3g} {unit.shown}"
+            return [
+                f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma, so map or walk do not fit this "
+                "recording; check that unit, axes and thermometer are those of the map, else `driftlab explain` looks "
+                "for what is missing"
+            ]
+    return []
 
 
 def error_rows(runs: Sequence[Scores]) -> Rows:

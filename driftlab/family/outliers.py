@@ -21,7 +21,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from functools import partial
+from itertools import chain, combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +42,7 @@ from driftlab.family.outlier_tests import (
     tests_of,
     unscaled,
 )
-from driftlab.family.partitions import FamilyUnits, in_partitions
+from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
 from driftlab.family.reml import Index
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
@@ -140,7 +141,19 @@ def find_outliers(
     read = zip(places.tolist(), p, reported, units.chosen(places).read(), strict=True)
     odd = {soaked.unit: words.of(k, own, passed, soaked, lot) for k, own, passed, (soaked, lot) in read}
     lots = _odd_lots(family, tests, unit) if fitted else ()
-    return Outliers(odd, tests.laws, _not_judged(family, tests, known=not fitted), lots)
+    elsewhere = chain.from_iterable(units.map(partial(_elsewhere, family.knots.domain)))
+    return Outliers(odd, tests.laws, [*_not_judged(family, tests, known=not fitted), *elsewhere], lots)
+
+
+def _elsewhere(domain: tuple[float, float], units: Sequence[UnitOfLot]) -> list[str]:
+    """Return a sentence on each unit that saw none of the family's temperatures, degC."""
+    low, high = domain
+    return [
+        f"Unit {soaked.unit} was soaked from {soaked.seen[0]:.3g} to {soaked.seen[1]:.3g} °C, where the family has "
+        "nothing: its curve is not judged, and not in the family."
+        for soaked, _ in units
+        if soaked.seen[1] < low or soaked.seen[0] > high
+    ]
 
 
 def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:

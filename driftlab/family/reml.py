@@ -339,8 +339,9 @@ def _alone(axis: int, units: OfAxes) -> tuple[Array, Array]:
     q = J.shape[1]
     bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
     size = np.trace(J, axis1=1, axis2=2)[:, None, None] / q
+    size = np.where(size > 0, size, 1.0)  # a unit that saw nothing of the family's temperatures says nothing
     own = np.linalg.solve(J + 1e-6 * size * (bend.T @ bend + 1e-4 * np.eye(q)), h[..., None])[..., 0]
-    return own, np.diagonal(J, axis1=1, axis2=2)
+    return np.asarray(own), np.diagonal(J, axis1=1, axis2=2)
 
 
 def _nearest(expected: EStep) -> Array:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from driftlab.config import Limits
 from driftlab.evaluation.limits import SIDE, check_limits, outcome, verdict
@@ -151,6 +152,18 @@ def test_the_noise_of_a_run_is_of_all_that_was_at_rest():
     np.testing.assert_allclose(found.high - found.values, SIDE * found.values * np.sqrt(0.75 / 5999), rtol=0.01)
     short = averaged(rest(600, np.random.default_rng(2)), 600).noise()
     assert short.missing == "59 s at rest in a row; record 100 s or more"
+
+
+@pytest.mark.parametrize(("rows", "measured"), [
+    (lambda white: white, True),
+    (lambda white: white + np.cumsum(0.02 * white, axis=0), True),  # a walk
+    (lambda white: lfilter([0.005], [1, -0.995], white, axis=0), False),  # a low pass of 20 s
+    (lambda white: np.repeat(white[::100], 100, axis=0) + 0.1 * white, False),  # 0.1 Hz held at 10 Hz
+])  # fmt: skip
+def test_the_noise_of_filtered_or_interpolated_rates_is_not_measured(rows, measured):
+    block = rest(36_000, np.random.default_rng(5))
+    block["rate"] = rows(block["rate"])
+    assert (averaged(block, 7000).noise().missing == "") is measured
 
 
 def rest(N, rng, tau=0.1, bias=0.0):

@@ -83,6 +83,15 @@ def test_no_reference_no_heading_error():
     assert found.moved == pytest.approx(1.0)
 
 
+def test_a_prediction_far_beyond_its_sigma_is_named_and_one_within_is_not():
+    coast = {**SCORES.coast, "to the end": np.array([1.0, 34.0, 2.0])}
+    (line,) = said(replace(QUIET, yardsticks=replace(SCORES, coast=coast)), journal())
+    assert line.startswith("prediction, to the end: off by gyro y ")
+    assert "34 times its sigma" in line
+    near = {**SCORES.coast, "to the end": np.array([1.0, 3.5, 2.0])}
+    assert said(replace(QUIET, yardsticks=replace(SCORES, coast=near)), journal()) == []
+
+
 def test_a_score_without_a_value_says_why():
     scores = replace(SCORES, filter_first=np.full(3, np.nan), share={**SCORES.share, "first 30 s": 0.1})
     (line,) = said(replace(QUIET, yardsticks=scores), journal())

@@ -312,3 +312,18 @@ def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
     reasons = CurveReasons(CurveStatistics(family, fitted=True), judged.laws)
     (bend,) = reasons.of(*family.information_of(gap), units[7].lot, (0,))
     assert abs(bend.off) > 2 * bend.spread
+
+
+def test_a_unit_whose_thermometer_is_in_kelvin_leaves_the_family_as_it_is_and_is_named() -> None:
+    units = made.deal("polynomial", 30, 25, size=SIZE)
+    pairs = [(unit.soaked(25, ("x",)), unit.lot) for unit in units]
+    (rows,) = pairs[-1][0].recordings
+    own = replace(rows, T=rows.T + 273.15)
+    elsewhere = UnitInformation.of("kelvin", ("x",), [own], pairs[-1][0].white, pairs[-1][0].walk, 2.5)
+    clean, family = fit_family(pairs[:-1]), fit_family([*pairs[:-1], (elsewhere, pairs[-1][1])])
+    assert family.knots == clean.knots
+    assert np.max(np.abs(family.mu - clean.mu)) < 0.05 * SIZE
+    outliers = find_outliers(family, [*pairs[:-1], (elsewhere, pairs[-1][1])], [])
+    assert "kelvin" not in outliers.odd
+    (line,) = (text for text in outliers.remarks if "kelvin" in text)
+    assert "where the family has nothing" in line
