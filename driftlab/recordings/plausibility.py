@@ -1,4 +1,4 @@
-"""Readings that no sensor gives: two axes that are one column, a thermometer that stands still, jumps or is in kelvin.
+"""Readings that no sensor gives: an axis that copies another, or stays at the end of its range; thermometers that fail.
 
 What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit passes on them.
 """
@@ -21,6 +21,7 @@ LASTING = 60.0  # s that it stands, at least
 JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
+AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the rows next to it: at least
 KELVIN = (200.0, 450.0)  # degC: colder there is no kelvin, and hotter no sensor
 
 
@@ -41,9 +42,38 @@ class Copies:
                 continue
             before, same[i, j] = same[i, j], same[i, j] + int(np.count_nonzero(np.diff(values[:, i])))
             if before < LIVELY <= same[i, j]:
-                axes = sensor.axes if sensor is not None and len(sensor.axes) == values.shape[1] else "xyz?"
-                one, other = (axis_name(name, axes[k]) for k in (i, j))
+                one, other = (_axis(name, sensor, k, values.shape[1]) for k in (i, j))
                 self.faults.doubt(f"{other} shows what {one} shows, row by row; correct source.channels.{name}.path")
+
+
+class Rails:
+    """Count of the largest and the smallest readings of each axis: at the end of its range it shows the very same.
+
+    `table` (2, d, 4) is largest reading, its count, the next one, its count, of the readings and with their sign
+    reversed.
+    """
+
+    def __init__(self, name: str, sensor: Sensor | None, d: int) -> None:
+        self.name, self.sensor = name, sensor
+        self.table = np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, d, 1))
+
+    def judge(self, faults: Faults) -> None:
+        """Note a doubt about each axis that was at an end of its range, where none is declared."""
+        sensor, (high, low) = self.sensor, self.table
+        if sensor is not None and sensor.range:
+            return
+        for which, side, sign in (("largest", high, 1), ("smallest", low, -1)):
+            for k, (value, count, _, below) in enumerate(side):
+                if count >= AT_END * faults.rows and count >= LIVELY and count > STEEP * below:
+                    unit, section = ("in SI", "filter.gyro") if sensor is None else (sensor.unit, sensor.section)
+                    faults.doubt(
+                        f"{_axis(self.name, sensor, k, len(side))} shows exactly {sign * value:.6g} {unit}, its "
+                        f"{which} reading, in {count:.0f} rows: that looks like the end of its range; set {section}.range to it"
+                    )
+
+
+def _axis(name: str, sensor: Sensor | None, k: int, d: int) -> str:
+    return axis_name(name, (sensor.axes if sensor is not None and len(sensor.axes) == d else "xyz".ljust(d, "?"))[k])
 
 
 class Thermometer:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.recordings.plausibility import Copies, Thermometer
+from driftlab.recordings.plausibility import Copies, Rails, Thermometer
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
@@ -37,7 +37,7 @@ def read(
     gaps, look = Gaps(faults), getattr(_suspect, "py_func", _suspect) if few else _suspect
     chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
     runs: dict[str, Array] = {}
-    copies, thermometer = Copies(faults), Thermometer(faults)
+    copies, thermometer, rails = Copies(faults), Thermometer(faults), dict[str, Rails]()
     empty = True
     for chunk in chunks:
         taken = sorted(DERIVED & set(chunk.channels))
@@ -53,8 +53,9 @@ def read(
             sensor = (sensors or {}).get(name)
             copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
-            before = runs.get(name, np.zeros(chunk[name].shape[1]))
-            suspect, runs[name] = look(chunk[name], _value_before(chunk, name), before, limit)
+            d = chunk[name].shape[1]
+            before, ends = runs.get(name, np.zeros(d)), rails.setdefault(name, Rails(name, sensor, d))
+            suspect, runs[name] = look(chunk[name], _value_before(chunk, name), before, limit, ends.table)
             if not suspect:
                 continue
             repeats = _repeats(chunk, name, before)
@@ -65,6 +66,8 @@ def read(
             empty = False
             faults.usable += len(kept)
             yield kept
+    for ends in rails.values():
+        ends.judge(faults)
     if empty:
         raise EmptyRecording(
             f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
@@ -129,10 +132,11 @@ class Gaps:
 
 
 @compiled
-def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
+def _suspect(values: Array, last: Array, carried: Array, limit: float, rails: Array) -> tuple[bool, Array]:
     """Return True if any value (N, d) is stuck or beyond the limit, and the length of each axis' repetition (d,).
 
-    One pass over what is nearly always good; `_repeats` says where it is not, in NumPy.
+    One pass over what is nearly always good; `_repeats` says where it is not, in NumPy. `rails` (2, d, 4) goes on: the
+    largest value and how often it was there, the next one and how often, of the readings and with their sign reversed.
     """
     suspect, runs = False, np.empty(values.shape[1])
     for j in range(values.shape[1]):
@@ -141,6 +145,19 @@ def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[
             run = run + 1.0 if values[k, j] == value else 1.0
             value = values[k, j]
             suspect |= run >= STUCK or abs(value) >= limit
+            for side in range(2):
+                reading = value if side == 0 else -value
+                if reading < rails[side, j, 2]:
+                    continue  # nearly always
+                if reading > rails[side, j, 0]:
+                    rails[side, j, 2], rails[side, j, 3] = rails[side, j, 0], rails[side, j, 1]
+                    rails[side, j, 0], rails[side, j, 1] = reading, 1.0
+                elif reading == rails[side, j, 0]:
+                    rails[side, j, 1] += 1.0
+                elif reading > rails[side, j, 2]:
+                    rails[side, j, 2], rails[side, j, 3] = reading, 1.0
+                else:
+                    rails[side, j, 3] += 1.0
         runs[j] = run
     return suspect, runs
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import Copies, Thermometer
+from driftlab.recordings.plausibility import Copies, Rails, Thermometer
+from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 
@@ -95,3 +96,38 @@ def test_axes_that_are_alike_for_a_while_or_stand_still_are_no_copies():
     faults = Faults()
     Copies(faults).look(Chunk(np.arange(N) * DT, {"gyro": values}), "gyro", None)
     assert faults.doubts == []
+
+
+def ends(values, size=999):
+    """Return the doubts of readings (N, 1) that come in chunks."""
+    faults, rails = Faults(rows=len(values)), Rails("gyro", None, 1)
+    for start in range(0, len(values), size):
+        _suspect(values[start : start + size], np.full(1, np.nan), np.zeros(1), np.inf, rails.table)
+    rails.judge(faults)
+    return faults.doubts
+
+
+NOISE = RNG.normal(size=(N, 1))
+READINGS = {
+    "fine": NOISE,
+    "steps of one sigma": np.rint(NOISE),
+    "steps of a third": np.rint(NOISE * 3),
+    "steps of a fortieth": np.rint(NOISE * 40),
+    "steps of two sigma, on a curve": np.rint(NOISE / 2 + RAMP[:, None] / 10),
+    "a curve without noise": RAMP[:, None],
+    "a fifth is zero": np.where(np.arange(N)[:, None] % 5, NOISE, 0.0),
+}
+
+
+@pytest.mark.parametrize("values", READINGS.values(), ids=READINGS)
+def test_steps_and_curves_are_no_end_of_a_range(values):
+    assert ends(values) == []
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_axis_at_the_end_of_its_range_is_named(sign):
+    (text,) = ends(np.minimum(NOISE, 1.5) * sign)
+    which = "largest" if sign > 0 else "smallest"
+    assert text.startswith(
+        f"gyro x shows exactly {1.5 * sign} in SI, its {which} reading, in {np.sum(NOISE >= 1.5)} rows"
+    )

@@ -118,7 +118,7 @@ def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
     chunk = Chunk(np.arange(400.0), {"gyro": values}, before)
     carried = np.zeros(2) if first else np.array([STUCK - 20.0, 3.0])
     last = np.full(2, np.nan) if first else np.zeros(2)
-    suspect, runs = _suspect(values, last, carried, level)
+    suspect, runs = _suspect(values, last, carried, level, np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 2, 1)))
     repeats = _repeats(chunk, "gyro", carried)
     assert suspect == bool(np.any(repeats >= STUCK) or np.any(np.abs(values) >= level))
     np.testing.assert_array_equal(runs, repeats[-1])
