@@ -68,7 +68,7 @@ class Rails:
                     unit, section = ("in SI", "filter.gyro") if sensor is None else (sensor.unit, sensor.section)
                     faults.doubt(
                         f"{_axis(self.name, sensor, k, len(side))} shows exactly {sign * value:.6g} {unit}, its "
-                        f"{which} reading, in {count:.0f} rows: that looks like the end of its range; set {section}.range to it"
+                        f"{which} reading, in {count:.0f} rows: as at the end of its range; set {section}.range"
                     )
 
 
