@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3816
+    assert 0 < count <= 3820
 
 
 def imports():
@@ -257,37 +257,37 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 634,
-    "driftlab/commands": 3754,
-    "driftlab/evaluation": 1471,
-    "driftlab/family": 3259,
-    "driftlab/filtering": 1248,
-    "driftlab/identification": 2201,
+    "driftlab/commands": 3747,
+    "driftlab/evaluation": 1499,
+    "driftlab/family": 3268,
+    "driftlab/filtering": 1265,
+    "driftlab/identification": 2197,
     "driftlab/live": 848,
     "driftlab/maps": 1806,
-    "driftlab/noise": 1215,
-    "driftlab/planning": 1259,
-    "driftlab/production": 3149,
+    "driftlab/noise": 1220,
+    "driftlab/planning": 1254,
+    "driftlab/production": 3135,
     "driftlab/products": 6,
-    "driftlab/recordings": 466,
-    "driftlab/reports": 3524,
-    "driftlab/soak": 618,
-    "driftlab/spc": 1522,
+    "driftlab/recordings": 586,
+    "driftlab/reports": 3519,
+    "driftlab/soak": 633,
+    "driftlab/spc": 1520,
     "driftlab/starter": 871,
     "driftlab/storage": 1278,
     "driftlab/triad": 592,
-    "fusion_core": 1860,
+    "fusion_core": 1864,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 823,
     "fusion_core/host": 748,
     "fusion_core/testing": 1002,
     "fusion_core/thermal": 1151,
-    "fusion_core/units": 431,
+    "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 254,
-    "plugins/effects": 749,
-    "plugins/exporters": 1754,
+    "plugins/effects": 743,
+    "plugins/exporters": 1747,
     "plugins/framings": 641,
-    "plugins/measurement_models": 775,
+    "plugins/measurement_models": 771,
     "plugins/sources": 5410,
     "plugins/stimuli": 288,
     "plugins/thermal_maps": 897,
