@@ -268,7 +268,7 @@ BUDGET = {
     "driftlab/planning": 1254,
     "driftlab/production": 3135,
     "driftlab/products": 6,
-    "driftlab/recordings": 586,
+    "driftlab/recordings": 593,
     "driftlab/reports": 3519,
     "driftlab/soak": 633,
     "driftlab/spc": 1520,

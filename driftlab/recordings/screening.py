@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +34,8 @@ def read(
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
-    gaps, look = Gaps(faults), getattr(_suspect, "py_func", _suspect) if few else _suspect
+    gaps, screen = Gaps(faults), _Screen(faults, sensors or {}, few=few)
     chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
-    runs: dict[str, Array] = {}
-    copies, thermometer, rails = Copies(faults), Thermometer(faults), dict[str, Rails]()
     empty = True
     for chunk in chunks:
         taken = sorted(DERIVED & set(chunk.channels))
@@ -46,32 +44,47 @@ def read(
                 f"channel '{taken[0]}': the program uses this name itself; rename it under source.channels"
             )
         chunk = _with_sensors(chunk, sensors)
-        keep = np.ones(len(chunk), dtype=bool)
-        if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
-            thermometer.look(chunk)
-        for name in (name for name in chunk.channels if name in chunk.sensors):
-            sensor = (sensors or {}).get(name)
-            copies.look(chunk, name, sensor)
-            limit = 0.999 * ((sensor and sensor.range) or np.inf)
-            d = chunk[name].shape[1]
-            before, ends = runs.get(name, np.zeros(d)), rails.setdefault(name, Rails(name, sensor, d))
-            suspect, runs[name] = look(chunk[name], _value_before(chunk, name), before, limit, ends.table)
-            if not suspect:
-                continue
-            repeats = _repeats(chunk, name, before)
-            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
-                keep &= ~_report(chunk, name, sensor, what, bad, faults)
+        keep = screen.keep(chunk)
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
             empty = False
             faults.usable += len(kept)
             yield kept
-    for ends in rails.values():
+    for ends in screen.rails.values():
         ends.judge(faults)
     if empty:
         raise EmptyRecording(
             f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
         )
+
+
+class _Screen:
+    """A look at all samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
+
+    def __init__(self, faults: Faults, sensors: Mapping[str, Sensor], *, few: bool) -> None:
+        self.faults, self.sensors = faults, sensors
+        self.look = getattr(_suspect, "py_func", _suspect) if few else _suspect
+        self.copies, self.thermometer = Copies(faults), Thermometer(faults)
+        self.runs: dict[str, Array] = {}  # length of the repetition of each axis
+        self.rails: dict[str, Rails] = {}
+
+    def keep(self, chunk: Chunk) -> Flags:
+        """Return the rows (N,) that can be used."""
+        keep = np.ones(len(chunk), dtype=np.bool_)
+        if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
+            self.thermometer.look(chunk)
+        for name in (name for name in chunk.channels if name in chunk.sensors):
+            sensor, d = self.sensors.get(name), chunk[name].shape[1]
+            self.copies.look(chunk, name, sensor)
+            limit = 0.999 * ((sensor and sensor.range) or np.inf)
+            before, ends = self.runs.get(name, np.zeros(d)), self.rails.setdefault(name, Rails(name, sensor, d))
+            suspect, self.runs[name] = self.look(chunk[name], _value_before(chunk, name), before, limit, ends.table)
+            if not suspect:
+                continue
+            repeats = _repeats(chunk, name, before)
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
+                keep &= ~_report(chunk, name, sensor, what, bad, self.faults)
+        return keep
 
 
 def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
