@@ -16,6 +16,7 @@ from driftlab.config import Config, with_recording
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
+from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Index, Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
@@ -245,6 +246,10 @@ def gather(
     both = (smooth, [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
+    if config.filter is not None:
+        tracked, named = config.filter.tracked, [c.source.name if c.source else "" for c in configs]
+        for text in contradictions([p.T for p in parts], [p.bias for p in parts], named, tracked.channel, tracked.axes):
+            faults.doubt(text)
     names = [c.source.name for c in configs if c.source is not None]
     placements, unknown = None, None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is not None and np.ptp(T) > 0:
