@@ -66,9 +66,12 @@ class Rails:
             for k, (value, count, _, below) in enumerate(side):
                 if count >= AT_END * faults.rows and count >= LIVELY and count > STEEP * below:
                     unit, section = ("in SI", "filter.gyro") if sensor is None else (sensor.unit, sensor.section)
+                    why = "as where zero stands for lost samples; name their flag as channel `valid`"
+                    if value != 0:
+                        why = f"as at the end of its range; set {section}.range"
                     faults.doubt(
                         f"{_axis(self.name, sensor, k, len(side))} shows exactly {sign * value:.6g} {unit}, its "
-                        f"{which} reading, in {count:.0f} rows: as at the end of its range; set {section}.range"
+                        f"{which} reading, in {count:.0f} rows: {why}"
                     )
 
 

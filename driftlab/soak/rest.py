@@ -30,7 +30,7 @@ from driftlab.filtering.setup import (
 )
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
+from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor
 from fusion_core.faults import Faults
 from fusion_core.thermal.rate_estimators import with_rate
 
@@ -39,6 +39,7 @@ SHORTEST = 10.0  # s of rest about a motion, at least
 BEFORE = 30.0  # s before a window that show the level, at most
 LATELY = 600.0  # s over which a rate of the temperature is forgotten
 FAR = 2.0  # K: over more, a stretch may bend as no one curve of it does
+LOUD, ENOUGH = 3.0, 20  # times the usual noise, over so many epochs at least: more than temperature makes
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
@@ -124,7 +125,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             yield RestStretch(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
         return
     channel = model.tracked.channel
-    squares, counted = np.zeros(len(model.tracked.axes)), 0  # of measured over declared noise, and of how many epochs
+    noise: list[tuple[float, int, Array]] = []  # temperature, epochs, measured over declared noise of each stretch
     others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
     cutting = _Cutting(config, model, others, used)
@@ -137,7 +138,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             refused -= len(part)
             model.check(part, config.site)
             alignment = model.aligned(corrected(part, others), config.site)
-            squares, counted = squares + len(part) * alignment.noise_ratio[channel] ** 2, counted + len(part)
+            noise.append((float(np.mean(part["temperature"])), len(part), alignment.noise_ratio[channel]))
             if placing is not None:
                 alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])
             moved = False
@@ -150,11 +151,28 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             used.moving += refused
             used.first = used.first or f"at {faults.when(window.t[0])}"
             faults.add("epochs in stretches with motion, left out", refused, f"at {faults.when(window.t[0])}")
-    if counted:
-        ratios = np.sqrt(squares / counted)
-        for line in noise_remarks(model.tracked, ratios, OFF):
-            faults.note(line)
-        faults.doubts += noise_doubts(model.tracked, ratios)
+    if noise:
+        T, count, ratios = (np.array(column) for column in zip(*noise, strict=True))
+        _judge_noise(model.tracked, T, count, ratios, faults)
+
+
+def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults: Faults) -> None:
+    """Note the noise of a sensor where it is not as declared, or not the same at all temperatures.
+
+    Of K stretches: temperature T (K,) in degC, number of epochs (K,), measured over declared noise (K, d).
+    """
+    whole = np.sqrt(epochs @ ratios**2 / np.sum(epochs))
+    for line in noise_remarks(sensor, whole, OFF):
+        faults.note(line)
+    faults.doubts += noise_doubts(sensor, whole)
+    over = np.max(ratios / np.maximum(np.median(ratios, axis=0), np.finfo(float).tiny), axis=1)
+    loud = (over > LOUD) & (epochs >= ENOUGH)
+    if np.sum(epochs[loud]) >= NOTED * np.sum(epochs):
+        faults.doubt(
+            f"{sensor.channel}: noise is {np.median(over[loud]):.2g} times the usual between {np.min(T[loud]):.3g} and "
+            f"{np.max(T[loud]):.3g} °C ({np.sum(epochs[loud]) / np.sum(epochs):.0%} of the rest), as of vibration, "
+            "which moves the bias too; find what shakes the unit there, or leave that part out with PATH::START:STOP"
+        )
 
 
 class _Cutting:

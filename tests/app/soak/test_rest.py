@@ -151,3 +151,16 @@ def test_an_axis_in_another_unit_than_its_noise_is_named(factor, noted):
     for line in lines:
         assert "or correct unit and path of source.channels.gyro" in line
         assert float(line.split("declared: y ")[1].split(")")[0]) == pytest.approx(factor, rel=0.05)
+
+
+@pytest.mark.parametrize(("factor", "noted"), [(1.0, False), (2.0, False), (5.0, True)])
+def test_noise_that_is_larger_in_one_range_of_temperature_is_a_doubt(factor, noted):
+    faults = Faults()
+    t, T, rates = soak(MEMS, 22, 1.0)
+    rates[:, 0] += (
+        np.where((T > -10) & (T < 0), factor, 0.0) * MEMS / np.sqrt(DT) * np.random.default_rng(3).normal(size=len(t))
+    )
+    list(at_rest(config(MEMS), [of(t, T, rates)], faults))
+    texts = [text for text in faults.doubts if "as of vibration" in text]
+    assert len(texts) == noted
+    assert all("between -9" in text and "and -0" in text for text in texts)
