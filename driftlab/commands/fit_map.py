@@ -21,6 +21,7 @@ from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
+from driftlab.evaluation.overview import DOUBT
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings, usual_settings
 from driftlab.maps.kind_selection import KindComparison, candidates, divide
@@ -80,6 +81,8 @@ class FitMapResult(Result):
     ) -> None:
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted, self.comparison = verdict.map, comparison
+        if faults.doubts:
+            fitted = fitted.noting(provenance={**fitted.record.provenance, DOUBT: faults.doubts[0]})
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.measured = of_map(fitted, self.unit)

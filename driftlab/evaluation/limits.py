@@ -163,8 +163,8 @@ def check_limits(
     rows = [_result(name, limit, measured.get(name)) for name, limit in declared.items()]
     beside = [one.beside for name, one in measured.items() if one.beside and name not in declared]
     if doubts:
-        beside.append(f"the recording is in doubt: {doubts[0]}")
-        why = "the recording is in doubt"
+        beside.append(f"in doubt: {doubts[0]}")
+        why = "the recording, or its map, is in doubt"
         rows = [replace(row, decision="undecided", needs=why) if row.decision == "pass" else row for row in rows]
     return [replace(row, beside="; ".join(beside) if row is rows[0] else "") for row in rows]
 

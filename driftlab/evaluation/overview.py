@@ -35,6 +35,7 @@ from fusion_core.model import Flags
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
 STRETCHES = 400  # of which the figures show errors, two points each, and mean nis; up to twice as many
+DOUBT = "doubt"  # in the provenance of a map: why its soak may not be what its config said
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
@@ -365,8 +366,11 @@ class ScoredRun:
         """The limits of the config, each held against its measurement."""
         if self.config.limits is None:
             return []
-        noise = noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
-        return check_limits(self.config.limits, self.measured, [*self.journal.faults.doubts, *noise])
+        doubts = [*self.journal.faults.doubts]
+        doubts += noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
+        if (fitted := map_of(self.config)) is not None and (why := fitted.record.provenance.get(DOUBT)):
+            doubts.append(f"the soak of its map: {why}")
+        return check_limits(self.config.limits, self.measured, doubts)
 
 
 def accumulator_of(run: Run) -> OverviewAccumulator:
