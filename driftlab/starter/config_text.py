@@ -28,6 +28,7 @@ UNITS_OF = {
     "temperature": ("degC", "degF", "K"),
 }  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
+QUIET = 20.0  # times less noise than the others of a triad: more than sensors of one kind differ by
 AXES = tuple(str.maketrans("xX", pair) for pair in ("xX", "yY", "zZ"))
 
 
@@ -83,7 +84,11 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return replace(_starter(lines, asked), questions=questions, problems=tuple(map(line, unread_of(columns, channels))))
+    return replace(
+        _starter(lines, asked),
+        questions=questions,
+        problems=tuple(map(line, [*unread_of(columns, channels), *_quiet(channels)])),
+    )
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
@@ -233,6 +238,21 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
         if sensor == "gyro" and "temperature" in channels.found:
             fitted = f"{{kind: spline, path: {yaml_text(map_name)}}}"
             yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
+
+
+def _quiet(channels: Channels) -> Iterator[str]:
+    """Yield a sentence on each axis that has far less noise than the others of its sensor."""
+    for sensor in SENSORS:
+        channel, noise = channels.found.get(sensor), channels.noise.get(sensor)
+        if channel is None or noise is None:
+            continue
+        usual = float(np.median(noise.white))
+        for axis, white in zip(channel.axes, noise.white, strict=True):
+            if QUIET * white < usual:
+                yield (
+                    f"{sensor} {axis} has {usual / white:,.0f} times less noise than the others: it is in another "
+                    f"unit, or no sensor is there; correct source.channels.{sensor}"
+                )
 
 
 def _in_units(sensor: str, noise: QuickNoise, unit: str) -> tuple[str, str]:

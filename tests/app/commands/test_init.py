@@ -558,3 +558,12 @@ def test_a_clock_that_was_set_back_is_a_time_and_a_problem(tmp_path):
     done = written(tmp_path, table(LOGS["short"]) | {"t": np.where(UNIT.t > UNIT.t[4000], UNIT.t - 1, UNIT.t)})
     assert "time: {path: t, unit: s}" in done.text
     assert done.problems[0].startswith("time runs backwards by 0.95 s, 200 s after the first row: sort the rows, or")
+
+
+@pytest.mark.parametrize(("factor", "problems"), [(1.0, 0), (5.0, 0), (1e-3, 1)])
+def test_an_axis_with_far_less_noise_than_the_others_is_a_problem(tmp_path, factor, problems):
+    content = table(LOGS["short"])
+    done = written(tmp_path, content | {"gy": content["gy"] * factor})
+    quiet = [text for text in done.problems if "less noise than the others" in text]
+    assert len(quiet) == problems
+    assert all(text.startswith(("gyro y has 1,0", "gyro y has 9")) for text in quiet)
