@@ -18,6 +18,7 @@ from fusion_core.faults import Faults
 LIVELY = 100  # changes of a reading that show its habit
 STUCK = 100  # times its longest repetition before: a thermometer that repeats a reading for longer is stuck
 LASTING = 60.0  # s that it stands, at least
+ENOUGH = 1000  # rows that are looked at together: a live source has one at a time
 JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
@@ -35,7 +36,9 @@ class Copies:
     def look(self, chunk: Chunk, name: str, sensor: Sensor | None) -> None:
         """Look at the next rows of a sensor (N, d)."""
         values = chunk[name]
-        same = self._same.setdefault(name, dict.fromkeys(combinations(range(values.shape[1]), 2), 0))
+        if name not in self._same:
+            self._same[name] = dict.fromkeys(combinations(range(values.shape[1]), 2), 0)
+        same = self._same[name]
         for i, j in list(same):
             if not np.array_equal(values[:100, i], values[:100, j]) or not np.array_equal(values[:, i], values[:, j]):
                 del same[i, j]
@@ -84,18 +87,28 @@ class Thermometer:
 
     def __init__(self, faults: Faults) -> None:
         self.faults = faults
+        self._parts: list[tuple[Array, Array]] = []  # times in s and readings that are not looked at yet
+        self._rows = 0  # of these; and one that was looked at before them
         self.changes = self.longest = self.run = 0  # changes, rows of the longest repetition, and of the present one
         self.since = np.nan  # when that began, s
         self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
         self.fast = False  # whether it has moved faster than any
 
     def look(self, chunk: Chunk) -> None:
-        """Look at the next temperatures (N,), in degC."""
-        t, T = chunk.t, chunk["temperature"]
-        if chunk.previous is not None:
-            t, T = np.append(chunk.previous.t[-1:], t), np.append(chunk.previous["temperature"][-1:], T)
+        """Take the next temperatures (N,), in degC, and look at them once there are enough."""
+        self._parts.append((chunk.t, chunk["temperature"]))
+        self._rows += len(chunk)
+        if self._rows >= ENOUGH or chunk.t[-1] - self._parts[0][0][0] > LASTING:
+            self.flush()
+
+    def flush(self) -> None:
+        """Look at all that came."""
+        if not self._rows:
+            return
+        t, T = (np.concatenate(column) for column in zip(*self._parts, strict=True))
+        known, self._parts, self._rows = len(t) - self._rows, [(t[-1:], T[-1:])], 0
         steps = np.abs(np.diff(T))
-        self._repeats(t, T, np.flatnonzero(steps) + 1, known=len(t) - len(chunk))
+        self._repeats(t, T, np.flatnonzero(steps) + 1, known)
         if np.max(steps, initial=0.0) > JUMP:
             self._jumps(t, T, steps)
         self._range(t, T)

@@ -50,6 +50,7 @@ def read(
             empty = False
             faults.usable += len(kept)
             yield kept
+    screen.thermometer.flush()
     for ends in screen.rails.values():
         ends.judge(faults)
     if empty:
@@ -77,8 +78,10 @@ class _Screen:
             sensor, d = self.sensors.get(name), chunk[name].shape[1]
             self.copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
-            before, ends = self.runs.get(name, np.zeros(d)), self.rails.setdefault(name, Rails(name, sensor, d))
-            suspect, self.runs[name] = self.look(chunk[name], _value_before(chunk, name), before, limit, ends.table)
+            if name not in self.runs:
+                self.runs[name], self.rails[name] = np.zeros(d), Rails(name, sensor, d)
+            before, table = self.runs[name], self.rails[name].table
+            suspect, self.runs[name] = self.look(chunk[name], _value_before(chunk, name), before, limit, table)
             if not suspect:
                 continue
             repeats = _repeats(chunk, name, before)

@@ -16,11 +16,10 @@ RAMP = 20 + 30 * np.sin(np.arange(N) * DT / 1500)
 def doubts(T, size=7000, dt=DT):
     """Return the doubts of temperatures (N,), which come in chunks of `size`."""
     faults = Faults(first_row=0.0)
-    thermometer, t, previous = Thermometer(faults), np.arange(len(T)) * dt, None
+    thermometer, t = Thermometer(faults), np.arange(len(T)) * dt
     for start in range(0, len(T), size):
-        chunk = Chunk(t[start : start + size], {"temperature": T[start : start + size]}, previous)
-        thermometer.look(chunk)
-        previous = Chunk(chunk.t[-1:], {"temperature": chunk["temperature"][-1:]})
+        thermometer.look(Chunk(t[start : start + size], {"temperature": T[start : start + size]}))
+    thermometer.flush()
     return faults.doubts
 
 
