@@ -180,7 +180,7 @@ def _scored(run: ScoredRun) -> list[str]:
 def _mispredicted(run: ScoredRun) -> list[str]:
     """Return the longest prediction that is off by far more than its deviation, and what may be the cause."""
     scores, unit = run.yardsticks, run.unit
-    for name in LONGEST_FIRST:
+    for name in () if len(run.journal.alignments) > 1 else LONGEST_FIRST:  # one that was turned is another matter
         ratio = scores.coast[name] / np.maximum(scores.coast_sigma[name], np.finfo(float).tiny)
         if np.any(ratio > FAR_OFF):
             k = int(np.nanargmax(ratio))
@@ -188,8 +188,8 @@ def _mispredicted(run: ScoredRun) -> list[str]:
             by = f"{axis} {scores.coast[name][k] * unit.factor:.3g} {unit.shown}"
             return [
                 f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma, so map or walk do not fit this "
-                "recording; check that unit, axes and thermometer are those of the map, else `driftlab explain` looks "
-                "for what is missing"
+                "recording; check that unit, axes and thermometer are those of the map, and see with driftlab explain "
+                "what is missing"
             ]
     return []
 
