@@ -263,7 +263,7 @@ BUDGET = {
     "driftlab/filtering": 1265,
     "driftlab/identification": 2197,
     "driftlab/live": 848,
-    "driftlab/maps": 1811,
+    "driftlab/maps": 1815,
     "driftlab/noise": 1220,
     "driftlab/planning": 1254,
     "driftlab/production": 3135,

@@ -246,11 +246,8 @@ def gather(
     both = (smooth, [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
-    if config.filter is not None:
-        tracked, named = config.filter.tracked, [c.source.name if c.source else "" for c in configs]
-        for text in contradictions([p.T for p in parts], [p.bias for p in parts], named, tracked.channel, tracked.axes):
-            faults.doubt(text)
     names = [c.source.name for c in configs if c.source is not None]
+    _compare(config, parts, names, faults)
     placements, unknown = None, None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is not None and np.ptp(T) > 0:
         first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
@@ -271,6 +268,16 @@ def gather(
         used,
         steps,
     )
+
+
+def _compare(config: Config, parts: Sequence[_Samples], names: Sequence[str], faults: Faults) -> None:
+    """Note doubts about recordings that contradict the others."""
+    if config.filter is None or len(names) < len(parts):
+        return
+    tracked = config.filter.tracked
+    T, bias = [part.T for part in parts], [part.bias for part in parts]
+    for text in contradictions(T, bias, names, tracked.channel, tracked.axes):
+        faults.doubt(text)
 
 
 def _joined(times: Sequence[Array], interval: float) -> Array:
