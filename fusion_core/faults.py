@@ -17,6 +17,7 @@ from fusion_core.errors import EmptyRecording, TimeBackwards, moment
 
 LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
 RANGES = {"temperature": (-273.15, 5000.0, "degC")}  # of what can be; a logger writes -999 where it has nothing
+DOUBT = "doubt"  # in the provenance of a map: why its soak may not be what its config said
 LOST = "samples lost on the way, by the device's counter"
 NO_FRAME = "bytes that came for a second or more without a frame, check baudrate and framing"
 
@@ -81,10 +82,11 @@ class Faults:
         """Return the seconds from the first row to t, in the recording's own seconds."""
         return t - (self.first_row or 0.0)
 
-    def lines(self, *, notes: bool = True) -> list[str]:
-        """Return one sentence for each kind of fault, and each note, where those are wanted too."""
+    def lines(self, *, notes: bool = True, doubts: bool = True) -> list[str]:
+        """Return one sentence for each kind of fault, and each note and doubt, where those are wanted too."""
         faults = list(self.found.items())  # at once: of a live run, another thread may ask
-        return [fault.line(what) for what, fault in faults if fault.count or notes]
+        wanted = [(what, fault) for what, fault in faults if doubts or what not in self.doubts]
+        return [fault.line(what) for what, fault in wanted if fault.count or notes]
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:

@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3820
+    assert 0 < count <= 3822
 
 
 def imports():
@@ -257,25 +257,25 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 634,
-    "driftlab/commands": 3750,
+    "driftlab/commands": 3747,
     "driftlab/evaluation": 1503,
     "driftlab/family": 3268,
     "driftlab/filtering": 1265,
     "driftlab/identification": 2197,
     "driftlab/live": 848,
-    "driftlab/maps": 1815,
+    "driftlab/maps": 1818,
     "driftlab/noise": 1220,
     "driftlab/planning": 1254,
     "driftlab/production": 3135,
     "driftlab/products": 6,
     "driftlab/recordings": 610,
-    "driftlab/reports": 3519,
+    "driftlab/reports": 3520,
     "driftlab/soak": 697,
     "driftlab/spc": 1520,
     "driftlab/starter": 888,
     "driftlab/storage": 1278,
     "driftlab/triad": 592,
-    "fusion_core": 1864,
+    "fusion_core": 1866,
     "fusion_core/contracts": 1955,
     "fusion_core/fast": 823,
     "fusion_core/host": 748,

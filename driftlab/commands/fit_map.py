@@ -21,7 +21,6 @@ from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
-from driftlab.evaluation.overview import DOUBT
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings, usual_settings
 from driftlab.maps.kind_selection import KindComparison, candidates, divide
@@ -81,8 +80,6 @@ class FitMapResult(Result):
     ) -> None:
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted, self.comparison = verdict.map, comparison
-        if faults.doubts:
-            fitted = fitted.noting(provenance={**fitted.record.provenance, DOUBT: faults.doubts[0]})
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.measured = of_map(fitted, self.unit)
@@ -107,7 +104,7 @@ class FitMapResult(Result):
 
     def lines(self) -> list[str]:
         """Return the verdict on the map, and the notes on its recordings, a sentence each."""
-        return [*self.verdict.sentences(self.unit), *self.faults.lines()]
+        return [*self.verdict.sentences(self.unit), *self.faults.lines(doubts=False)]
 
     def _chart(self) -> Chart:
         """Return samples and curve over temperature, the residuals, how sure it is and on how many samples."""
@@ -127,7 +124,7 @@ class FitMapResult(Result):
         save(self.map, path, COMMAND)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        texts = [page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison)]
+        texts = [page_of(self.verdict, self.unit, self.faults.lines(doubts=False), sheet, self.comparison)]
         if selection is not None:
             drawn = figure_of(map_selection.chart(selection, self.unit))
             texts += [text_of(map_selection.selection_document(selection, self.unit)), svg(drawn)]
@@ -140,10 +137,10 @@ class FitMapResult(Result):
     def _certificate(self, sheet: Sheet) -> Certificate:
         verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
         soak = verdict.soak if len(set(paths)) == len(paths) else None  # parts of one recording are no power-ups
-        remark = verdict.used.sentence() if verdict.used else None
+        remarks = [*verdict.doubts, *filter(None, [verdict.used.sentence() if verdict.used else None])]
         return Certificate(
             COMMAND, self.config, sheet, self.limits, self.measured, self.map, soak, verdict.placements,
-            self.map.record.lasted, remarks=[remark] if remark else [],
+            self.map.record.lasted, remarks=remarks,
         )  # fmt: skip
 
 
@@ -270,7 +267,7 @@ def _fitted(
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, soak, more)
-    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
+    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

@@ -30,12 +30,12 @@ from fusion_core.chunk import Array
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor, ThermalBias
 from fusion_core.fast import compiled
+from fusion_core.faults import DOUBT
 from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
 STRETCHES = 400  # of which the figures show errors, two points each, and mean nis; up to twice as many
-DOUBT = "doubt"  # in the provenance of a map: why its soak may not be what its config said
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",

@@ -33,6 +33,7 @@ from driftlab.soak.rest import Used
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.faults import DOUBT
 
 GRID = 400
 
@@ -46,6 +47,7 @@ class MapVerdict:
     soak: SoakSummary
     placements: Placements | None = None  # of the unit, where its input is known by its length alone
     used: Used | None = None  # share of the soak that is used; None where that is not known
+    doubts: Sequence[str] = ()  # why the soak may not be what its config says (`Faults.doubts`)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -59,8 +61,9 @@ class MapVerdict:
 
     @cached_property
     def map(self) -> FittedMap:
-        """The map with the soak's evidence for memories in its record, for those who judge by its file."""
-        return self.fitted.noting(memory=self.memory.as_json())
+        """The map with the soak's evidence for memories and doubts in its record, for those who judge by its file."""
+        provenance = {**self.fitted.record.provenance, **({DOUBT: self.doubts[0]} if self.doubts else {})}
+        return self.fitted.noting(memory=self.memory.as_json(), provenance=provenance)
 
     @cached_property
     def T(self) -> Array:
@@ -90,11 +93,11 @@ class MapVerdict:
         return coverage_of(self.soak, self.fitted, self.good)
 
     def sentences(self, unit: BiasUnit) -> list[str]:
-        """Return the verdict in words, the decisive one first: that much of the soak is not used, where it is so."""
+        """Return the verdict in words, the decisive one first: doubts, or that much of the soak is not used."""
         unused = "" if self.used is None else self.used.sentence()
         placements = [] if self.placements is None else sentences(self.placements, self.axes, unit)
         good, *level = self._good(unit)
-        lines = [unused] if unused else []
+        lines = [*(f"in doubt: {text}" for text in self.doubts), *([unused] if unused else [])]
         lines += [good, memory_sentence(self.memory, self.axes, unit), *level, *placements]
         return [*lines, *self._misfits(unit), *self._coverage(unit)]
 

@@ -205,7 +205,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "plugins": participants(unit.config),
     }
     if task.page:
-        files |= pages_of(unit, run, soaks, faults.lines(), files[unit.file])
+        files |= pages_of(unit, run, soaks, faults.lines(doubts=False), files[unit.file])
     if task.explain:
         record["loop"] = loop_of(config, recordings, files)
     return record, files

@@ -142,7 +142,7 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus:
         with_bias = _with_map(config, settings, fitted)
         triad = fit_triad_map(with_bias, stimulus, "scale,misalignment", None, None, None)
         fitted = triad.map
-    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used)
+    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
     return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict, triad)
 
 

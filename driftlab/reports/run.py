@@ -98,7 +98,8 @@ def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[
     trust = (
         f"its sigma{of} there is {unit.number(sigma)} {unit.shown}, the error {ratio:.1f} times that, which {verdict}"
     )
-    turned = f"{name} without updates turn the heading by {np.rad2deg(scores.heading[name]):.2g} deg; " * heading
+    angle = float(np.rad2deg(scores.heading[name])) if heading else np.nan  # without gravity no axis is known as up
+    turned = f"{name} without updates turn the heading by {angle:.2g} deg; " if np.isfinite(angle) else ""
     return f"{result}.", f"{turned}{trust}."
 
 

@@ -29,6 +29,7 @@ def test_no_limit_passes_on_a_copied_axis_or_with_a_map_of_one(tmp_path, copied)
     decided = {row.name: row.decision for row in fitted.limits if row.measured}
     assert decided == dict.fromkeys(("residual", "swing"), "undecided" if copied else "pass")
     assert ("in doubt: gyro y shows what gyro x shows" in fitted.limits_verdict) is copied
+    assert fitted.lines()[0].startswith("in doubt: gyro y shows what gyro x shows") is copied  # before any number
     found = driftlab.run(config, recording(1, copied=False))
     assert outcome(found.verdict) == ("undecided" if copied else "pass")
     assert ("in doubt: the soak of its map: gyro y shows" in found.verdict) is copied

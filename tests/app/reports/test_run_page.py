@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -15,7 +16,7 @@ import driftlab
 from driftlab.commands.run import show
 from driftlab.evaluation.overview import POINTS, STRETCHES
 from driftlab.reports.charts import content
-from driftlab.reports.run import bias_chart, error_chart, map_chart, nis_chart
+from driftlab.reports.run import bias_chart, error_chart, map_chart, nis_chart, result_sentences
 from driftlab.units import RATE
 
 CONFIG = """
@@ -222,3 +223,10 @@ def test_what_is_drawn_over_temperature_has_no_loop_that_the_unit_has_not(run):
     off = dots.y / RATE.factor - thermal_bias(dots.x)[:, 1]
     # 1.54e-5 rad/s/sqrt(Hz) over 30 s is 2.8e-6, the means about a turn 3e-6; the smoothed temperature makes 4e-5
     assert np.sqrt(np.nanmean((off - np.nanmean(off)) ** 2)) < 8e-6
+
+
+def test_without_an_axis_that_is_known_as_up_nothing_is_said_of_the_heading(run):
+    scores = run.overview.yardsticks
+    unknown = replace(scores, heading=dict.fromkeys(scores.heading, np.nan))
+    assert "turn the heading by" in result_sentences(scores, RATE, heading=True)[1]
+    assert "heading" not in result_sentences(unknown, RATE, heading=True)[1]
