@@ -226,7 +226,7 @@ def test_what_is_drawn_over_temperature_has_no_loop_that_the_unit_has_not(run):
 
 
 def test_without_an_axis_that_is_known_as_up_nothing_is_said_of_the_heading(run):
-    scores = run.overview.yardsticks
+    scores = run[0].overview.yardsticks
     unknown = replace(scores, heading=dict.fromkeys(scores.heading, np.nan))
     assert "turn the heading by" in result_sentences(scores, RATE, heading=True)[1]
     assert "heading" not in result_sentences(unknown, RATE, heading=True)[1]
