@@ -49,7 +49,7 @@ def planted(shape: str, period: float, size: float, seed: int) -> float:
 
 
 def none(profile: str, noise: str, step: float, rng: np.random.Generator) -> int:
-    """Return how many of three axes have a ripple that is not there; `step` of the thermometer in K, 0: fine."""
+    """Return the number of axes (of three) with a ripple that is not there; `step` in K, 0: a fine thermometer."""
     n = 14_400
     T = np.asarray(late(np.interp(np.arange(n) / n, *PROFILES[profile]), 120.0))
     left = 2 * rng.normal(size=(n, 3)) + 30 * np.sin(T / 30)[:, None]
