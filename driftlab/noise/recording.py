@@ -20,6 +20,7 @@ from driftlab.noise.allan import bridgeable, curve
 from driftlab.noise.allan_fit import Coefficients, fit
 from driftlab.noise.allan_model import PRESENT, AllanCurve
 from driftlab.recordings.epochs import GAP, epochs
+from driftlab.recordings.plausibility import axes_in
 from driftlab.recordings.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -224,7 +225,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
         waiting = {c: pool.map(each, whole[c].T) for c in whole.channels}
         curves = {c: list(of_axes) for c, of_axes in waiting.items()}
     coefficients = {c: list(map(fit, of_axes)) for c, of_axes in curves.items()}
-    axes = {c: _axes(sensors.get(c), len(of_axes)) for c, of_axes in curves.items()}
+    axes = {c: axes_in(sensors.get(c), len(of_axes)) for c, of_axes in curves.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
     if len(whole) * dt < SPARSE * total:
         faults.doubt(
@@ -237,11 +238,6 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
         notes += _grouped(c, axes[c], [one.notes for one in of_axes])
     start, plugins = float(whole.t[cut.spans[0, 0]]), participants(config.source)
     return Analysis(name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors)
-
-
-def _axes(sensor: Sensor | None, d: int) -> list[str]:
-    named = [] if sensor is None else list(sensor.axes)
-    return named if len(named) == d else list("xyz"[:d])
 
 
 def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]:

@@ -45,7 +45,8 @@ class Copies:
                 continue
             before, same[i, j] = same[i, j], same[i, j] + int(np.count_nonzero(np.diff(values[:, i])))
             if before < LIVELY <= same[i, j]:
-                one, other = (_axis(name, sensor, k, values.shape[1]) for k in (i, j))
+                axes = axes_in(sensor, values.shape[1])
+                one, other = (axis_name(name, axes[k]) for k in (i, j))
                 self.faults.doubt(f"{other} shows what {one} shows, row by row; correct source.channels.{name}.path")
 
 
@@ -66,20 +67,22 @@ class Rails:
         if sensor is not None and sensor.range:
             return
         for which, side, sign in (("largest", high, 1), ("smallest", low, -1)):
-            for k, (value, count, _, below) in enumerate(side):
+            for axis, (value, count, _, below) in zip(axes_in(sensor, len(side)), side, strict=True):
                 if count >= AT_END * faults.rows and count >= LIVELY and count > STEEP * below:
                     unit, section = ("in SI", "filter.gyro") if sensor is None else (sensor.unit, sensor.section)
                     why = "as where zero stands for lost samples; name their flag as channel `valid`"
                     if value != 0:
                         why = f"as at the end of its range; set {section}.range"
                     faults.doubt(
-                        f"{_axis(self.name, sensor, k, len(side))} shows exactly {sign * value:.6g} {unit}, its "
+                        f"{axis_name(self.name, axis)} shows exactly {sign * value:.6g} {unit}, its "
                         f"{which} reading, in {count:.0f} rows: {why}"
                     )
 
 
-def _axis(name: str, sensor: Sensor | None, k: int, d: int) -> str:
-    return axis_name(name, (sensor.axes if sensor is not None and len(sensor.axes) == d else "xyz".ljust(d, "?"))[k])
+def axes_in(sensor: Sensor | None, d: int) -> list[str]:
+    """Return the names of d axes: those that the sensor declares, where it declares as many."""
+    named = [] if sensor is None else list(sensor.axes)
+    return named if len(named) == d else list("xyz".ljust(d, "?")[:d])
 
 
 class Thermometer:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.recordings.plausibility import Copies, Rails, Thermometer
+from driftlab.recordings.plausibility import Copies, Rails, Thermometer, axes_in
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
@@ -195,8 +195,7 @@ def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:
 
 def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flags, faults: Faults) -> Flags:
     """Count the rows that have a bad value (N, d), and return which they are."""
-    axes = sensor.axes if sensor is not None and len(sensor.axes) == bad.shape[1] else "xyz".ljust(bad.shape[1], "?")
-    rows = np.asarray(np.any(bad, axis=1), dtype=np.bool_)
+    rows, axes = np.asarray(np.any(bad, axis=1), dtype=np.bool_), axes_in(sensor, bad.shape[1])
     if np.any(rows):
         k = int(np.argmax(rows))
         axis = int(np.argmax(bad[k]))

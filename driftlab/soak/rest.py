@@ -164,7 +164,8 @@ def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults:
     whole = np.sqrt(epochs @ ratios**2 / np.sum(epochs))
     for line in noise_remarks(sensor, whole, OFF):
         faults.note(line)
-    faults.doubts += noise_doubts(sensor, whole)
+    for line in noise_doubts(sensor, whole):
+        faults.doubt(line)
     over = np.max(ratios / np.maximum(np.median(ratios, axis=0), np.finfo(float).tiny), axis=1)
     loud = (over > LOUD) & (epochs >= ENOUGH)
     if np.sum(epochs[loud]) >= NOTED * np.sum(epochs):
