@@ -19,7 +19,7 @@ from dataflash_writer import write_log
 from device_frames import kvh, one, vectornav, xsens
 from scipy.io import savemat
 from typer.testing import CliRunner
-from typists import at_a_terminal
+from typists import STOP, at_a_terminal
 from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
@@ -363,7 +363,7 @@ def test_what_is_no_recording_writes_nothing(tmp_path, content, message):
     assert not (tmp_path / "rec.yaml").exists()
 
 
-ENTER, DOWN, STOP = "\r", "\x1b[B", "\x03"
+ENTER, DOWN = "\r", "\x1b[B"
 
 
 def answered(tmp_path, *keys, **environment):
