@@ -89,7 +89,7 @@ COMMANDS = (
     Command("export", "exporting", metavars={"out": "PATH"}),
     Command("vehicle", "fitting", defaults={"out": NEEDED}),
     Command("import_map", "importing", title="import", metavars={"out": "MAP"}),
-    Command("plugins", module="driftlab.commands.check", options={}),
+    Command("plugins", module="driftlab.commands.check", metavars={"family": "NAME"}, options={}),
     Command("schema", module="driftlab.commands.check", options={}),
 )
 

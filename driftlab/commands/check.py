@@ -16,6 +16,7 @@ from driftlab.filtering.setup import FORCE, check_channels, loaded_map, prior
 from driftlab.recordings.screening import head
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import FittedMap, Sensor
+from fusion_core.errors import ConfigError
 from fusion_core.host.config import quantities
 from fusion_core.host.registry import Entry, registry
 from fusion_core.host.schema import config_schema
@@ -132,11 +133,13 @@ def _unit(quantity: Quantity) -> str:
     return (quantity.unit or "").replace("delta_degC", "K")
 
 
-def plugins(*, json: bool = False, check: bool = False) -> None:
+def plugins(*, family: str | None = None, json: bool = False, check: bool = False) -> None:
     """List every plugin with its distribution, version and state.
 
     Parameters
     ----------
+    family : str, optional
+        Only those of a family, as bias_models.
     json : bool
         Print JSON for programs instead of text.
     check : bool
@@ -144,10 +147,14 @@ def plugins(*, json: bool = False, check: bool = False) -> None:
     """
     from driftlab.reports.tables import TextTable
 
+    entries = [entry for entry in registry().entries if family in (None, entry.family)]
+    if not entries:
+        known = ", ".join(sorted({entry.family for entry in registry().entries}))
+        raise ConfigError(f"--family {family}: is no family of plugins; they are {known}")
     if check:
-        _print_laws(json)
+        _print_laws(entries, json)
         return
-    entries = sorted(registry().entries, key=lambda e: (e.error is not None, e.family, e.kind))
+    entries.sort(key=lambda e: (e.error is not None, e.family, e.kind))
     if json:
         fields = ("family", "kind", "distribution", "version", "module", "error")
         print_json([{name: getattr(e, name) for name in fields} for e in entries])
@@ -179,12 +186,11 @@ def law_checks(entry: Entry) -> list[tuple[str, str | None]]:
     return [(name, law.broken()) for name, law in zip(names, examples, strict=True)]
 
 
-def _print_laws(json: bool) -> None:
+def _print_laws(entries: list[Entry], json: bool) -> None:
     """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
     from driftlab.reports.tables import TextTable
 
-    entries = sorted(registry().entries, key=lambda e: (e.family, e.kind))
-    checks = [(entry, law_checks(entry)) for entry in entries]
+    checks = [(entry, law_checks(entry)) for entry in sorted(entries, key=lambda e: (e.family, e.kind))]
     broken = [(entry.kind, law, error) for entry, results in checks for law, error in results if error is not None]
     if json:
         keys = ("family", "kind", "law", "error")
