@@ -1,5 +1,7 @@
 """Readings that no sensor gives: an axis that copies another, or stays at the end of its range; thermometers that fail.
 
+And those of a sensor that rounds to steps beside which its noise is small.
+
 What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit passes on them.
 """
 
@@ -14,6 +16,7 @@ from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Sensor
 from fusion_core.faults import Faults
+from fusion_core.thermal.thermometer import noise_before
 
 LIVELY = 100  # changes of a reading that show its habit
 STUCK = 100  # times its longest repetition before: a thermometer that repeats a reading for longer is stuck
@@ -23,6 +26,9 @@ JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is 
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
 AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the rows next to it: at least
+BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
+EXACT = 0.01  # of a step: so far changes may be from multiples of it
+MINUTE = 60.0  # s; a mean over it is to be off by no more than its noise
 KELVIN = (200.0, 450.0)  # degC: colder there is no kelvin, and hotter no sensor
 
 
@@ -77,6 +83,57 @@ class Rails:
                         f"{axis_name(self.name, axis)} shows exactly {sign * value:.6g} {unit}, its "
                         f"{which} reading, in {count:.0f} rows: {why}"
                     )
+
+
+class Rounding:
+    """Steps that the axes of a sensor round to, beside its noise before them.
+
+    The mean of many readings is off by a sine of the value, of an amplitude of q / pi exp(-2 pi^2 s^2 / q^2) for steps
+    q and noise s (Widrow and Kollar): nothing where the noise is half a step, a tenth of the noise at a third.
+    """
+
+    def __init__(self, name: str, sensor: Sensor | None, d: int) -> None:
+        self.name, self.sensor = name, sensor
+        self.step = np.full(d, np.inf)  # of which all changes are multiples; 0: of none
+        self.squares: list[Array] = []  # (B, d): mean squares of the changes in each block
+        self.dt: list[float] = []
+
+    def look(self, chunk: Chunk) -> None:
+        """Look at blocks of the next rows."""
+        if self.sensor is None or len(chunk) < BLOCK or not np.any(self.step):
+            return
+        starts = np.unique(np.linspace(0, len(chunk) - BLOCK, min(BLOCKS, len(chunk) // BLOCK)).astype(np.intp))
+        changes = np.abs(np.diff(chunk[self.name][starts[:, None] + np.arange(BLOCK)], axis=1))
+        self.squares.append(np.mean(changes**2, axis=1))
+        self.dt.append(float(np.median(np.diff(chunk.t))))
+        least = np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf)
+        step = np.minimum(self.step, least)
+        known = np.where(np.isfinite(self.step), self.step, 0.0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            times = np.vstack([changes.reshape(-1, len(step)), known]) / step
+            odd = np.max(np.abs(times - np.rint(times)), axis=0, where=np.isfinite(times), initial=0.0)
+        self.step = np.where(odd < EXACT, step, 0.0)
+
+    def judge(self, faults: Faults) -> None:
+        """Note a doubt about each axis whose means are off by more than the noise of a minute."""
+        if self.sensor is None or not self.squares:
+            return
+        each = np.concatenate(self.squares) / 2
+        at_rest = each <= np.maximum(4 * np.median(each, axis=0), self.step**2 / 3)  # or between two steps
+        variances = np.mean(each, axis=0, where=at_rest)
+        minute = np.maximum(np.sqrt(variances * float(np.median(self.dt))), self.sensor.noise) / np.sqrt(MINUTE)
+        steps = zip(axes_in(self.sensor, len(self.step)), self.step, variances, minute, strict=True)
+        for axis, q, variance, noise in steps:
+            if not 0 < q < np.inf:
+                continue
+            s = noise_before(float(q), float(variance))
+            off = q / np.pi * np.exp(-2 * (np.pi * s / q) ** 2)
+            if off > np.sqrt(2) * noise:
+                faults.doubt(
+                    f"{axis_name(self.name, axis)} rounds to steps of {q:.3g} {self.sensor.unit}, and its noise before "
+                    f"them is {s / q:.2g} of one: a mean is off by up to {off:.2g} {self.sensor.unit}, which no "
+                    "averaging takes out; choose a smaller range of the sensor, or more digits of its file"
+                )
 
 
 def axes_in(sensor: Sensor | None, d: int) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.recordings.plausibility import Copies, Rails, Thermometer, axes_in
+from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
@@ -51,8 +51,9 @@ def read(
             faults.usable += len(kept)
             yield kept
     screen.thermometer.flush()
-    for ends in screen.rails.values():
-        ends.judge(faults)
+    for looks in (screen.rails, screen.roundings):
+        for look in looks.values():
+            look.judge(faults)
     if empty:
         raise EmptyRecording(
             f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
@@ -68,6 +69,7 @@ class _Screen:
         self.copies, self.thermometer = Copies(faults), Thermometer(faults)
         self.runs: dict[str, Array] = {}  # length of the repetition of each axis
         self.rails: dict[str, Rails] = {}
+        self.roundings: dict[str, Rounding] = {}
 
     def keep(self, chunk: Chunk) -> Flags:
         """Return the rows (N,) that can be used."""
@@ -80,6 +82,8 @@ class _Screen:
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             if name not in self.runs:
                 self.runs[name], self.rails[name] = np.zeros(d), Rails(name, sensor, d)
+                self.roundings[name] = Rounding(name, sensor, d)
+            self.roundings[name].look(chunk)
             before, table = self.runs[name], self.rails[name].table
             suspect, self.runs[name] = self.look(chunk[name], _value_before(chunk, name), before, limit, table)
             if not suspect:

@@ -166,7 +166,8 @@ def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults:
         faults.note(line)
     for line in noise_doubts(sensor, whole):
         faults.doubt(line)
-    over = np.max(ratios / np.maximum(np.median(ratios, axis=0), np.finfo(float).tiny), axis=1)
+    usual = np.median(ratios, axis=0)
+    over = np.max(np.divide(ratios, usual, out=np.zeros_like(ratios), where=usual > 0), axis=1)
     loud = (over > LOUD) & (epochs >= ENOUGH)
     if np.sum(epochs[loud]) >= NOTED * np.sum(epochs):
         faults.doubt(

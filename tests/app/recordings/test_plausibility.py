@@ -1,9 +1,11 @@
 """Readings that no sensor gives are doubts; those of ordinary sensors, coarse ones and steady ones are none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import Copies, Rails, Thermometer
+from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer
 from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
@@ -130,3 +132,43 @@ def test_an_axis_at_the_end_of_its_range_is_named(sign):
     assert text.startswith(
         f"gyro x shows exactly {1.5 * sign} in SI, its {which} reading, in {np.sum(NOISE >= 1.5)} rows"
     )
+
+
+def rounded(values, dt, noise):
+    """Return the doubts of readings (N,) of a gyro whose declared noise has this density."""
+    faults, sensor = Faults(), SimpleNamespace(axes="x", unit="rad/s", noise=np.array([noise]))
+    rounding = Rounding("gyro", sensor, 1)
+    for start in range(0, N, 9_999):
+        part = values[start : start + 9_999, None]
+        rounding.look(Chunk(np.arange(len(part)) * dt, {"gyro": part}))
+    rounding.judge(faults)
+    return faults.doubts
+
+
+@pytest.mark.parametrize("rate", [1, 100])
+@pytest.mark.parametrize("step", [0.5, 1.0, 2.0, 2.75, 4.5, 8.0])
+def test_steps_that_noise_does_not_average_out_are_named(rate, step):
+    """The error of a mean is that of a million readings, at values all over one step."""
+    bias = np.linspace(0.0, step, 20)[:, None]
+    off = np.max(np.abs(np.mean(np.rint((bias + RNG.normal(size=(20, 50_000))) / step) * step, axis=1) - bias[:, 0]))
+    values = np.rint((NOISE[:, 0] + 10 * np.sin(np.arange(N) / 6000)) / step) * step
+    found = rounded(values, 1 / rate, 1 / np.sqrt(rate))
+    assert bool(found) is bool(off > np.sqrt(2) / np.sqrt(60 * rate))
+    for text in found:
+        stated = float(text.partition("off by up to ")[2].split()[0])
+        assert 0.7 * off < stated < 1.4 * off
+
+
+STEADY = {
+    "a curve": RAMP,
+    "noise": NOISE[:, 0],
+    "single precision": NOISE[:, 0].astype(np.float32).astype(float),
+    "nothing": np.zeros(N),
+    "steps below the declared noise": np.rint(RAMP),
+    "a file of six digits": np.rint(RAMP * 1e6) / 1e6,
+}
+
+
+@pytest.mark.parametrize("values", STEADY.values(), ids=STEADY)
+def test_values_without_steps_or_with_small_ones_are_in_no_doubt(values):
+    assert rounded(values, DT, 5.0) == []
