@@ -362,12 +362,17 @@ class ScoredRun:
         return measured if fitted is None else measured | of_map(fitted, self.unit)
 
     @cached_property
+    def doubts(self) -> list[str]:
+        """Sentences on why the recording may not be what its config says."""
+        noise = noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
+        return [*self.journal.faults.doubts, *noise]
+
+    @cached_property
     def judged(self) -> list[LimitResult]:
         """The limits of the config, each held against its measurement."""
         if self.config.limits is None:
             return []
-        doubts = [*self.journal.faults.doubts]
-        doubts += noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
+        doubts = [*self.doubts]
         if (fitted := map_of(self.config)) is not None and (why := fitted.record.provenance.get(DOUBT)):
             doubts.append(f"the soak of its map: {why}")
         return check_limits(self.config.limits, self.measured, doubts)

@@ -49,6 +49,7 @@ from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.family.unit_information import UnitInformation
 from driftlab.units import BiasUnit, axis_name, default_unit, number
 from fusion_core.chunk import Array
+from fusion_core.faults import DOUBT
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
 AT_ONCE = 1000  # units whose p-values are in memory
@@ -67,7 +68,7 @@ class Outlier:
     ----------
     unit : str
     what : str
-        Of a curve `sign`, `swap`, `scale`, `level` or `shape`; or one of `driftlab.family.outlier_tests.FIGURES`.
+        DOUBT; of a curve `sign`, `swap`, `scale`, `level` or `shape`; or one of `outlier_tests.FIGURES`.
     axis : str
     p : float
         Chance of a value as far out among units of the family.
@@ -166,6 +167,13 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     if known and family.laws is None:
         return ["The family's file does not say what is usual of its units: these are held against one another."]
     return []
+
+
+def of_doubts(record: UnitRecord) -> tuple[Outlier, ...]:
+    """Return the doubts about a unit as reasons for which it stands out: nothing of it is said to be as the family."""
+    return tuple(
+        Outlier(record.unit, DOUBT, "", 0.0, float("nan"), None, f"in doubt: {text}", ()) for text in record.doubts
+    )
 
 
 def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
@@ -360,6 +368,7 @@ def _off(family: Family, name: str, B: Array) -> tuple[Array, Array]:
 
 PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
 SCALES = 0.25, 4.0  # of either sign: -0.4 times the usual curve is not the usual one negated
+SMALL = np.geomspace(1e-6, SCALES[0], 109)  # of an axis in another unit; 12 % apart, as a curve tells it
 ORDINARY = 1e-3  # probability of a curve as far from its family, that is still one of it
 LITTLE = 0.15  # of the squared distance
 
@@ -402,8 +411,11 @@ class CurveReasons:
                 rest = [axis for axis in rest if axis not in (a, b)]
                 reasons.append(self._where("swap", (a, b), J[a], h[a], shapes[a]))
         for axis in rest:
-            ordinary = [reason for _, reason, good in every[axis] if good]
-            reasons.append(ordinary[0] if ordinary else every[axis][-1][1])
+            (*tried, (usual, none, _)) = every[axis]
+            ordinary = [(cost, reason) for cost, reason, good in tried if good]
+            likelier = [reason for cost, reason in ordinary if cost < usual]  # a reason that gains less is none
+            off = self._where("curve", (axis,), J[axis], h[axis], shapes[axis]) if ordinary else none
+            reasons.append(likelier[0] if likelier else off)
         return reasons
 
     def _hypotheses(self, J: Array, h: Array, shapes: DeviationShapes, axis: int) -> list[tuple[float, Reason, bool]]:
@@ -423,6 +435,8 @@ class CurveReasons:
         times = 1 + float(_fit(J, h, shapes.c, shapes.L, np.column_stack([shapes.scale, shapes.level]))[1][0])
         if SCALES[0] < abs(times) < SCALES[1]:
             add("scale", times, shapes.level / times)
+        times = _smaller(J, h, shapes)
+        add("scale", times, shapes.level / times)
         seen = np.flatnonzero(self.statistics.seen(J))
         bumps = shapes.bumps[:, seen]
         t = (bumps.T @ own.z) ** 2 / np.sum((own.K @ bumps) * bumps, axis=0)
@@ -454,6 +468,18 @@ class CurveReasons:
         off = B @ (shapes.L @ _fit(J, h, shapes.c, shapes.L)[2].z)
         k = int(np.argmax(np.abs(off) / spread))
         return Reason(what, axes, float(off[k]), float(spread[k]), float(peaks[k]))
+
+
+def _smaller(J: Array, h: Array, shapes: DeviationShapes) -> float:
+    """Return the factor, of either sign and below SCALES, under which a curve, its level apart, is likeliest.
+
+    Of an axis in another unit not only the mean is so many times as large, but also what units differ by.
+    """
+
+    def cost(times: float) -> float:
+        return _fit(J, h, times * shapes.c, abs(times) * shapes.L, shapes.level[:, None] / times)[0]
+
+    return float(min([*SMALL, *-SMALL], key=cost))
 
 
 def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tuple[float, Array, CurveDeviation]:

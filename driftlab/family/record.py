@@ -180,6 +180,8 @@ class UnitRecord(Figures):
         With --explain: `verdict`, and `effects` as in loop.json; or `why_not`.
     notes : list of str
         What one should know of its recordings.
+    doubts : list of str
+        Why these may not be what the config says: it is not accepted.
     seconds : float
         Of one processor that it took.
     driftlab : str
@@ -214,6 +216,7 @@ class UnitRecord(Figures):
     limits: list[dict[str, Any]] = []
     loop: dict[str, Any] | None = None
     notes: list[str] = []
+    doubts: list[str] = []
     seconds: float = 0.0
     driftlab: str = ""
     plugins: list[dict[str, Any]] = []

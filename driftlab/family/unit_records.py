@@ -50,7 +50,7 @@ class UnitRecords:
         limits = tuple(tuple((name, row[name]) for name in OF_LIMITS if name in row) for row in record.limits)
         names = tuple(name for name in HELD if name in record.figures)
         texts = (record.state, record.lot, record.date, tuple(record.more.items()), record.channel, record.bias_unit,
-                 record.driftlab, limits)  # fmt: skip
+                 record.driftlab, limits, tuple(record.doubts))  # fmt: skip
         common = tuple([self._texts.setdefault(text, text) for text in texts])
         values, sigmas = record.table(names, len(axes))
         hashed = len(record.key) == 64 and set(record.key) <= HEX
@@ -76,7 +76,7 @@ class UnitRecords:
 
     def at(self, row: int) -> UnitRecord:
         """Return the record of a row."""
-        state, lot, date, more, channel, bias_unit, driftlab, limits = self.common[self.codes[row]]
+        state, lot, date, more, channel, bias_unit, driftlab, limits, doubts = self.common[self.codes[row]]
         unhashed = self._keys[32 * row : 32 * row + 32].hex(), "", (), None
         key, error, repeats, parabolas = self._alone.get(row, unhashed)
         (axes, names), (_, numbers, deviations) = [*self._tables.items()][self._kinds[row]]
@@ -92,7 +92,7 @@ class UnitRecords:
             key=key, unit=self.units[row], lot=lot, date=date, more=dict(more), state=state, error=error,
             channel=channel, bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
             samples=int(samples), figures=figures, limits=[dict(limit) for limit in limits], seconds=seconds,
-            driftlab=driftlab, repeats=list(repeats), parabolas=parabolas,
+            driftlab=driftlab, repeats=list(repeats), parabolas=parabolas, doubts=list(doubts),
         )  # fmt: skip
 
     def of(self, units: Iterable[str]) -> RecordsOfUnits:
@@ -157,9 +157,11 @@ class RecordsOfUnits(Sequence[UnitRecord]):
             found.setdefault(int(group[k]), []).append(unit)
         return list(found.values())
 
-    def in_state(self, state: str) -> RecordsOfUnits:
-        """Return those that are in a state."""
-        of_codes = np.array([common[0] == state for common in self.records.common], dtype=bool)
+    def in_state(self, state: str, *, in_doubt: bool | None = None) -> RecordsOfUnits:
+        """Return those that are in a state; of those in doubt, or in none, where that is asked for."""
+        of_codes = np.array(
+            [one[0] == state and in_doubt in (None, bool(one[-1])) for one in self.records.common], dtype=bool
+        )
         return self[np.flatnonzero(of_codes[np.asarray(self.records.codes)[self.rows]])]
 
 

@@ -18,7 +18,7 @@ from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.bands import deviation
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.outliers import LotOutlier, Outlier, find_outliers
+from driftlab.family.outliers import LotOutlier, Outlier, Outliers, find_outliers, of_doubts
 from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
@@ -73,6 +73,7 @@ class FamilyAnalysis:
 
 def analyse(
     units: Partitions[Sequence[UnitOfLot]],
+    doubted: Partitions[Sequence[UnitOfLot]],
     status: FleetStatus,
     config: Config,
     known: Path | None,
@@ -81,7 +82,8 @@ def analyse(
 ) -> FamilyAnalysis:
     """Fit the family of the units that are done, or compare them with one that is `known`.
 
-    `units` are those of the status, `rules` run rules of the line's charts.
+    `units` are the sound ones of the status, `rules` run rules of the line's charts. Those that are `doubted` are held
+    against the family as new units: their recordings may be of something else.
 
     Raises
     ------
@@ -89,7 +91,7 @@ def analyse(
         If the known family cannot be used for these units.
     """
     unit = tracked_unit(config.filter)
-    records = status.done
+    records = status.sound
     if known is None:
         family, common, apart, why = _fitted(units, status, progress)
     else:
@@ -100,7 +102,8 @@ def analyse(
     before = None if known is None or family is None else family.baseline
     line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules)
     if family is None:
-        return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
+        odd, lines = _doubted(doubted, status, None, common, unit)
+        return FamilyAnalysis(None, common, odd, line, [*([f"no family: {why}"] if why else []), *lines])
     progress(Stage("units that stand out"))
     outliers = find_outliers(family, apart, records, shown=unit, fitted=known is None)
     lots: tuple[LotOutlier, ...] = ()
@@ -109,13 +112,32 @@ def analyse(
         frozen = baseline_of(line, _level_law(family))
         more = {"laws": outliers.laws, "baseline": frozen, "terms": fit_terms(records)}
         family = family.model_copy(update=more)
+    odd, about = _doubted(doubted, status, family, common, unit)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
-        *_judged_by(family, len(units), known), *outliers.remarks, *([] if known else _frozen_after_changes(line)),
+        *about, *_judged_by(family, len(units), known), *outliers.remarks,
+        *([] if known else _frozen_after_changes(line)),
     ]  # fmt: skip
     judged = outliers.laws is not None and bool(outliers.laws.curves)
-    return FamilyAnalysis(family, common, outliers.odd, line, lines, tuple(lots), judged)
+    return FamilyAnalysis(family, common, {**odd, **outliers.odd}, line, lines, tuple(lots), judged)
+
+
+def _doubted(
+    units: Partitions[Sequence[UnitOfLot]],
+    status: FleetStatus,
+    family: Family | None,
+    common: SharedEffects,
+    unit: BiasUnit,
+) -> tuple[dict[str, tuple[Outlier, ...]], list[str]]:
+    """Return the reasons of each unit in doubt, its doubts first, and sentences on these units."""
+    found, records = Outliers({}), status.doubted
+    if family is not None and family.laws is not None and family.laws.curves and len(units):
+        apart = units.keep("doubted", partial(_bare, common.effects), [None] * len(units))
+        found = find_outliers(family, apart, records, shown=unit, fitted=False)
+    about = f"{counted(len(units))} in doubt: not in the family, not on the charts; held against the family as new"
+    odd = {record.unit: (*of_doubts(record), *found.odd.get(record.unit, ())) for record in records}
+    return odd, [*([about] if odd else []), *found.remarks]
 
 
 def _frozen_after_changes(line: LineReport) -> list[str]:
@@ -149,7 +171,7 @@ def _fitted(
     try:
         progress(Stage("effects that the units share"))
         common = find_common(units, bias_unit=status.bias_unit)
-        noise = [common.noise.get(unit) for unit in status.done.units]
+        noise = [common.noise.get(unit) for unit in status.sound.units]
         apart = units.keep("apart", partial(_bare, common.effects), noise)
         progress(Stage("the family"))
         family = fit_family(apart, channel=status.channel, bias_unit=status.bias_unit)

@@ -263,8 +263,11 @@ class _Command:
         with threadpool_limits(1), seen.scratch() as scratch:
             stored = partial(stored_units, folder.units, engine=engine, scratch=scratch)
             whole = stored(status.records.units, [record.lot for record in status.records])
-            units = stored(status.done.units, [record.lot for record in status.done]) if status.failed else whole
-            learned = partial(analyse, units, status, self.config, options.family, progress, options.rules)
+            doubted, units = (
+                stored(some.units, [record.lot for record in some]) if len(some) < len(status.records) else whole
+                for some in (status.doubted, status.sound)
+            )
+            learned = partial(analyse, units, doubted, status, self.config, options.family, progress, options.rules)
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
@@ -327,7 +330,7 @@ class _Command:
         usual = ("lot",) if any(record.lot for record in records) else ()
         self.yields = yields_of(records, odd, self.jobs.options.by or usual)
         columns = {entry.unit: entry.of_soaks for entry in self.jobs.manifest.units if entry.of_soaks}
-        self.gauge = gauge_study(self.status.done, self.config.limits, self.jobs.options.appraiser, columns)
+        self.gauge = gauge_study(self.status.sound, self.config.limits, self.jobs.options.appraiser, columns)
 
     def _timed(self, name: str, stage: Callable[[], T]) -> T:
         begun = time.monotonic()
@@ -347,6 +350,7 @@ class _Command:
         jobs, folder, status = self.jobs, self.jobs.folder, self.status
         left = [unit for unit in folder.units.names() if unit not in folder.records]
         counts = {"units": len(status.records), "done": len(status.done), "failed": len(status.failed)}
+        counts["in_doubt"] = len(status.doubted)
         summary = FleetSummary(
             plugins=participants(self.config),
             units_from=jobs.manifest.name,
@@ -354,7 +358,7 @@ class _Command:
             limits=status.limits,
             acceptance=status.acceptance,
             pass_with_hysteresis=status.beside,
-            terms=terms_of_units(status.done),
+            terms=terms_of_units(status.sound),
             yields=self.yields,
             gauge=self.gauge,
             acknowledgements=self.notes,

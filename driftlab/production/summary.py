@@ -194,7 +194,8 @@ class FleetSummary(BaseModel):
         now, done, failed = (self.counts[name] for name in ("done_now", "done", "failed"))
         before = self.counts["units"] - now
         when = "" if not before else f" ({now:,} of them now, {before:,} before)" if now else " (all of them before)"
-        lines = [f"{units(self.counts['units'])}: {done:,} done, {failed:,} failed{when}"]
+        doubt = f" ({count:,} of them in doubt)" if (count := self.counts.get("in_doubt", 0)) else ""
+        lines = [f"{units(self.counts['units'])}: {done:,} done{doubt}, {failed:,} failed{when}"]
         if failed:
             lines += [f"failed: unit {unit}: {why}" for unit, why in self.failed.items()]
             more = f"and {failed - len(self.failed):,} more; " if failed > len(self.failed) else ""

@@ -42,6 +42,7 @@ from driftlab.storage.ownership import seal_of
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile
+from fusion_core.faults import DOUBT
 
 if TYPE_CHECKING:
     import polars as pl
@@ -111,7 +112,7 @@ def _drawn(status: FleetStatus, analysis: FamilyAnalysis) -> list[str]:
     """Return the units whose curves the report draws: all, or an even sample and the first of an odd shape."""
     if analysis.family is None:
         return []
-    names, done = list(analysis.odd), status.done.units
+    names, done = list(analysis.odd), status.sound.units
     bent = {name for name in names if any(one.T is not None for one in analysis.odd[name])}
     even = set(done[:: max(1, -(-len(done) // MOST_CURVES))])
     first = set([name for name in done if name in bent][:MOST_CURVES])
@@ -146,14 +147,14 @@ class _Table:
                     f"{self.folders.address}/{name}: has no record any more; give the same command again"
                 )
             if self.family is None or record.state != "done":
-                rows += rows_of(record)
+                rows += rows_of(record, odd=odd[k])
                 continue
             soaked, lot = units[k]
             if self.effects:
                 soaked = without_effects(soaked, lot, self.effects, noise[k])
             else:
                 soaked = informed_where_unknown(soaked, self.family, record)
-            part, curve = _posterior_rows(self.folders, posterior_of(self.family, soaked, lot), sizes[k])
+            part, curve = _posterior_rows(self.folders, posterior_of(self.family, soaked, lot), sizes[k], record.doubts)
             rows += rows_of(record, part, odd[k] or ())
             curves += [curve] * bool(shown[k])
         table = io.BytesIO()
@@ -168,14 +169,15 @@ def temperatures(family: Family) -> Array:
 
 
 def _posterior_rows(
-    folders: UnitFolders, of_unit: UnitPosterior, size: Sequence[OfUnit] | None
+    folders: UnitFolders, of_unit: UnitPosterior, size: Sequence[OfUnit] | None, doubts: Sequence[str]
 ) -> tuple[list[Row], Array]:
     """Write the map of a unit with the family; return the family's part of its rows, and that map's curve (d, G).
 
     `shape_distance` is that of its coefficients from the mean of its lot, in deviations: 1 is usual.
     """
     family, name, lot, posterior = of_unit.family, of_unit.soaked.unit, of_unit.lot, of_unit.posterior
-    fitted = of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot})
+    doubt = {DOUBT: doubts[0]} if doubts else {}
+    fitted = of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot, **doubt})
     folders.write(name, FAMILY_MAP, file_content(fitted, FAMILY_MAP))
     T, before = temperatures(family), family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]

@@ -201,7 +201,7 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
         "map_file": unit.file,
         "verdict": unit.sentences(),
         "limits": run.limits,
-        "notes": [_with_urls(note, recordings) for note in notes],
+        **_without_copies(recordings, notes=notes, doubts=_doubts(faults.doubts, run)),
         "plugins": participants(unit.config),
     }
     if task.page:
@@ -209,6 +209,18 @@ def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dic
     if task.explain:
         record["loop"] = loop_of(config, recordings, files)
     return record, files
+
+
+def _without_copies(recordings: Recordings, **texts: Sequence[str]) -> dict[str, list[str]]:
+    """Return texts by name, each of them once and with URLs in the place of copies."""
+    return {name: [_with_urls(text, recordings) for text in dict.fromkeys(own)] for name, own in texts.items()}
+
+
+def _doubts(of_soaks: list[str], run: CoastResult) -> list[str]:
+    """Return the doubts about a unit; a run over its soak repeats those about it."""
+    if run.in_sample:
+        return of_soaks or run.doubts
+    return [*of_soaks, *(f"its holdout: {text}" for text in run.doubts)]
 
 
 def _relative(name: str, folder: str) -> str:
@@ -303,7 +315,7 @@ def certificate_of(record: UnitRecord, path: Path, config: Config, sheet: Sheet)
     in_sample = "the prediction is of the soak that the map was fitted on"
     return Certificate(
         "fleet", config, own, judged, measured, fitted, seconds=3600 * record.hours, name=record.unit,
-        remarks=[in_sample] * record.coast_in_sample,
+        remarks=[*record.doubts, *[in_sample] * record.coast_in_sample],
     )  # fmt: skip
 
 

@@ -142,6 +142,8 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus:
         with_bias = _with_map(config, settings, fitted)
         triad = fit_triad_map(with_bias, stimulus, "scale,misalignment", None, None, None)
         fitted = triad.map
+        for text in triad.faults.doubts:
+            faults.doubt(f"its stimulus: {text}")
     verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
     return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict, triad)
 
@@ -169,11 +171,14 @@ class CoastResult:
     figures: dict[str, Figure]  # the coasts
     limits: list[dict[str, Any]]  # those of the config, checked against run and map
     notes: list[str]
+    doubts: list[str]  # whether the recording is what its config says
     result: RunResult | None  # None where the config has no filter
 
 
 def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> CoastResult:
     """Run the filter with a unit's map on its tests, or else on its first soak; of several tests the worst counts.
+
+    A test in doubt is worse than any other.
 
     `walk` (d,) is the density of its bias, SI/sqrt(s).
 
@@ -185,7 +190,13 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
     if unit.config.filter is None:
         nothing = Figure.of(np.full(len(unit.axes), np.nan), np.full(len(unit.axes), np.nan))
         return CoastResult(
-            "", in_sample=False, figures=dict.fromkeys(NAMES.values(), nothing), limits=[], notes=[], result=None
+            "",
+            in_sample=False,
+            figures=dict.fromkeys(NAMES.values(), nothing),
+            limits=[],
+            notes=[],
+            doubts=[],
+            result=None,
         )
     config = unit.lenient if tests else unit.config
     name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
@@ -193,14 +204,14 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
     noise = of_alignment(of_run.sensor, of_run.alignment, of_run.model.align)
     coasts = coasts_of(of_run.yardsticks, of_run.span, noise.values, walk)
     limits = plain([row.as_json(unit.bias_unit) for row in result.judged])
-    return CoastResult(name, not tests, coasts, limits, result.lines(), result)
+    return CoastResult(name, not tests, coasts, limits, result.lines(), of_run.doubts, result)
 
 
-def _badness(one: tuple[str, RunResult]) -> float:
-    """Return the largest error of prediction over ten minutes, or over a shorter time where there is none."""
+def _badness(one: tuple[str, RunResult]) -> tuple[bool, float]:
+    """Return True first of a run in doubt, then the largest error of prediction over ten minutes, or a shorter time."""
     scores = (one[1].run.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
     known = next((values for values in scores if np.any(np.isfinite(values))), np.zeros(1))
-    return float(np.nanmax(known))
+    return bool(one[1].run.doubts), float(np.nanmax(known))
 
 
 NAMES = {"1 min": "coast_1min", "5 min": "coast_5min", "10 min": "coast", "to the end": "coast_end"}

@@ -341,6 +341,16 @@ class FleetStatus:
         return self.records.in_state("done")
 
     @cached_property
+    def sound(self) -> RecordsOfUnits:
+        """The records of the units that were done and are not in doubt: what is learnt of the line stands on them."""
+        return self.records.in_state("done", in_doubt=False)
+
+    @cached_property
+    def doubted(self) -> RecordsOfUnits:
+        """Those of the units that were done and are in doubt."""
+        return self.records.in_state("done", in_doubt=True)
+
+    @cached_property
     def failed(self) -> RecordsOfUnits:
         """Those of the units that failed."""
         return self.records.in_state("failed")

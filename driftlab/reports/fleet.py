@@ -37,6 +37,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
     failed = [(record.unit, "", record.error) for record in records if record.state == "failed"]
     done, odd, table = len(records) - len(failed), len(reasons), _table(overview, reasons)
+    doubted = sum(bool(record.doubts) for record in records)
     done_over = (record.domain for record in records if record.domain and record.state == "done")
     domains = np.fromiter(chain.from_iterable(done_over), dtype=np.float64).reshape(-1, 2)
     lists, shown_below = _lists(overview, reasons), in_tables(line)
@@ -44,10 +45,10 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         path,
         "fleet",
         title=overview.title,
-        lead=_lead(len(records), len(failed), odd, len(effects)),
+        lead=_lead(len(records), len(failed), odd, doubted, len(effects)),
         limits=verdict_of_units(record.limits for record in records if record.state == "done").capitalize(),
         outcome=_outcome(record for record in records if record.state == "done"),
-        verdict=_headline(line, odd, done, odd - len(lists["odd"])),
+        verdict=_headline(line, odd, doubted, done, odd - len(lists["odd"])),
         use=_use(line, len(lists["odd"]), len(lists["alarms"])),
         yields=overview.yields,
         called=figure_name,
@@ -96,19 +97,20 @@ def _outcome(records: Iterable[UnitRecord]) -> str | None:
     return worst([{"verdict": word} for word in {worst(record.limits) for record in records}])
 
 
-def _lead(units: int, failed: int, odd: int, effects: int) -> str:
+def _lead(units: int, failed: int, odd: int, doubted: int, effects: int) -> str:
     """Return the numbers of units and of effects that they share."""
     parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    parts[-1] += f", {doubted:,} of them in doubt" if doubted else ""
     parts += [f"{effects} effect{'s' * (effects != 1)} that they share"] if effects else []
     return "; ".join(parts)
 
 
-def _headline(line: LineReport, odd: int, done: int, known: int) -> str:
+def _headline(line: LineReport, odd: int, doubted: int, done: int, known: int) -> str:
     """Return the first sentence on the units and on their line: odd units are no quiet line."""
     if not odd:
         return line.sentences[0]
-    acknowledged = f", {known:,} of them acknowledged" if known else ""
-    return f"{odd:,} of {done:,} units {'is' if odd == 1 else 'are'} odd{acknowledged}. {line.sentences[0]}"
+    among = "".join(f", {n:,} of them {what}" for n, what in ((doubted, "in doubt"), (known, "acknowledged")) if n)
+    return f"{odd:,} of {done:,} units {'is' if odd == 1 else 'are'} odd{among}. {line.sentences[0]}"
 
 
 def _use(line: LineReport, odd: int, out: int) -> str:

@@ -21,6 +21,7 @@ from driftlab.family.outliers import Outlier
 from driftlab.family.record import UnitRecord
 from fusion_core.errors import ConfigError, quote
 from fusion_core.escaping import is_plain
+from fusion_core.faults import DOUBT
 
 LONGEST = 1000  # characters of a note
 
@@ -35,6 +36,8 @@ class Alarm:
 
 def of_outlier(outlier: Outlier) -> Alarm:
     """Return the alarm of a unit that is not as in its family."""
+    if outlier.what == DOUBT:
+        return Alarm(outlier.sentence, outlier.sentence)
     value = f" {outlier.value:.3g}" if outlier.what in FIGURES else ""
     return Alarm(f"{outlier.axis} {outlier.what}{value}: odd", outlier.sentence)
 

@@ -1,8 +1,9 @@
 """Yield of a line and the reasons of what is not accepted (Pareto), as a whole and by a column of the units' table.
 
-A unit is accepted where it was calibrated and keeps every limit of the config (`driftlab.evaluation.limits`). The 95 %
-interval of a share is Clopper and Pearson's. Whether the yield differs between the groups of a column is Pearson's
-chi-squared, by the permutation law of the accepted units over the groups: right for few units and rare reasons alike.
+A unit is accepted where it was calibrated, keeps every limit of the config (`driftlab.evaluation.limits`), and is not
+in doubt. The 95 % interval of a share is Clopper and Pearson's. Whether the yield differs between the groups of a
+column is Pearson's chi-squared, by the permutation law of the accepted units over the groups: right for few units and
+rare reasons alike.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
 }
 """Columns of the units' table by which a yield is grouped, beside those of the manifest itself."""
 UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
-SAID = {"fail": "above limit", "undecided": "undecided", "not measured": "not measured"}
+UNDECIDED = "undecided"
+SAID = {"fail": "above limit", UNDECIDED: "undecided", "not measured": "not measured"}
+_Judged = tuple[list[str], bool, bool]  # reasons of a unit, whether it stands out, and whether it is undecided
 NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
 DRAWS = 9999  # permutations
@@ -49,6 +52,7 @@ class YieldGroup:
     accepted: int
     odd: int = 0
     reasons: Mapping[str, int] = field(default_factory=dict)  # of what was not accepted, most units first
+    undecided: int = 0  # of what was not accepted
 
     @property
     def share(self) -> float:
@@ -64,7 +68,7 @@ class YieldGroup:
         """Return it as `fleet.json` has it."""
         return {
             "units": self.units, "accepted": self.accepted, "yield": self.share, "yield_95": [*self.interval],
-            "odd": self.odd, "reasons": dict(self.reasons),
+            "odd": self.odd, "reasons": dict(self.reasons), "undecided": self.undecided,
         }  # fmt: skip
 
 
@@ -118,7 +122,9 @@ class Yield:
             return []
         first = ", ".join(f"{reason} ({count:,})" for reason, count in [*whole.reasons.items()][:3])
         more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
-        lines = [f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}; not accepted: {first}{more}"]
+        open_ = f"; {whole.undecided:,} undecided" if whole.undecided else ""
+        yielded = f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}"
+        lines = [f"{yielded}{open_}; not accepted: {first}{more}"]
         for column, groups in self.by.items():
             if self.differs(column):
                 least, most = (f(groups, key=lambda one: one.share) for f in (min, max))
@@ -137,20 +143,21 @@ def _per_cent(group: YieldGroup) -> str:
 def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iterable[str] = ()) -> Yield:
     """Return the yield of units, of which `odd` stand out, and by the columns `by`: COLUMNS, or the manifest's own."""
     known: dict[tuple[str, ...], list[str]] = {}  # of a line of many units few differ
-    why = [known.setdefault(tuple(own), own) for own in map(reasons, records)]
     known_odd = set(odd)
-    stand_out = [record.unit in known_odd for record in records]
-    whole = _group("", why, sum(stand_out))
+    judged = [
+        (known.setdefault(tuple(own), own), record.unit in known_odd, undecided(record))
+        for record, own in zip(records, map(reasons, records), strict=True)
+    ]
+    whole, why = _group("", judged), [own for own, *_ in judged]
     place = {reason: k for k, reason in enumerate(whole.reasons)}
     first = Counter(min(place[reason] for reason in of_unit) for of_unit in why if of_unit)
     covered = tuple(accumulate(first[k] for k in place.values()))
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
-        parts, counts = dict[str, list[list[str]]](), Counter[str]()
-        for name, of_unit, stands_out in zip(_names(records, column), why, stand_out, strict=True):
+        parts = dict[str, list[_Judged]]()
+        for name, of_unit in zip(_names(records, column), judged, strict=True):
             parts.setdefault(name, []).append(of_unit)
-            counts[name] += stands_out
-        groups[column] = tuple(_group(name, part, counts[name]) for name, part in parts.items())
+        groups[column] = tuple(_group(name, part) for name, part in parts.items())
     p = {
         column: chance([one.units for one in parts], [one.accepted for one in parts])
         for column, parts in groups.items()
@@ -159,25 +166,40 @@ def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iter
 
 
 def reasons(record: UnitRecord) -> list[str]:
-    """Return the reasons for which a unit is not accepted; none where it is.
+    """Return the reasons for which a unit is not accepted, first what it is in doubt for; none where it is accepted.
 
-    Errors that differ in a name of a file or a number are one reason.
+    Errors and doubts that differ in a name of a file or a number are one reason. That limits are undecided is no
+    further reason of a unit in doubt, of which none passes.
     """
     if record.state == "failed":
-        text = re.sub(r"^\S*[/\\]\S*: ", "", record.error.partition(";")[0]).replace(record.unit, "…")
-        text = re.sub(r"[^\s:;,'\"]*[/\\][^\s:;,'\"]*\.\w+", "…", text)
-        text = re.sub(r"[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?", "…", text)
-        return [f"not calibrated: {re.sub('(… ?)+', '… ', text).strip() or 'no reason given'}"]
-    if worst(record.limits) in (None, "pass"):
-        return []
+        return [f"not calibrated: {_general(record.error, record.unit) or 'no reason given'}"]
+    doubts = dict.fromkeys(f"in doubt: {_general(text, record.unit)}" for text in record.doubts)
     rows = ((figure_name(str(row["name"])).replace("_", " "), str(row["verdict"])) for row in record.limits)
-    return [f"{name} {SAID[verdict]}" for name, verdict in rows if verdict in SAID]
+    said = {verdict: text for verdict, text in SAID.items() if not doubts or verdict != UNDECIDED}
+    return [*doubts, *(f"{name} {said[verdict]}" for name, verdict in rows if verdict in said)]
 
 
-def _group(name: str, why: Sequence[list[str]], odd: int) -> YieldGroup:
-    """Return a group of the units of these reasons, of which `odd` stand out."""
+def undecided(record: UnitRecord) -> bool:
+    """Return True if a unit is neither accepted nor known to fail: in doubt, or within the guard of a limit."""
+    doubts = [{"verdict": UNDECIDED}] * bool(record.doubts)
+    return record.state == "done" and worst([*record.limits, *doubts]) == UNDECIDED
+
+
+def _general(text: str, unit: str) -> str:
+    """Return the first part of a message with names of files and numbers left out, as those of other units are."""
+    text = re.sub(r"^\S*[/\\]\S*: ", "", text.partition(";")[0]).replace(unit, "…")
+    text = re.sub(r"[^\s:;,'\"]*[/\\][^\s:;,'\"]*\.\w+", "…", text)
+    text = re.sub(r"[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?", "…", text)
+    return re.sub("(… ?)+", "… ", text).strip()
+
+
+def _group(name: str, judged: Sequence[_Judged]) -> YieldGroup:
+    """Return a group of units, of which each has its reasons, and whether it stands out and is undecided."""
+    why, odd, left = zip(*judged, strict=True) if judged else ((), (), ())
     counts = Counter(reason for of_unit in why for reason in of_unit)
-    return YieldGroup(name, len(why), sum(not of_unit for of_unit in why), odd, dict(counts.most_common()))
+    return YieldGroup(
+        name, len(why), sum(not of_unit for of_unit in why), sum(odd), dict(counts.most_common()), sum(left)
+    )
 
 
 def _names(records: Sequence[UnitRecord], column: str) -> list[str]:

@@ -248,6 +248,25 @@ def test_gross_errors_are_named_for_what_they_are(
     assert re.search(said, gross[unit][0].sentence)
 
 
+@pytest.mark.parametrize("times", [1e-3, -1e-3, np.pi / 180, 0.1])
+def test_an_axis_in_another_unit_is_named_with_its_factor(times: float) -> None:
+    """Units differ by more than their mean curve: what is next to nothing may be that curve negated, and is not."""
+    rng, u = np.random.default_rng(33), (made.GRID - 20) / 40
+    units = []
+    for k in range(30):
+        curve = 40 * np.sin(2 * u) + np.stack([np.ones_like(u), u, np.cos(2 * u)], axis=1) @ (60 * rng.normal(size=3))
+        units.append(made.Made(f"{k:04d}", "", curve[:, None] / RATE.factor, np.full(1, 2e-5), np.full(1, 1e-7)))
+    family = fit_family([(unit.soaked(33, ("x",)), "") for unit in units[:-1]])
+    laws = find_outliers(family, [(unit.soaked(33, ("x",)), "") for unit in units[:-1]], []).laws
+    assert laws is not None
+    rows = units[-1].soaked(33, ("x",)).recordings
+    own = [replace(part, bias=times * part.bias) for part in rows]
+    scaled = UnitInformation.of("x", ("x",), own, abs(times) * units[-1].noise, abs(times) * units[-1].walk, 2.5)
+    (reason,) = CurveReasons(CurveStatistics(family, fitted=False), laws).of(*family.information_of(scaled), "", (0,))
+    assert reason.what == "scale"
+    assert 0.3 < reason.times / times < 3.0
+
+
 def test_a_unit_that_disagrees_with_itself_is_named() -> None:
     """Two units under one name, and a hysteresis of its own, among units of which one in three was soaked twice."""
     pairs, records = [], []

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import family
 import fleets
+import h5py
 import polars as pl
 import pytest
 
@@ -68,6 +69,32 @@ def test_all_that_fail_are_an_error_and_a_table_all_the_same(fleet):
     with pytest.raises(DataError, match=r"^all 4 units failed; the first is 0000: "):
         fleet()
     assert table()["state"].to_list() == ["failed"] * COUNT
+
+
+@pytest.mark.parametrize("limited", [True, False])
+def test_a_unit_in_doubt_is_not_said_to_be_good(fleet, limited):
+    with h5py.File("units/0001/soak.h5", "r+") as file:
+        file["gyro"][:, 1] = file["gyro"][:, 0]
+    doubt = "gyro y shows what gyro x shows, row by row; correct source.channels.gyro.path"
+    if not limited:
+        config = Path("family.yaml")
+        config.write_text("".join(row for row in config.read_text().splitlines(True) if not row.startswith("limits")))
+    result, _ = fleet()
+    told, page = result.summary, Path("made/report.html").read_text()
+    assert result.lines()[0].startswith("4 units: 3 done (1 of them in doubt), 1 failed")
+    assert f"  unit 0001: in doubt: {doubt}" in "\n".join(result.lines())
+    assert "no unit stands out" not in result.lines()
+    assert told["counts"]["in_doubt"] == 1
+    of_yield = (0, 3) if limited else (2, 1)  # soaks so short decide no limit
+    assert (told["yield"]["accepted"], told["yield"]["undecided"]) == of_yield
+    assert "in doubt: gyro y shows what gyro x shows, row by row" in told["yield"]["reasons"]
+    assert result.record("0001").doubts == [doubt]
+    (row, *_) = table().filter(unit="0001").to_dicts()
+    assert row["odd_why"].startswith(f"in doubt: {doubt}")
+    assert row["limits"] == ("undecided" if limited else None)
+    assert "1 odd, 1 of them in doubt" in page
+    assert "1 of 3 units is odd, 1 of them in doubt." in page
+    assert f"in doubt: {doubt}" in page
 
 
 def test_what_looks_otherwise_and_is_the_same_is_not_done_again(fleet):

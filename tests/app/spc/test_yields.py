@@ -40,7 +40,20 @@ def test_yield_and_reasons_of_the_whole():
     interval = stats.binomtest(14, 20).proportion_ci(method="exact")
     assert whole.interval == pytest.approx((interval.low, interval.high))
     share, why = "70 % (95 %: 45.7 to 88.1 %)", "noise above limit (3), residual undecided (2)"
-    assert found.sentences()[0].startswith(f"yield: 14 of 20 units, {share}; not accepted: {why}")
+    assert found.sentences()[0].startswith(f"yield: 14 of 20 units, {share}; 1 undecided; not accepted: {why}")
+
+
+def test_a_unit_in_doubt_is_undecided_and_its_doubt_is_its_reason():
+    said = "gyro y shows exactly 0.25 rad/s, its largest reading, in 720 rows: as at the end of its range; set it"
+    doubt = "in doubt: gyro y shows exactly … rad/s, its largest reading, in … rows: as at the end of its range"
+    units = [unit(0), unit(1), unit(2, "undecided", "undecided"), unit(3, "fail", "undecided"), unit(4, "undecided")]
+    units = [*units[:1], *(one.model_copy(update={"doubts": [said]}) for one in units[1:4]), units[4]]
+    assert [reasons(one) for one in units] == [
+        [], [doubt], [doubt], [doubt, "noise above limit"], ["noise undecided"]
+    ]  # fmt: skip
+    told = yields_of(units, by=["lot"])
+    assert (told.whole.accepted, told.whole.undecided) == (1, 3)  # one fails, whatever it is in doubt for
+    assert told.as_json()["undecided"] == told.as_json()["by"]["lot"]["groups"][0]["undecided"] == 3
 
 
 def test_errors_that_differ_in_names_and_numbers_are_one_reason():
