@@ -25,6 +25,7 @@ import foreign_soaks
 import numpy as np
 from loop_cases.signatures import dragged
 from numpy.typing import NDArray
+from scipy.signal import butter, lfilter
 
 from driftlab.config import Limits
 from driftlab.evaluation.limits import Measured, check_limits
@@ -62,8 +63,6 @@ def walk(rng: Rng, N: int) -> Array:
 
 def gauss_markov(rng: Rng, N: int, tau: float) -> Array:
     """Return a stationary process (N, 3) of deviation 1 and correlation time tau."""
-    from scipy.signal import lfilter
-
     part = np.exp(-DT / tau)
     steps = rng.normal(size=(N, 3)) * np.sqrt(1 - part**2)
     steps[0] = rng.normal(size=3)
@@ -123,11 +122,20 @@ def of_run(rng: Rng, law: str, hours: float) -> dict[str, Unit]:
     return {"coast": (found, np.full(3, np.nan))}
 
 
-def of_log(rng: Rng, law: str, hours: float) -> dict[str, Unit]:
-    """Return noise and bias instability of a static log."""
+SMOOTHED: dict[str, Callable[[Array], Array]] = {
+    "low-pass 0.2": lambda rate: lfilter(*butter(2, 0.2), rate),  # corner in parts of half the sampling rate
+    "low-pass 0.4": lambda rate: lfilter(*butter(2, 0.4), rate),
+    "interpolated": lambda rate: np.interp(np.arange(10 * len(rate)) / 10, np.arange(len(rate)), rate),
+    "held": lambda rate: np.repeat(rate, 10),
+}
+
+
+def of_log(rng: Rng, law: str, hours: float, smoothed: Callable[[Array], Array] = np.asarray) -> dict[str, Unit]:
+    """Return noise and bias instability of a static log, of its samples as they are or `smoothed`."""
     N = int(hours * 3600 / DT)
     rate = LAWS[law](rng, N) + rng.normal(size=(N, 3)) * WHITE / np.sqrt(DT)
-    found = of_allan([fit(curve(axis, DT)) for axis in rate.T], AXES, DT * N)
+    seen = [np.ascontiguousarray(smoothed(axis)) for axis in rate.T]
+    found = of_allan([fit(curve(axis, DT * N / len(axis))) for axis in seen], AXES, DT * N)
     true = {"noise": WHITE, "bias_instability": 2 * DEG_H}
     return {name: (found[name], np.full(3, value)) for name, value in true.items()}
 
@@ -162,6 +170,8 @@ CELLS: dict[str, Callable[[Rng], dict[str, Unit]]] = {
     **{f"run {hours:g} h, {law}": lambda rng, law=law, hours=hours: of_run(rng, law, hours)
        for hours in (0.5, 2.0, 8.0) for law in LAWS},
     **{f"log {hours:g} h, flicker 2": lambda rng, hours=hours: of_log(rng, "flicker 2", hours) for hours in (2.0, 8.0)},
+    **{f"log 2 h, flicker 2, {name}": lambda rng, name=name: of_log(rng, "flicker 2", 2.0, SMOOTHED[name])
+       for name in SMOOTHED},
     **{f"play {width:g} K, {law}, {program}": lambda rng, law=law, program=program, width=width:
        of_play(rng, law, program, width)
        for width in (1.0, 4.0) for law in ("walk 0.03", "flicker 2") for program in PROGRAMS},

@@ -17,7 +17,7 @@ from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW, Scores
 from driftlab.maps.fit import axes_of
 from driftlab.noise.allan import curve
 from driftlab.noise.allan_fit import Coefficients, fit
-from driftlab.noise.allan_model import KEYS
+from driftlab.noise.allan_model import KEYS, WHITE, WHITE_ALIKE, alike
 from driftlab.noise.recording import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
@@ -35,9 +35,8 @@ NOT_SURE = "its kind of map does not say how sure the curve is; take one that do
 LONGER = "a longer stimulus would decide it, or larger rates"
 WHOLE = "`driftlab allan` measures it over the whole of a recording"
 SHORTEST = 1.0  # s, of an average
-WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
-WHITE_ALIKE, ALIKE = -0.5, -0.4  # correlation of neighbouring differences of white noise; with more it is not white
-SURE = 4.0  # deviations of such a correlation, 1 / sqrt(n)
+WALKS = 0.1  # what a walk adds to the correlation of neighbouring differences of white noise
+FLOOR = KEYS.index("bias_instability")
 Less = Callable[[Mapping[str, Array]], Array]
 
 
@@ -152,6 +151,10 @@ def of_allan(
     result = {}
     for name, k in (("noise", WHITE), ("bias_instability", FLOOR)):
         value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
+        if hidden := [axis for axis, end in zip(axes, high, strict=True) if np.isinf(end)]:
+            text = f"no averaging time shows it of {', '.join(hidden)}: filtered, interpolated or constant data"
+            result[name] = Measured(np.full(len(axes), np.nan), axes, missing=text)
+            continue
         part = np.where(value > 0, SIDE / TWO_SIDES, 1.0)  # of a limit of 97.5 %, on a scale of logarithms
         with np.errstate(divide="ignore", invalid="ignore"):
             high = np.where(value > 0, value * (high / value) ** part, high)
@@ -294,10 +297,10 @@ class Averages:
             pairs[:, None], np.diff(rows[:, 3:] / time, axis=0) / np.sqrt(1 / time[1:] + 1 / time[:-1]), 0.0
         )
         square = np.sum(steps**2, axis=0)
-        alike = np.max(np.sum(steps[1:] * steps[:-1], axis=0) / np.maximum(square, np.finfo(float).tiny))
-        if alike > ALIKE and (alike - WHITE_ALIKE) * np.sqrt(n) > SURE:
+        near = float(np.max(np.sum(steps[1:] * steps[:-1], axis=0) / np.maximum(square, np.finfo(float).tiny)))
+        if alike(near, n, WHITE_ALIKE, WALKS):
             text = (
-                f"neighbouring averages of {self.step:.3g} s are alike (differences correlate by {alike:.2f}, those of "
+                f"neighbouring averages of {self.step:.3g} s are alike (differences correlate by {near:.2f}, those of "
                 f"white noise by {WHITE_ALIKE}): filtered or interpolated data do not show it"
             )
             return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)

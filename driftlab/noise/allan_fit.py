@@ -4,6 +4,9 @@
 
     allan^2(tau) = 3 Q^2/tau^2 + N^2/tau + (2 ln 2/pi) B^2 + K^2 tau/3 + R^2 tau^2/2          (IEEE Std 952, annex C)
 
+Of samples that are filtered the quantisation gives way to what the filter takes off, and averaging times within its
+reach are left out (`Design.smoothed`).
+
 Values: non-negative least squares, each averaging time weighted by its effective degrees of freedom under the fitted
 model itself, iterated. Neighbouring averaging times share nearly all their samples, so the scatter of the fit about the
 curve says nothing of its error. The limits are those of the values under which such an estimate would have been likely
@@ -20,14 +23,16 @@ from itertools import combinations
 
 import numpy as np
 
-from driftlab.noise.allan_model import KEYS, RAMP, WALK, AllanCurve, Design, design
+from driftlab.noise.allan_model import KEYS, RAMP, WALK, WHITE, WHITE_ALIKE, AllanCurve, Design, alike, design
 from fusion_core.chunk import Array
 
 LEVEL = 0.95  # probability that an interval covers the true value
 TAIL = (1 - LEVEL) / 2
 MODEL_ERROR = 0.02  # of the variance: no unit follows five power laws more closely than that
 GOOD = 0.11  # a departure of the variance up to which a fit begins at the shortest averaging time
-SHAPED = 100  # samples over which a filter in the sensor may bend the curve
+REACH = 10  # times `a` of `Design.smoothed`: a filter of first or second order has then all but come to rest
+SHAPED = 100  # samples over which what is no filter, as vibration, may bend the curve
+SMOOTH = "neighbouring samples are alike, as those of a low-pass filter or of interpolation"
 LEFT = 15  # averaging times that are left to a fit at least
 
 
@@ -35,6 +40,8 @@ LEFT = 15  # averaging times that are left to a fit at least
 class Coefficients:
     """The five coefficients in SI in the order of KEYS, and their 95 % limits; zero where none is significant.
 
+    The upper limit of what is not measured is infinite. So it is of the quantisation of filtered samples, in whose
+    place `best` has, below zero, what the filter takes off.
     `spread` (J,) is the relative standard deviation of the Allan deviation at each averaging time; the fit begins at
     the averaging time number `first`. `best` is the fit itself, with terms in it that are not certain.
     """
@@ -55,13 +62,16 @@ def fit(curve: AllanCurve) -> Coefficients:
     curve or the two curves do not agree on the walk.
     """
     if not (np.all(curve.allan > 0) and np.all(curve.hadamard > 0)):
-        zero = np.zeros(len(KEYS))
-        note = "does not move at all at some averaging times: no coefficient can be fitted"
-        return Coefficients(zero, zero, zero, np.zeros_like(curve.tau), zero, notes=[note])
-    whole = design(curve, hadamard=False)
-    first = _begin(whole, curve.allan**2, curve.dt)
-    allan = _limits(whole.since(first), curve.allan[first:] ** 2, list(range(5)))
-    hadamard = _limits(design(curve, hadamard=True).since(first), curve.hadamard[first:] ** 2, [WALK])
+        return _unknown(curve, "does not move at all at some averaging times: no coefficient can be fitted")
+    whole, other = design(curve, hadamard=False), design(curve, hadamard=True)
+    smooth = _smooth(curve, whole, other)
+    if smooth:
+        whole, other = whole.smoothed(), other.smoothed()
+    first = (_beyond if smooth else _begin)(whole, curve.allan**2, curve.dt)
+    if smooth and first > len(curve.tau) - LEFT:
+        return _unknown(curve, f"{SMOOTH}: too few averaging times are left beyond its reach, nothing is measured")
+    allan = _limits(whole.since(first), curve.allan[first:] ** 2, list(range(int(smooth), 5)))
+    hadamard = _limits(other.since(first), curve.hadamard[first:] ** 2, [WALK])
     value, low, high = allan.value, allan.low, allan.high
     notes = []
     if low[RAMP] > 0 or low[WALK] > hadamard.high[WALK]:
@@ -77,15 +87,28 @@ def fit(curve: AllanCurve) -> Coefficients:
             f"something more is there, which {names} would explain, but another term as well: reported as a limit; a "
             "longer recording tells"
         )
-    notes += _fit_notes(curve, first, allan.error)
-    return Coefficients(value, low, high, whole.spread(allan.theta) / 2, np.sqrt(allan.theta), first, notes)
+    notes += _fit_notes(curve, first, allan.error, smooth=smooth)
+    best = np.sqrt(allan.theta)
+    if smooth:
+        high[0], best[0] = np.inf, -best[0]
+    return Coefficients(value, low, high, whole.spread(allan.theta) / 2, best, first, notes)
 
 
-def _fit_notes(curve: AllanCurve, first: int, error: float) -> Iterator[str]:
-    if first > 0:
+def _unknown(curve: AllanCurve, why: str) -> Coefficients:
+    zero = np.zeros(len(KEYS))
+    return Coefficients(zero, zero, np.full(len(KEYS), np.inf), np.zeros_like(curve.tau), zero, notes=[why])
+
+
+def _fit_notes(curve: AllanCurve, first: int, error: float, *, smooth: bool) -> Iterator[str]:
+    if smooth:
+        yield (
+            f"{SMOOTH}: fitted from {curve.tau[first]:.3g} s on, beyond its reach; the quantisation is not measured, "
+            "and the noise is that before the filter"
+        )
+    elif first > 0:
         yield (
             f"fitted from {curve.tau[first]:.3g} s on: at shorter averaging times the curve does not have the shape of "
-            "the five terms, as with a filter in the sensor or after it"
+            "the five terms, as with vibration"
         )
     if error > MODEL_ERROR:
         yield (
@@ -95,12 +118,29 @@ def _fit_notes(curve: AllanCurve, first: int, error: float) -> Iterator[str]:
 
 
 def _begin(model: Design, v: Array, dt: float) -> int:
-    """Return from which averaging time on the five terms fit well: the first, unless a filter bends the short ones."""
+    """Return from which averaging time on the five terms fit well: the first, unless the short ones are bent."""
     last = max(0, min(len(v) - LEFT, int(np.searchsorted(model.tau, SHAPED * dt))))
     errors = [_model_error(model.since(j), v[j:])[0] for j in range(last + 1)]
     wanted = max(GOOD, 1.5 * min(errors))
     first = next(j for j, error in enumerate(errors) if error <= wanted)
     return first if errors[first] < errors[0] / 2 else 0
+
+
+def _smooth(curve: AllanCurve, allan: Design, hadamard: Design) -> bool:
+    """Return True if neighbouring samples are alike, and the five terms do not say so: a filter, or interpolation."""
+    error, theta = _model_error(allan, curve.allan**2)
+    terms = WHITE_ALIKE if error > GOOD else 1 - 1.5 * (hadamard.A[0] @ theta[:RAMP]) / (allan.A[0] @ theta)
+    tolerance = MODEL_ERROR + GOOD * abs(terms - WHITE_ALIKE)
+    return alike(float(curve.alike[0]), int(np.sum(curve.lengths)), terms, tolerance)
+
+
+def _beyond(model: Design, v: Array, dt: float) -> int:
+    """Return the first averaging time beyond the reach of a filter, as the fit of what it takes off tells it."""
+    found = [_model_error(model.since(j), v[j:]) for j in range(max(1, len(v) - LEFT + 1))]
+    wanted = 1.5 * min(error for error, _ in found)
+    first, theta = next((j, theta) for j, (error, theta) in enumerate(found) if error <= wanted)
+    reach = REACH * 2 * theta[0] / max(theta[WHITE], np.finfo(float).tiny)
+    return max(first, int(np.searchsorted(model.tau, reach)))
 
 
 def _model_error(model: Design, v: Array) -> tuple[float, Array]:

@@ -12,7 +12,7 @@ J averaging times, F bands, S stretches, p <= 5 terms: quantisation, white, bias
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,11 +23,13 @@ from fusion_core.chunk import Array
 Index = NDArray[np.int64]
 
 KEYS = ("quantization", "white", "bias_instability", "rate_random_walk", "rate_ramp")
+WHITE = KEYS.index("white")
 WALK = KEYS.index("rate_random_walk")
 RAMP = KEYS.index("rate_ramp")
 DRAWS = 400
 ENDS = {2: 1.3, 3: 2.2}  # averaging times at the ends of a stretch that say nothing, by the order of the difference
 PRESENT = 0.9  # of a window's samples: with fewer, its mean may be that of another time
+WHITE_ALIKE, SURE = -0.5, 4.0  # correlation of neighbouring differences of white noise, and deviations that are sure
 LINES = 12  # lines of the periodogram that are bands of their own, from the lowest on
 
 
@@ -72,6 +74,11 @@ class AllanCurve:
     def m(self) -> Index:
         """Samples in each averaging time (J,)."""
         return np.rint(self.tau / self.dt).astype(np.int64)
+
+    @property
+    def alike(self) -> Array:
+        """Correlation (J,) of neighbouring differences of averages: WHITE_ALIKE of white noise, more of smoothed."""
+        return np.asarray(1 - 1.5 * (self.hadamard / self.allan) ** 2)
 
     @property
     def stretches(self) -> Index:
@@ -140,7 +147,9 @@ class Design:
 
     tau: Array  # (J,) averaging times, s
     A: Array  # (J, p) variance of each term at coefficient one
-    classes: tuple[Class, ...]  # stretches of like lengths; their W sum to A over the bands and the classes
+    classes: tuple[
+        Class, ...
+    ]  # stretches of like lengths; their W sum to A over bands and classes, where that is no loss
 
     @cached_property
     def variates(self) -> list[Array]:
@@ -159,12 +168,21 @@ class Design:
         left = tuple(one.since(first) for one in self.classes if len(one.power) > first)
         return Design(self.tau[first:], self.A[first:], left)
 
+    def smoothed(self) -> Design:
+        """Return the same with what a filter takes off in the place of the quantisation, averaging times beyond it.
+
+        The angle of white noise through a filter H grows within tau by the variance N^2 (tau - a), where a is the
+        integral of (1 - |H|^2) / (2 pi^2 f^2) over all f: a quantisation with the square -N^2 a / 2, for |H| <= 1.
+        """
+        classes = tuple(replace(one, W=one.W * (np.arange(len(one.W)) > 0)[:, None, None]) for one in self.classes)
+        return Design(self.tau, self.A * np.where(np.arange(self.A.shape[1]) > 0, 1.0, -1.0), classes)
+
     def spread(self, theta: Array) -> Array:
         """Relative standard deviation of the variances (J,) under squared coefficients theta (p,)."""
         variance = np.zeros(len(self.tau))
         for one in self.classes:
             variance[: len(one.power)] += np.sum(one.bands(theta) ** 2 / one.shape, axis=1) * one.power**2
-        return np.asarray(np.sqrt(variance) / (self.A @ theta))
+        return np.asarray(np.sqrt(variance) / (np.maximum(self.A, 0) @ theta))
 
     def draw(self, theta: Array, model_error: float) -> Array:
         """Draw curves (J, DRAWS) under theta."""
@@ -180,7 +198,10 @@ class Design:
                 L = len(one.power)
                 noise[:L] += one.beat(theta, ramp[:L], normal)
         noise = noise * (1 + model_error * self.normals[:J])
-        return np.asarray(np.maximum(noise, 0.01 * mean))
+        drawn = np.maximum(noise, 0.01 * mean)
+        if np.all(self.A >= 0):
+            return np.asarray(drawn)
+        return np.asarray(drawn * np.maximum(self.A @ theta / (np.maximum(self.A, 0) @ theta), 0.01)[:, None])
 
 
 def design(curve: AllanCurve, hadamard: bool) -> Design:
@@ -196,6 +217,14 @@ def design(curve: AllanCurve, hadamard: bool) -> Design:
         A[:, 0] *= curve.bridge.angle[int(hadamard)]
         A[:, 1] *= curve.bridge.white[int(hadamard)]
     return Design(tau, A, tuple(_classes(curve, A, 3 if hadamard else 2)))
+
+
+def alike(correlation: float, n: int, white: float, tolerance: float) -> bool:
+    """Return True if n neighbouring differences correlate by more than `white`, that of noise that is not smoothed.
+
+    The deviation of such a correlation is 1 / sqrt(n).
+    """
+    return bool(correlation - white > max(tolerance, SURE / np.sqrt(n)))
 
 
 def octaves(lengths: Index) -> Index:

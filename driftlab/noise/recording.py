@@ -120,8 +120,10 @@ class Pieces:
 def pieces(t: Array, usable: Flags | None = None) -> Pieces:
     """Cut samples at times t (N,) at steps longer than GAP times the median; leave out spans too short for any average.
 
-    The samples lost in a gap are counted from its own length, so a clock that drifts moves none. A gap's ends are those
-    of a line through NEAR samples: one sample that is late makes a long step and a short one, and none is lost.
+    Stamps that jitter make steps as much shorter as longer, a gap makes none shorter: a step that is as much longer
+    than the median as the shortest are shorter is no gap. The samples lost in a gap are counted from its own length, so
+    a clock that drifts moves none. A gap's ends are those of a line through NEAR samples: one sample that is late makes
+    a long step and a short one, and none is lost.
     """
     rows = _runs(t, usable)
     lengths, first, last = np.diff(rows, axis=1)[:, 0], rows[:, 0], rows[:, 1] - 1
@@ -144,7 +146,8 @@ def _runs(t: Array, usable: Flags | None) -> Index:
     if len(t) < 2:
         return np.empty((0, 2), dtype=np.int64)
     step = np.diff(t)
-    cut = step > GAP * np.median(step)
+    usual = float(np.median(step))
+    cut = step > max(GAP * usual, 2 * usual - float(np.quantile(step, EARLY)))
     if usable is not None:
         cut |= usable[1:] != usable[:-1]
     edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
@@ -165,6 +168,7 @@ def limits(t: Array, stretches: Index) -> tuple[float, float]:
 IMU = ("gyro", "accel")
 
 SPARSE = 0.2  # of the time that samples at their interval fill, at least
+EARLY = 1e-3  # of the steps, that are the shortest: a stamp is early by so much, and another one as late
 
 
 class TooShort(DataError):
@@ -227,17 +231,28 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     coefficients = {c: list(map(fit, of_axes)) for c, of_axes in curves.items()}
     axes = {c: axes_in(sensors.get(c), len(of_axes)) for c, of_axes in curves.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
-    if len(whole) * dt < SPARSE * total:
-        faults.doubt(
-            f"rows follow one another at {dt:.3g} s, enough for {len(whole) * dt:.3g} s of {total:.6g} s: "
-            "packets that were buffered have the time of their arrival; set source.interval"
-        )
+    _doubt_stamps(faults, len(whole), dt, total)
     first = next(iter(curves.values()))[0]
     notes = [*_gap_notes(first, whole, cut, faults), *_motion_notes(config, rest, faults)]
     for c, of_axes in coefficients.items():
         notes += _grouped(c, axes[c], [one.notes for one in of_axes])
     start, plugins = float(whole.t[cut.spans[0, 0]]), participants(config.source)
     return Analysis(name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors)
+
+
+def _doubt_stamps(faults: Faults, rows: int, dt: float, total: float) -> None:
+    """Note where the time stamps of so many rows, dt apart in the mean of `total` s, are not those of the samples."""
+    if rows * dt < SPARSE * total:
+        faults.doubt(
+            f"rows follow one another at {dt:.3g} s, enough for {rows * dt:.3g} s of {total:.6g} s: "
+            "packets that were buffered have the time of their arrival; set source.interval"
+        )
+    repeated = sum(fault.count for what, fault in faults.found.items() if "repeat a time stamp" in what)
+    if repeated > (1 - PRESENT) * faults.rows:
+        faults.doubt(
+            f"{repeated} of {faults.rows} rows repeat a time stamp and are left out: the clock is coarser than the "
+            "rows, and the noise is that of the rows that are left; set source.interval"
+        )
 
 
 def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.noise.allan_fit import LEVEL, Coefficients
-from driftlab.noise.allan_model import KEYS, WALK, AllanCurve, design
+from driftlab.noise.allan_model import KEYS, WALK, WHITE, AllanCurve, design
 from driftlab.noise.recording import Analysis
 from driftlab.reports.charts import Chart, Line, Panel, series
 from driftlab.reports.pages import page
@@ -22,7 +22,6 @@ from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
-WHITE = KEYS.index("white")
 
 
 def document(analysis: Analysis, *, curves: bool = True) -> dict[str, Any]:
@@ -105,8 +104,8 @@ def rows(analysis: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
 
 
 def _cell(fit: Coefficients, k: int, scale: float) -> str:
-    if fit.high[k] == 0:
-        return "-"
+    if np.isinf(fit.high[k]):
+        return "not measured"
     value, low, high = (number(v[k] / scale) for v in (fit.value, fit.low, fit.high))
     return f"{value} ({low} to {high})" if fit.value[k] > 0 else f"< {high}"
 
@@ -119,8 +118,8 @@ def config_lines(analysis: Analysis) -> str:
     """
     lines = ["filter:"]
     for channel, fits in analysis.coefficients.items():
-        if any(fit.high[WHITE] == 0 for fit in fits):
-            lines.append(f"  # {channel}: no coefficient could be fitted")
+        if any(np.isinf(fit.high[WHITE]) for fit in fits):
+            lines.append(f"  # {channel}: white noise is not measured")
             continue
         axes, units = analysis.axes[channel], units_of(analysis, channel)
         noise = [float(fit.value[WHITE] or fit.high[WHITE]) for fit in fits]
@@ -217,8 +216,8 @@ def _lines(c: AllanCurve, fit: Coefficients, scale: float, names: dict[str, str]
     floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
     A = design(c, hadamard=False).A
     if np.any(fit.best > 0):
-        fitted = np.sqrt(A @ fit.best**2) / scale
-        fitted[: fit.first] = np.nan
+        fitted = np.full(len(c.tau), np.nan)
+        fitted[fit.first :] = np.sqrt(A[fit.first :] @ (fit.best * np.abs(fit.best))) / scale
         yield Line(c.tau, fitted, "fit", "reference")
     for k, key in enumerate(KEYS):
         if fit.value[k] > 0:
@@ -254,8 +253,8 @@ def result_lines(analysis: Analysis) -> list[str]:
             k, scale = KEYS.index(key), float(convert(1.0, human[key], units.si[key]))
             worst = max(analysis.coefficients[channel], key=lambda fit: float(fit.value[k] or fit.high[k]))
             cell = _cell(worst, k, scale).partition(" (")[0]
-            parts.append(f"{names_of(units)[key]} {cell} {human[key]}" if cell != "-" else "")
-        lines.append(f"{channel}, worst axis: {', '.join(filter(None, parts))}.")
+            parts.append(f"{names_of(units)[key]} {cell}{f' {human[key]}' * bool(np.isfinite(worst.high[k]))}")
+        lines.append(f"{channel}, worst axis: {', '.join(parts)}.")
     return lines
 
 

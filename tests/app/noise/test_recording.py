@@ -5,12 +5,15 @@ import json
 import h5py
 import numpy as np
 import pytest
+from scipy import signal
 from sensors_at_rest import DT, simulated
 from typer.testing import CliRunner
 
-from driftlab.config import Config, load_config
+from driftlab.config import Config, Limits, load_config
+from driftlab.evaluation.limits import check_limits
+from driftlab.evaluation.measurements import of_allan
 from driftlab.noise.allan import curve
-from driftlab.noise.allan_fit import KEYS, Coefficients, fit
+from driftlab.noise.allan_fit import KEYS, fit
 from driftlab.noise.recording import Analysis, TooShort, analyse
 from driftlab.reports.allan import UNITS, config_lines, document, used
 from fusion_core.errors import DataError
@@ -64,9 +67,46 @@ def test_a_filter_in_the_sensor_moves_the_begin_of_the_fit():
     assert any("fitted from" in note for note in item.notes)
 
 
+def held(rate):
+    return np.repeat(rate, 10)
+
+
+def interpolated(rate):
+    return np.interp(np.arange(10 * len(rate)) / 10, np.arange(len(rate)), rate)
+
+
+def low_passed(rate, corner=0.2):
+    return signal.lfilter(*signal.butter(2, corner), rate)[2_000:]
+
+
+SMOOTHED = {"low-passed": (low_passed, DT), "held": (held, DT / 10), "interpolated": (interpolated, DT / 10)}
+
+
+@pytest.mark.parametrize("kind", SMOOTHED)
+def test_the_noise_before_a_filter_is_covered(kind):
+    """95 % limits of the white noise over eight seeds: at most 2 may miss (probability of more below 1 %)."""
+    smoothed, dt = SMOOTHED[kind]
+    found = [fit(curve(smoothed(simulated(14_000, seed, white=1.0, walk=0.01)), dt)) for seed in range(8)]
+    assert sum(not item.low[N] <= 1.0 <= item.high[N] for item in found) <= 2
+    assert np.median([item.high[N] / item.low[N] for item in found]) < 1.25
+    assert all(np.isinf(item.high[Q]) for item in found)
+
+
+def test_noise_that_a_filter_hides_is_not_measured():
+    """A corner at 1/400 of the rate leaves no decade and a half of averaging times beyond its reach."""
+    item = fit(curve(low_passed(simulated(12_000, 1, white=1.0), 0.005), DT))
+    assert not np.any(item.value)
+    assert np.all(np.isinf(item.high))
+    measured = of_allan([item], ["x"], 1000.0)
+    for row in check_limits(Limits(noise=10.0, bias_instability=10.0), measured):
+        assert (row.verdict, row.decision) == ("not measured", "undecided")
+        assert "filtered" in row.note
+
+
 def test_what_does_not_move_has_no_coefficient():
     item = fit(curve(np.full(1000, 0.1), DT))
     assert not np.any(item.value)
+    assert np.all(np.isinf(item.high))
     assert "does not move" in item.notes[0]
 
 
@@ -236,6 +276,21 @@ def test_too_short_is_refused(bench):
     assert len(done.curves["gyro"][0].tau) > 5
 
 
+def test_a_clock_that_is_coarser_than_the_rows_is_a_doubt(bench):
+    """Ten rows a second with stamps of whole seconds: one of ten is left, and no limit passes on those."""
+    write(bench / "whole.h5")
+    with h5py.File(bench / "whole.h5", "r+") as file:
+        file["time"][:] = np.floor(file["time"][:] + 1e-6)
+    limited = bench / "limited.yaml"
+    limited.write_text(CONFIG + "limits: {noise: 1 deg/s/sqrt(Hz)}\n")
+    done = command(limited, "--input", bench / "whole.h5", "--json")
+    content = json.loads(done.stdout)
+    assert any("set source.interval" in note for note in content["notes"])
+    assert [row["verdict"] for row in content["limits"]] == ["undecided"]
+    sound = json.loads(command(limited, "--input", bench / "rest.h5", "--json").stdout)
+    assert [row["verdict"] for row in sound["limits"]] == ["pass"]
+
+
 def test_two_axes_are_named_in_the_lines(tmp_path):
     rates = np.stack([simulated(2000, s, white=1e-4) for s in (0, 1)], axis=1)
     with h5py.File(tmp_path / "two.h5", "w") as file:
@@ -249,10 +304,8 @@ def test_two_axes_are_named_in_the_lines(tmp_path):
 
 def test_coefficients_of_nothing_make_no_lines(tmp_path):
     """A triad that cannot be fitted is a comment, not a section that the config would refuse."""
-    zero = np.zeros(5)
     c = curve(np.zeros(200), DT)
-    item = Coefficients(zero, zero, zero, np.zeros(len(c.tau)), zero)
-    found = Analysis("x", DT, 20.0, 20.0, 0.0, {"gyro": ["x"]}, {"gyro": [c]}, {"gyro": [item]}, [])
+    found = Analysis("x", DT, 20.0, 20.0, 0.0, {"gyro": ["x"]}, {"gyro": [c]}, {"gyro": [fit(c)]}, [])
     assert config_lines(found) == ""
 
 

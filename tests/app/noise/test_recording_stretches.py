@@ -26,6 +26,18 @@ def test_a_lost_sample_is_a_gap():
     assert (cut.rows.tolist(), cut.missing.tolist()) == ([[0, 50], [50, 98]], [1])
 
 
+def test_stamps_that_jitter_are_no_gaps():
+    """Stamps late and early by up to 45 % of the interval: steps of 0.1 to 1.9 of it, and none is lost."""
+    jitter = np.random.default_rng(1).uniform(-0.045, 0.045, 5_000)
+    t = np.arange(5_000) * 0.1 + jitter
+    whole = pieces(t)
+    assert whole.places.tolist() == [5_000]
+    assert whole.dt == pytest.approx(0.1, rel=1e-4)
+    lossy = pieces(np.delete(t, range(3_000, 3_020)))
+    assert (lossy.missing.max(), lossy.missing.sum()) == (20, 20)
+    assert lossy.dt == pytest.approx(0.1, rel=1e-4)
+
+
 def test_rows_that_are_not_usable_cut_too_and_are_not_bridged():
     t = times((0, 100), (120, 220))
     usable = np.ones(200, dtype=bool)
