@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.evaluation.overview import ScoredRun, map_of
-from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
+from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, WINDOW, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_remarks
 from driftlab.units import axis_name
@@ -178,18 +178,22 @@ def _scored(run: ScoredRun) -> list[str]:
 
 
 def _mispredicted(run: ScoredRun) -> list[str]:
-    """Return the longest prediction that is off by far more than its deviation, and what may be the cause."""
+    """Return the longest prediction that is off by far more than its deviation, and what may be the cause.
+
+    The white noise of the reference, a mean over WINDOW, counts too.
+    """
     scores, unit = run.yardsticks, run.unit
+    noise = run.sensor.noise * np.maximum(run.alignment.noise_ratio[run.sensor.channel], 1.0) / np.sqrt(WINDOW)
     for name in () if len(run.journal.alignments) > 1 else LONGEST_FIRST:  # one that was turned is another matter
-        ratio = scores.coast[name] / np.maximum(scores.coast_sigma[name], np.finfo(float).tiny)
+        ratio = scores.coast[name] / np.hypot(scores.coast_sigma[name], noise)
         if np.any(ratio > FAR_OFF):
             k = int(np.nanargmax(ratio))
             axis = axis_name(run.sensor.channel, scores.axes[k])
             by = f"{axis} {scores.coast[name][k] * unit.factor:.3g} {unit.shown}"
             return [
-                f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma, so map or walk do not fit this "
-                "recording; check that unit, axes and thermometer are those of the map, and see with driftlab explain "
-                "what is missing"
+                f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma and the reference's noise together, "
+                "so map or walk do not fit this recording; check that unit, axes and thermometer are those of the map, "
+                "and see with driftlab explain what is missing"
             ]
     return []
 

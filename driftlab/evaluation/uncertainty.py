@@ -85,17 +85,21 @@ def bias_budget(
     placements: Placements | None = None,
     level: float = 0.0,
 ) -> UncertaintyBudget:
-    """Return the budget of a fitted map at round temperatures of its domain.
+    """Return the budget of a fitted map at round temperatures of its domain, and at the ends of what was not recorded.
 
     `thermometer` is the expanded uncertainty of the thermometer, K. What a map's file does not keep, the power-ups of
     a soak of several recordings and placements, is in the budget where it is given; `level` is how far the level
     differs from one recording of a stimulus to another, 0 where it is not known.
     """
     T, record = temperatures(*fitted.domain), fitted.record
+    holes = record.error.holes if record.error is not None else ()
+    for low, high in holes:
+        T = np.unique(np.where((low < T) & (high > T), np.where((low + high) / 2 > T, low, high), T))
     bias, shape = fitted.bias(T), (len(T), record.d)
     if record.error is None:
         return UncertaintyBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
     sources, missing = [UncertaintySource("curve", "A", fitted.sigma(T))], []
+    missing += [f"the curve between {low:.4g} and {high:.4g} °C, of which there is no sample" for low, high in holes]
     left = np.zeros(record.d) if record.residual is None else np.asarray(record.residual)
     if record.samples and record.residual is not None:
         mean = np.broadcast_to(left / np.sqrt(record.samples), shape)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.filtering.segment import runs
-from driftlab.maps.fit import axes_of
+from driftlab.maps.fit import axes_of, unseen
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
@@ -159,23 +159,13 @@ class MapVerdict:
         return [f"{', '.join(each)}: {when}take {what}; {whether}"] if each else []
 
     def _coverage(self, unit: BiasUnit) -> list[str]:
-        lines = [
-            f"no sample between {start:.4g} and {stop:.4g} °C{self._inside(start, stop, unit)}; "
-            "record these temperatures too"
-            for start, stop in self.coverage.holes
-        ]
+        lines = [unseen(self.fitted, *hole, unit) for hole in self.coverage.holes]
         lines += [
             f"few samples between {part.start:.4g} and {part.stop:.4g} °C: {part.found:.0f} a kelvin, where "
             f"{part.needed:.0f} would bring white noise alone down to the curve's deviation; stay longer there"
             for part in self.coverage.thin
         ]
         return lines
-
-    def _inside(self, start: float, stop: float, unit: BiasUnit) -> str:
-        if self.fitted.record.error is None:
-            return ""
-        sigma = np.max(self.fitted.sigma(np.linspace(start, stop, 50), start), axis=0) * unit.factor
-        return f", the curve is known there only to {', '.join(text(v, 2) for v in sigma)} {unit.shown}"
 
 
 def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit) -> str:

@@ -178,13 +178,16 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     T = np.linspace(low, high, 200)
     sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0)) * unit.factor
     lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {unit.shown} (1 sigma)")
-    for start, stop in record.error.holes:
-        inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0) * unit.factor
-        lines.append(
-            f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} °C, the curve is known there only to "
-            f"{', '.join(f'{v:.2g}' for v in inside)} {unit.shown}; record these temperatures too"
-        )
-    return lines
+    return [*lines, *(f"map {record.kind}: {unseen(fitted, *hole, unit)}" for hole in record.error.holes)]
+
+
+def unseen(fitted: FittedMap, low: float, high: float, unit: BiasUnit) -> str:
+    """Return a sentence on the range between two temperatures in degC of which the soak has no sample."""
+    good = ""
+    if fitted.record.error is not None:
+        sigma = np.max(fitted.sigma(np.linspace(low, high, 50), low), axis=0) * unit.factor
+        good = f", good to {', '.join(f'{v:.2g}' for v in sigma)} {unit.shown} where it bends as elsewhere"
+    return f"no sample between {low:.4g} and {high:.4g} °C: the curve there is a guess{good}; record these too"
 
 
 @dataclass(frozen=True, eq=False)

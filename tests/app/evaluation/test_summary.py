@@ -92,6 +92,15 @@ def test_a_prediction_far_beyond_its_sigma_is_named_and_one_within_is_not():
     assert said(replace(QUIET, yardsticks=replace(SCORES, coast=near)), journal()) == []
 
 
+def test_the_noise_of_the_reference_is_no_error_of_a_prediction():
+    """A mean over 30 s of a sensor that is as loud as declared."""
+    loud = np.sqrt(30) * np.ones(3)
+    model = MODEL.model_copy(update={"gyro": MODEL.gyro.model_copy(update={"noise": loud})})
+    coast = {**SCORES.coast, "to the end": np.array([1.0, 5.0, 2.0])}
+    run = ScoredRun(Config(), model, journal(), replace(QUIET, yardsticks=replace(SCORES, coast=coast)), None)
+    assert remarks(run) == []
+
+
 def test_a_score_without_a_value_says_why():
     scores = replace(SCORES, filter_first=np.full(3, np.nan), share={**SCORES.share, "first 30 s": 0.1})
     (line,) = said(replace(QUIET, yardsticks=scores), journal())

@@ -42,6 +42,17 @@ def test_the_sources_add_up_by_their_squares_and_u_is_twice_that(verdict):
     assert np.array_equal(budget.values, verdict.map.bias(budget.T))
 
 
+def test_no_row_stands_where_nothing_was_recorded():
+    """What a curve does in a hole nobody can tell: a peak there is not seen."""
+    T, bias = soak(RNG(3))
+    keep = (T < 3) | (T > 22)
+    budget = bias_budget(verdict_on(T[keep], bias[keep]).map)
+    assert not np.any((budget.T > 3.1) & (budget.T < 21.9))
+    assert {3.0, 22.0} <= set(np.round(budget.T, 1))
+    assert any(text.endswith("°C, of which there is no sample") for text in budget.missing)
+    assert not any("no sample" in text for text in bias_budget(verdict_on(T, bias).map).missing)
+
+
 def test_a_thermometer_counts_by_the_slope(verdict):
     budget = bias_budget(verdict.map, thermometer=0.3)
     (thermometer,) = (source for source in budget.sources if source.name == "thermometer")
