@@ -1,7 +1,8 @@
 """The hooks of a plugin module.
 
 Each family of plugins (`fusion_core.contracts.families`, and those that `families()` adds) has a hook of its name,
-without arguments, that returns a list of classes: `bias_models()`, `effects()`, ... The two here return something else.
+without arguments, that returns a list of classes: `bias_models()`, `effects()`, ... A class of a family that bears the
+mark `hookimpl` itself stands for a hook that returns it alone. The two hooks here return something else.
 """
 
 from __future__ import annotations

@@ -162,18 +162,24 @@ class Registry:
         hooks = _hooks_of(module)
         known = (*self.families, PRODUCTS, "families")
         unknown = [hook for hook in hooks if hook not in known]
-        if unknown or not hooks:
+        if unknown or not (hooks or _classes_of(module)):
             hint = nearest(unknown[0], known) if unknown else None
             advice = f"did you mean {hint}?" if hint else f"decorate a function named like one of {', '.join(known)}"
             raise PluginError(
                 f"{name} implements {f'an unknown hook {unknown[0]}' if unknown else 'no hook'}; {advice}"
             )
-        for hook in hooks:
-            for item in () if hook == "families" else self._answers(module, hook):
-                try:
-                    self._add(hook, item, name, point)
-                except PluginError as error:
-                    self._break(_called(item), name, error, point, hook)
+        for hook, item in self._items(module):
+            try:
+                self._add(hook, item, name, point)
+            except PluginError as error:
+                self._break(_called(item), name, error, point, hook)
+
+    def _items(self, module: Any) -> Iterator[tuple[str, Any]]:
+        """Yield the plugins and products of a module with their hooks: those that functions return, then classes."""
+        for hook in _hooks_of(module):
+            yield from () if hook == "families" else ((hook, item) for item in self._answers(module, hook))
+        for item in _classes_of(module):
+            yield next((name for name, family in self.families.items() if issubclass(item, family.contract)), "?"), item
 
     def _add(self, hook: str, item: Any, module: str, point: EntryPoint | None) -> None:
         origin = Origin(hook, *_distribution(point))
@@ -182,6 +188,8 @@ class Registry:
             self._check_free(origin, kind)
             self._entries.append(Entry(hook, kind, *origin[1:], module, path=path))
             return
+        if hook not in self.families:
+            raise PluginError(f"{item.__name__} is marked as a plugin and of no family; derive it from a contract")
         family = self.families[hook]
         check_class(family, item)
         kind = kind_of(item)
@@ -209,6 +217,12 @@ def _hooks_of(module: Any) -> list[str]:
     """Return the names of the functions of a module that are marked as implementations of hooks."""
     members = {name: getattr(module, name, None) for name in dir(module)}
     return [name for name, item in members.items() if inspect.isroutine(item) and hasattr(item, f"{PROJECT}_impl")]
+
+
+def _classes_of(module: Any) -> list[type]:
+    """Return the classes of a module itself that are marked as plugins."""
+    classes = [item for item in vars(module).values() if inspect.isclass(item) and f"{PROJECT}_impl" in vars(item)]
+    return [item for item in classes if item.__module__ == module.__name__]
 
 
 def _product(name: Any, place: Any) -> tuple[str, Path]:

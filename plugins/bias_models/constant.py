@@ -19,6 +19,7 @@ from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.hookspecs import hookimpl
 
 
+@hookimpl
 class Constant(BiasModel):
     """Bias as an unknown constant."""
 
@@ -33,9 +34,3 @@ class Constant(BiasModel):
         """Return F = I and Q = 0."""
         d = len(self.axes)
         return Transition(np.eye(d), np.zeros((d, d)), np.zeros(d)), memory
-
-
-@hookimpl
-def bias_models() -> list[type[BiasModel]]:
-    """Register the plugin."""
-    return [Constant]

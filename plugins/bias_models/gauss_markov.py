@@ -21,6 +21,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit, along_axes
 
 
+@hookimpl
 class GaussMarkov(BiasModel):
     """Bias as an exponentially correlated process around an unknown constant."""
 
@@ -60,9 +61,3 @@ def _diagonal(values: Array, half: int) -> Array:
     """Return a diagonal (2d, 2d) with `values` in its first (0) or second (1) half."""
     which = np.diag(np.eye(2)[half])
     return np.asarray(np.kron(which, np.diag(values)), dtype=np.float64)
-
-
-@hookimpl
-def bias_models() -> list[type[BiasModel]]:
-    """Register the plugin."""
-    return [GaussMarkov]

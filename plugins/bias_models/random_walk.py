@@ -21,6 +21,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit, along_axes
 
 
+@hookimpl
 class RandomWalk(BiasModel):
     """Bias as a random walk."""
 
@@ -51,9 +52,3 @@ class RandomWalk(BiasModel):
     def _density(self) -> Array:
         """Of the walk (d, d): Q of one second."""
         return np.diag(along_axes(self.walk, len(self.axes)) ** 2)
-
-
-@hookimpl
-def bias_models() -> list[type[BiasModel]]:
-    """Register the plugin."""
-    return [RandomWalk]

@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import model_validator
 
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.contracts import BiasModel, Effect, Memory, Prior, ThermalBias, ThermalMap, Transition
+from fusion_core.contracts import Effect, Memory, Prior, ThermalBias, ThermalMap, Transition
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -51,6 +51,7 @@ class _Memory(NamedTuple):
         return cls(None, [None] * count, [None] * count, [None] * count, [1.0] * count, None)
 
 
+@hookimpl
 class ThermalDerivative(ThermalBias):
     """Bias that follows temperature through a map, plus a random walk."""
 
@@ -239,9 +240,3 @@ class ThermalDerivative(ThermalBias):
 def _as_measured(chunk: Chunk) -> Chunk:
     """Return the chunk as effects see it: an application's own smoothing of the temperature is none of theirs."""
     return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
-
-
-@hookimpl
-def bias_models() -> list[type[BiasModel]]:
-    """Register the plugin."""
-    return [ThermalDerivative]

@@ -8,12 +8,13 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Reading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.common import OfChannel, auxiliary
 
 
+@hookimpl
 class Channel(OfChannel):
     """A channel as it is; one with several columns acts with each of them."""
 
@@ -47,9 +48,3 @@ class Channel(OfChannel):
     def terms(self) -> tuple[str, ...]:
         """One a column."""
         return ("",) if self.columns == 1 else tuple(f"{self.channel}_{k}" for k in range(self.columns))
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Channel]

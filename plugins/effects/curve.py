@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.common import OfChannel, auxiliary
@@ -17,6 +17,7 @@ from fusion_plugins.effects.common import OfChannel, auxiliary
 _MAX_POWERS = 3  # powers
 
 
+@hookimpl
 class Curve(OfChannel):
     """Powers above + 1 ... above + powers of x = (u - middle) / half of the range; beyond the range the tangent."""
 
@@ -89,9 +90,3 @@ class Curve(OfChannel):
     def terms(self) -> tuple[str, ...]:
         """One a power."""
         return tuple(f"c{k}" for k in range(self.above + 1, self.above + self.powers + 1))
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Curve]

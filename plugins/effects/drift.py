@@ -10,6 +10,7 @@ from fusion_core.contracts.effect import Elapsed, Signal
 from fusion_core.hookspecs import hookimpl
 
 
+@hookimpl
 class Drift(Effect):
     """The time since the recording's first sample."""
 
@@ -30,9 +31,3 @@ class Drift(Effect):
     def realisation(self) -> tuple[Signal, ...]:
         """Return the time."""
         return (Elapsed(),)
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Drift]

@@ -15,6 +15,7 @@ from fusion_core.hookspecs import hookimpl
 _TILTED = 0.5  # m/s^2: an accelerometer of consumer grade drifts by 0.02 to 0.05 g over its temperatures
 
 
+@hookimpl
 class GSensitivity(Effect):
     """A 3 x 3 matrix on specific force."""
 
@@ -48,9 +49,3 @@ class GSensitivity(Effect):
     def terms(self) -> tuple[str, ...]:
         """The three components."""
         return ("f_x", "f_y", "f_z")
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [GSensitivity]

@@ -17,6 +17,7 @@ from fusion_plugins.effects.common import largest_reversal, up_to
 _WIDTHS, _NARROWEST, _WIDEST = 12, 0.02, 0.7  # to try: how many, and from where to where, of the swing
 
 
+@hookimpl
 class Hysteresis(Effect):
     """A play operator: the loop's position y - T, from -width / 2 (warming up) to width / 2 (cooling down)."""
 
@@ -68,9 +69,3 @@ class Hysteresis(Effect):
         lows, highs = np.minimum(np.minimum.accumulate(T), lowest), np.maximum(np.maximum.accumulate(T), highest)
         crossed = highs - lows >= self.width
         return np.where(crossed, 0.0, 1.0), (float(lows[-1]), float(highs[-1]))
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Hysteresis]

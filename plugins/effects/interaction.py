@@ -15,6 +15,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.common import auxiliary
 
 
+@hookimpl
 class Interaction(Effect):
     """(a - a_0) (b - b_0), together with a and b themselves (temperature is the map's).
 
@@ -73,9 +74,3 @@ class Interaction(Effect):
     @property
     def _factors(self) -> list[tuple[str, float]]:
         return [item for item in dict(zip(self.channels, self.zero, strict=True)).items() if item[0] != "temperature"]
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Interaction]

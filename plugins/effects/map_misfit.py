@@ -15,6 +15,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
 
+@hookimpl
 class MapMisfit(Effect):
     """Cubic B-splines on equal intervals from `low` to `high`; the function is constant beyond."""
 
@@ -76,9 +77,3 @@ class MapMisfit(Effect):
     def terms(self) -> tuple[str, ...]:
         """One a spline."""
         return tuple(f"B{k}" for k in range(self.intervals + 3))
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [MapMisfit]

@@ -19,6 +19,7 @@ _FINE = 8  # frequencies to the resolution of all recordings together
 _MAX_FREQUENCIES = 1000  # frequencies that are tried on either side of a line
 
 
+@hookimpl
 class Periodic(Effect):
     """Sine and cosine of time as the recording counts it: one phase for all recordings of one clock."""
 
@@ -86,9 +87,3 @@ def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
     t = t - t.mean()
     power = [float(np.sum(np.abs(np.exp(-2j * np.pi * frequency * t) @ e) ** 2)) for frequency in f]
     return float(1 / f[int(np.argmax(power))])
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Periodic]

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -19,6 +19,7 @@ _OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
 _OF_SPAN = 0.5  # longest time constant to try, of the longest recording: beyond, it is the channel itself
 
 
+@hookimpl
 class Relaxation(FadingLag, OfChannel):
     """u - lag(u): what of the channel u a first-order lag tau has not followed yet; or, where it acts late, lag(u)."""
 
@@ -78,9 +79,3 @@ class Relaxation(FadingLag, OfChannel):
         """Of the channel: kelvin, or its SI unit."""
         thermometer = self.channel.startswith("temperature")
         return ("bias/K" if thermometer else "bias per SI unit of the channel",) * len(self.labels)
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [Relaxation]

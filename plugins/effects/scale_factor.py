@@ -19,6 +19,7 @@ _TURNED = 0.1  # of the input: it differs by more from one recording to another,
 Form = Literal["constant", "of temperature", "both"]
 
 
+@hookimpl
 class ScaleFactor(Effect):
     """Regressors u_i and u_i (T - T_0) on axis i, with u the input: specific force, or the reference of the sensor."""
 
@@ -109,9 +110,3 @@ def _input_of(recordings: Sequence[Chunk]) -> tuple[str, list[Array]] | None:
         if constant and size > _KNOWN * max(float(np.max(np.abs(chunk["excess"]))) for chunk in recordings):
             return name, known
     return None
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [ScaleFactor]

@@ -16,6 +16,7 @@ from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.common import lag_of
 
 
+@hookimpl
 class ThermalGradient(Effect):
     """The difference of a second thermometer to `temperature`, and its rate over `window`.
 
@@ -83,9 +84,3 @@ class ThermalGradient(Effect):
         """Units of the terms, axis by axis."""
         units = {"difference": "bias/K", "rate": "bias/(K/s)"}
         return tuple(units[term] for _ in self.axes for term in self.terms)
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [ThermalGradient]

@@ -8,13 +8,14 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory
+from fusion_core.contracts import Memory
 from fusion_core.contracts.effect import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.common import FadingLag, lag_of
 
 
+@hookimpl
 class ThermalLag(FadingLag):
     """The map sees the temperature through a first-order lag tau; no coefficient."""
 
@@ -57,9 +58,3 @@ class ThermalLag(FadingLag):
     def terms(self) -> tuple[str, ...]:
         """There is none."""
         return ()
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [ThermalLag]

@@ -13,6 +13,7 @@ from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.common import lag_of
 
 
+@hookimpl
 class ThermalRate(Effect):
     """dT/dt through s (1 + 3 tau s) / (1 + tau s)^3: without a coarse thermometer's steps, and late on no ramp."""
 
@@ -54,9 +55,3 @@ class ThermalRate(Effect):
     def memory_span(self) -> float:
         """Of the differentiator."""
         return float(self.tau)
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [ThermalRate]

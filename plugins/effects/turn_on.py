@@ -17,6 +17,7 @@ from fusion_plugins.effects.common import longest_span
 _OF_SPAN = 1 / 3  # longest time constant to try, of the longest recording: beyond, it is a drift
 
 
+@hookimpl
 class TurnOn(Effect):
     """exp(-t / tau), with t since the recording's first sample."""
 
@@ -49,9 +50,3 @@ class TurnOn(Effect):
     def realisation(self) -> tuple[Signal, ...]:
         """Return the exponential."""
         return (Fading(float(self.tau)),)
-
-
-@hookimpl
-def effects() -> list[type[Effect]]:
-    """Register the plugin."""
-    return [TurnOn]

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Exporter, ReadBack
+from fusion_core.contracts import Calibrated, ReadBack
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import same_dimension
@@ -79,6 +79,7 @@ class ArduPilotParameters(autopilot.Firmware):
         return np.asarray(np.clip(T, self.T_min, self.T_max), dtype=np.float32)
 
 
+@hookimpl
 class Ardupilot(Autopilot):
     """Thermal parameters of ArduPilot, for MAVProxy and Mission Planner."""
 
@@ -238,9 +239,3 @@ def _calibration(values: Mapping[str, float], kind: FirmwareSensor, imu: int) ->
         notes.append(f"{kind.channel}: {names.caltemp} is not set, the firmware takes TMIN in its place")
     scale = np.array([values.get(name, 1.0) for name in of_axes(names.scale)]) if kind.scaled else None
     return autopilot.read_back(kind, held, f"IMU {imu}", notes, {"imu": str(imu)}, scale=scale)
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [Ardupilot]

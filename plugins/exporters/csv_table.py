@@ -21,6 +21,7 @@ from fusion_plugins.exporters.mat import between, rows_of
 DIGITS = ".9g"
 
 
+@hookimpl
 class CsvTable(Exporter):
     """A table of temperature, bias and deviation."""
 
@@ -53,9 +54,3 @@ class CsvTable(Exporter):
         lines = [*map(csv_comment, head), ",".join(map(csv_cell, header)), *(",".join(row) for row in rows)]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [CsvTable]

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from fusion_core.contracts import Export, Exporter
+from fusion_core.contracts import Export
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise, matrix_lines
 
@@ -35,6 +35,7 @@ def densities(noise: dict[str, SensorNoise]) -> list[str]:
     return [f"{name}: {getattr(noise[c], which).value:{DIGITS}}  # {unit}" for name, c, which, unit in NAMES]
 
 
+@hookimpl
 class Kalibr(ImuNoise):
     """The imu.yaml of Kalibr."""
 
@@ -56,9 +57,3 @@ class Kalibr(ImuNoise):
         yield from super().notes(what)
         if len(list(self.matrices(what))) == len(CHANNELS):
             yield "C_gyro_i: is right where both maps are in one frame, as a gyro's by placements of this accelerometer"
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [Kalibr]

@@ -43,6 +43,7 @@ from fusion_core.units import Quantity, Unit
 from fusion_plugins.mat_elements import Elements, Variable
 
 
+@hookimpl
 class Mat(Exporter):
     """A .mat file with a struct for each sensor."""
 
@@ -225,9 +226,3 @@ def structs_of(path: Path) -> dict[str, Mapping[str, Variable]]:
         elements = Elements(path, file, size)
         variables = [elements.load(at) for _, at in elements.variables()]
     return {variable.name: variable.fields for variable in variables if variable and variable.fields}
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [Mat]

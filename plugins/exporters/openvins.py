@@ -28,7 +28,7 @@ from typing import Literal
 
 import numpy as np
 
-from fusion_core.contracts import Export, Exporter
+from fusion_core.contracts import Export
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise, matrix_lines
 from fusion_plugins.exporters.kalibr import densities
@@ -37,6 +37,7 @@ FIRST = "%YAML:1.0"
 INTRINSICS = {"gyro": ("Tw", "R_IMUtoGYRO"), "accel": ("Ta", "R_IMUtoACC")}
 
 
+@hookimpl
 class OpenVins(ImuNoise):
     """The kalibr_imu_chain.yaml of OpenVINS, or the keys of VINS."""
 
@@ -83,9 +84,3 @@ def _of_samples(rate: float, noise: dict[str, SensorNoise]) -> list[str]:
             f"{name}_w: {walk * step:{DIGITS}}  # {unit}/s: {walk:.4g} {unit}/sqrt(s) times sqrt({rate:g} Hz)",
         ]
     return lines
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [OpenVins]

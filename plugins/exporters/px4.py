@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Exporter, ReadBack, warm_up
+from fusion_core.contracts import Calibrated, ReadBack, warm_up
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.exporters import autopilot
@@ -93,6 +93,7 @@ class Px4Parameters(autopilot.Firmware):
         return np.asarray(offset, dtype=np.float32)
 
 
+@hookimpl
 class Px4(Autopilot):
     """Thermal parameters of PX4, for QGroundControl."""
 
@@ -297,9 +298,3 @@ def published(t: ArrayLike, temperature: ArrayLike, others: Sequence[ArrayLike] 
         own = T[look] if np.any(moved) else own
         used[look:after] = own
     return used
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [Px4]

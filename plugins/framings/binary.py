@@ -161,6 +161,7 @@ class BinaryField(Settings):
         return raw if kind.kind == "f" else np.clip(np.rint(raw), np.iinfo(kind).min, np.iinfo(kind).max)
 
 
+@hookimpl
 class Binary(Framing):
     """Frames of a fixed layout between sync bytes and a checksum."""
 
@@ -296,9 +297,3 @@ class Binary(Framing):
 def _until_false(flags: NDArray[np.bool_]) -> int:
     k = int(flags.argmin()) if len(flags) else 0
     return len(flags) if not len(flags) or flags[k] else k
-
-
-@hookimpl
-def framings() -> list[type[Framing]]:
-    """Register the plugin."""
-    return [Binary]

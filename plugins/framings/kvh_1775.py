@@ -36,6 +36,7 @@ ALL_VALID = 0x77
 HEADERS = {"A": "FE 81 FF 55", "B": "FE 81 FF 56"}
 
 
+@hookimpl
 class Kvh1775(Framing):
     """The KVH 1775 inertial unit, message formats A and B."""
 
@@ -104,9 +105,3 @@ class Kvh1775(Framing):
         number = begun + np.arange(len(chunk))
         more = {"status": np.full(len(chunk), ALL_VALID), "sequence": number % 128}
         return self._binary.encode(Chunk(chunk.t, {**chunk.channels, **more}), begun)
-
-
-@hookimpl
-def framings() -> list[type[Framing]]:
-    """Register the plugin."""
-    return [Kvh1775]

@@ -32,6 +32,7 @@ LONGEST = 4096  # bytes of a line
 UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before the stream, within it, too far back
 
 
+@hookimpl
 class Text(Framing):
     """Lines of numbers between separators."""
 
@@ -182,9 +183,3 @@ def _numbers(cells: Sequence[str]) -> list[float] | None:
         return [float(cell) for cell in cells]
     except ValueError:
         return None
-
-
-@hookimpl
-def framings() -> list[type[Framing]]:
-    """Register the plugin."""
-    return [Text]

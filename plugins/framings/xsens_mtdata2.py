@@ -49,6 +49,7 @@ class Item(NamedTuple):
     size: int
 
 
+@hookimpl
 class XsensMtdata2(Framing):
     """Xsens MTi units, messages MTData2."""
 
@@ -197,9 +198,3 @@ def _hold(values: Array, before: Array | None) -> Array:
     row = np.where(np.isfinite(values[:, 0]), np.arange(1, len(values) + 1), 0)
     known = np.concatenate([[[np.nan]] if before is None else [before], values])
     return np.asarray(known[np.maximum.accumulate(row)] if len(values) else values, dtype=np.float64)
-
-
-@hookimpl
-def framings() -> list[type[Framing]]:
-    """Register the plugin."""
-    return [XsensMtdata2]

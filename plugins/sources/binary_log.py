@@ -42,6 +42,7 @@ STAMP = ""  # under which a block gives the times that are made here: no field i
 Numbers = NDArray[np.int64]
 
 
+@hookimpl
 class BinaryLog(contracts.FileSource):
     """A file of the bytes that a device sent; a gzip archive is read as it is."""
 
@@ -196,9 +197,3 @@ class Stamps:
 
     def _where(self) -> str:
         return "at the start" if self.raw is None or self.tick is None else f"after {seconds(self.x * self.tick)}"
-
-
-@hookimpl
-def sources() -> list[type[contracts.Source]]:
-    """Register the plugin."""
-    return [BinaryLog]

@@ -28,7 +28,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of, unpacked_at_most
 from fusion_core.chunk import Array
-from fusion_core.contracts import Block, Source, Table, foreign, recognised
+from fusion_core.contracts import Block, Table, foreign, recognised
 from fusion_core.contracts.file_source import problem
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -63,6 +63,7 @@ DAY = 86_400.0  # s
 GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
 
 
+@hookimpl
 class Csv(TableSource):
     """A text file with a header line, or a gzip archive of one; the path `-` is standard input."""
 
@@ -480,9 +481,3 @@ def _number(cell: str) -> float | None:
         return np.nan if cell in ("", *MISSING) else float(cell)
     except ValueError:
         return None
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Csv]

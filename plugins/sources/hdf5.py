@@ -21,7 +21,7 @@ import numpy as np
 
 from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
-from fusion_core.contracts import Block, Source, Table, foreign, head
+from fusion_core.contracts import Block, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
@@ -32,6 +32,7 @@ from fusion_plugins.sources.unpacked import damaged, unpacking
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
+@hookimpl
 class Hdf5(TableSource):
     """An HDF5 or NetCDF-4 file."""
 
@@ -187,9 +188,3 @@ def _translated(path: Path) -> Iterator[None]:
                 f"{path}: was not closed by the program that wrote it; repair a copy with `h5clear -s COPY`"
             ) from None
         raise damaged(path, reason) from None
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Hdf5]

@@ -24,7 +24,7 @@ import numpy as np
 
 from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
-from fusion_core.contracts import Block, Source, Table, foreign, head
+from fusion_core.contracts import Block, Table, foreign, head
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
@@ -42,6 +42,7 @@ PLAIN = ["double", "single", "logical", "int8", "uint8", "int16", "uint16", "int
 AS_STRUCT = "in MATLAB, S = table2struct(timetable2table(TT), 'ToScalar', true); save('FILE', 'S', '-v7')"
 
 
+@hookimpl
 class Mat(TableSource):
     """A MAT file of MATLAB or Octave."""
 
@@ -295,9 +296,3 @@ def _version_4(first: bytes) -> bool:
             if good and imaginary in (0, 1) and 1 < name <= 64 and first[19 + name : 20 + name] == b"\0":
                 return True
     return False
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Mat]

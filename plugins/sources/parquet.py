@@ -34,7 +34,7 @@ import numpy as np
 
 from fusion_core.budget import PIECE, TimeBudget, check_count, check_size
 from fusion_core.chunk import Array
-from fusion_core.contracts import Block, Source, Table, foreign, head
+from fusion_core.contracts import Block, Table, foreign, head
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -49,6 +49,7 @@ SIGNATURE = b"PAR1"
 WIDE = 1024  # values of a list that can be channels
 
 
+@hookimpl
 class Parquet(TableSource):
     """A Parquet file."""
 
@@ -410,9 +411,3 @@ class _Struct:
     def _number(self) -> int:
         value = self._varint()
         return (value >> 1) ^ -(value & 1)
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Parquet]

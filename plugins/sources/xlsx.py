@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from fusion_core.budget import PIECE, check_size
-from fusion_core.contracts import Source, Table, foreign, head
+from fusion_core.contracts import Table, foreign, head
 from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -40,6 +40,7 @@ SHARED, ITEM = re.compile(rb"\bt\s*=\s*[\"']s[\"']"), re.compile(rb"<(?:[^\s<>/:
 CELL = 64.0  # bytes that one takes
 
 
+@hookimpl
 class Xlsx(Csv):
     """A sheet of a workbook of Excel."""
 
@@ -202,9 +203,3 @@ def _text(cell: Any) -> str:
     if isinstance(cell, time):
         return cell.isoformat("microseconds")
     return " ".join(cell.split()) if isinstance(cell, str) else str(float(cell) if isinstance(cell, bool) else cell)
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Xlsx]

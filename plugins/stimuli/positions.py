@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fusion_core.contracts import Stimulus
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.stimuli.placements import PlacedStimulus
 
 
+@hookimpl
 class Positions(PlacedStimulus):
     """Placements by hand, or on six faces and between them."""
 
     kind: Literal["positions"] = "positions"
-
-
-@hookimpl
-def stimuli() -> list[type[Stimulus]]:
-    """Register the plugin."""
-    return [Positions]

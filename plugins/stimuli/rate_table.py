@@ -30,6 +30,7 @@ class _Turn(NamedTuple):
     rate: float
 
 
+@hookimpl
 class RateTable(Stimulus):
     """A turntable: its rates as a table of segments, or as a channel of the recording."""
 
@@ -114,9 +115,3 @@ class RateTable(Stimulus):
             channels = {"gyro": y, "accel": force, self.channel: rate, "temperature": np.full(len(rate), 20.0)}
             made.append(Chunk(dt * np.arange(1.0, len(rate) + 1), channels))
         return made
-
-
-@hookimpl
-def stimuli() -> list[type[Stimulus]]:
-    """Register the plugin."""
-    return [RateTable]

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fusion_core.contracts import Stimulus
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.stimuli.placements import PlacedStimulus
 
 
+@hookimpl
 class Tumble(PlacedStimulus):
     """Placements over temperature, of a chamber with a two-axis table or hands."""
 
     kind: Literal["tumble"] = "tumble"
-
-
-@hookimpl
-def stimuli() -> list[type[Stimulus]]:
-    """Register the plugin."""
-    return [Tumble]

@@ -32,6 +32,7 @@ _OF_SWING = 1e-4  # at least
 _PLACES = 200  # at which that is looked up
 
 
+@hookimpl
 class C99(Exporter):
     """C99 with a table of knots, its memories in a struct."""
 
@@ -149,9 +150,3 @@ def usual_loss(sensor: Calibrated) -> Array:
     swing = np.ptp(fitted.bias(T), axis=0)
     largest = np.maximum(np.max(swing), np.finfo(np.float32).tiny)
     return np.asarray(np.maximum(_OF_KNOWN * known, _OF_SWING * largest))
-
-
-@hookimpl
-def exporters() -> list[type[Exporter]]:
-    """Register the plugin."""
-    return [C99]

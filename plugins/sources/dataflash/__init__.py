@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from fusion_core.contracts import FileSource, Source, Table, foreign, head
+from fusion_core.contracts import FileSource, Table, foreign, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -30,6 +30,7 @@ TEXT = b"FMT, "  # of a log as text
 NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
 
 
+@hookimpl
 class DataFlash(FileSource):
     """A DataFlash log of an ArduPilot vehicle, from the card or as a ground station downloads it."""
 
@@ -89,9 +90,3 @@ def _binary(path: Path, faults: Faults) -> Iterator[Path]:
 
     with binary(path, faults) as place:
         yield place
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [DataFlash]

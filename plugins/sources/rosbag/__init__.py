@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from fusion_core.budget import COPIED, check_count, keep, temporary_folder, unpacked_at_most
 from fusion_core.chunk import Array
-from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.contracts import Block, FileSource, Table, foreign, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -46,6 +46,7 @@ ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
 
 
+@hookimpl
 class Rosbag(FileSource):
     """A ROS bag: a file, or the folder of a ROS 2 bag."""
 
@@ -348,12 +349,6 @@ class TopicStream:
             first = times[np.argmax(which)]
             where = f"{at} {first // SECOND}.{first % SECOND:09d} s"
             self.faults.add(f"messages on {self.topic} {what}", int(np.sum(which)), where)
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Rosbag]
 
 
 FILES = 500  # that are open at a time

@@ -51,6 +51,7 @@ FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # s before the port is opened again
 LOOK_UP = 1.0  # s without a sample before an empty chunk is yielded
 
 
+@hookimpl
 class Serial(Source):
     """A device on a serial port, or behind a URL of pyserial."""
 
@@ -268,9 +269,3 @@ class Port:
                 self.dropped += lost
                 self._torn = True
             self._some.notify()
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Serial]

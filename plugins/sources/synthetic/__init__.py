@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import SimulatedSource, Site, Source, Twin
+from fusion_core.contracts import SimulatedSource, Site, Twin
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.recursions import LaggedLines, play
@@ -201,6 +201,7 @@ class SimulatedAccel(Settings):
     """Step to which the output is rounded."""
 
 
+@hookimpl
 class Synthetic(SimulatedSource):
     """A simulated unit at rest in a climatic chamber."""
 
@@ -338,9 +339,3 @@ class Synthetic(SimulatedSource):
         x_level = np.array([np.cos(self.pitch), -np.sin(self.pitch) * np.sin(self.roll),
                             -np.sin(self.pitch) * np.cos(self.roll)])  # fmt: skip
         return earth_rate(up, self.latitude, self.heading, x_level), g
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Synthetic]

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from fusion_core.contracts import FileSource, Source, Table
+from fusion_core.contracts import FileSource, Table
 from fusion_core.contracts.file_source import problem
 from fusion_core.errors import ConfigError, MissingChannel, quote
 from fusion_core.faults import Faults
@@ -50,6 +50,7 @@ def _number(value: object) -> object:
         raise problem(f"'{quote(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
 
 
+@hookimpl
 class Ulog(FileSource):
     """A log of PX4."""
 
@@ -146,9 +147,3 @@ class Ulog(FileSource):
                 raise MissingChannel(
                     f"{table.log.path}: has no rows of {topic} for channel {name}; {advice}. The log has: {have}"
                 )
-
-
-@hookimpl
-def sources() -> list[type[Source]]:
-    """Register the plugin."""
-    return [Ulog]

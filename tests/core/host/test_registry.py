@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts import BiasModel, Prior, Transition
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, PluginError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host import registry as module
 from fusion_core.host.config import Document, validate
@@ -55,6 +55,26 @@ def test_a_class_is_found_by_its_kind():
     registry.register(plugin("good", Still))
     assert registry.classes(BiasModel) == {"still": Still}
     assert kind_of(Still) == "still"
+
+
+def test_a_marked_class_is_a_plugin_of_the_module_that_defines_it():
+    own, other = types.ModuleType(Still.__module__), types.ModuleType("other")
+    own.Marked = other.Marked = hookimpl(type("Marked", (Still,), {"__module__": own.__name__}))
+    own.Derived = type("Derived", (own.Marked,), {"__module__": own.__name__})  # bears no mark of its own
+    registry = Registry()
+    registry.register(own)
+    assert registry.classes(BiasModel) == {"still": own.Marked}
+    with pytest.raises(PluginError, match="other implements no hook"):
+        Registry().register(other)
+
+
+def test_a_marked_class_of_no_family_is_shown_with_its_error():
+    own = types.ModuleType(__name__)
+    own.Lonely = hookimpl(type("Lonely", (), {"__module__": __name__}))
+    registry = Registry()
+    registry.register(own)
+    (broken,) = [entry for entry in registry.entries if entry.error]
+    assert "Lonely is marked as a plugin and of no family; derive it from a contract" in broken.error
 
 
 @pytest.mark.parametrize(
