@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +13,22 @@ import numpy as np
 from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.family_map import FamilyMapResult, fit_family_map, show_family_map
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, Units, config_of, recordings_of
-from driftlab.commands.result import Result
-from driftlab.commands.triad_map import TriadMapResult, fit_triad_map, show_triad_map
+from driftlab.commands.triad_map import COMMAND, MapResult, TriadMapResult, fit_triad_map, names_beside, show_triad_map
 from driftlab.config import Config, paths_of
-from driftlab.evaluation.limits import check_limits
-from driftlab.evaluation.limits import verdict as verdict_line
-from driftlab.evaluation.measurements import of_map
 from driftlab.maps.assessment import MapVerdict
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings, usual_settings
 from driftlab.maps.kind_selection import KindComparison, candidates, divide
 from driftlab.maps.kind_selection import compare as compare_kinds
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.reports import map_selection
-from driftlab.reports.certificate import FILES as CERTIFICATE
 from driftlab.reports.certificate import Certificate
 from driftlab.reports.charts import Chart
 from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.map import chart, page_of
-from driftlab.reports.provenance import Sheet, map_facts, sheet_of
+from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
-from driftlab.storage.map_file import check_all, save, write_beside
-from driftlab.units import tracked_unit
+from driftlab.storage.map_file import check_all
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError
@@ -44,11 +36,10 @@ from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 
-COMMAND = "fit-map"  # by which its files are known
 MAX_BLOCKS = 4096  # of all recordings, where kinds are compared
 
 
-class FitMapResult(Result):
+class FitMapResult(MapResult):
     """A fitted map, as arrays over its domain: `temperature` (N,), `bias`, `slope` and `sigma` (N, d).
 
     Attributes
@@ -57,16 +48,8 @@ class FitMapResult(Result):
         The map itself: `map.bias(T)`, `map.slope(T)`, `map.sigma(T)` at any temperatures.
     verdict : MapVerdict
         How good it is: sigma, misfits, what differs between up and down, coverage.
-    selection : Selection or None
-        How its size was chosen, if it was.
     comparison : KindComparison or None
         How its kind was chosen, if it was.
-    limits : list of LimitResult
-        The config's limits, held against the map.
-    sensor, unit : Sensor or None, BiasUnit
-        Whose map it is, and in which unit it is shown.
-    written : tuple of Path
-        The files that were written.
     """
 
     def __init__(
@@ -78,14 +61,9 @@ class FitMapResult(Result):
         selection: Selection | None = None,
         comparison: KindComparison | None = None,
     ) -> None:
-        self.config, self.recordings, model = config, list(recordings) or None, config.filter
-        fitted, self.comparison = verdict.map, comparison
-        self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
-        self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
-        self.measured = of_map(fitted, self.unit)
-        self.limits = check_limits(config.limits, self.measured, faults.doubts)
-        self.limits_verdict = verdict_line(self.limits)
-        self.written: tuple[Path, ...] = ()
+        super().__init__(config, recordings, fitted := verdict.map, faults)
+        self.verdict, self.selection, self.comparison = verdict, selection, comparison
+        self.plugins = participants(verdict.settings)
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
         self.name = f"map {record.kind} of the {record.channel}"
         self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
@@ -110,29 +88,12 @@ class FitMapResult(Result):
         """Return samples and curve over temperature, the residuals, how sure it is and on how many samples."""
         return chart(self.verdict, self.unit)
 
-    def save(
-        self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False
-    ) -> None:
-        """Write the map to the file `out`, and its page; where its size was chosen, `select.json` and `select.svg` too.
-
-        Those, and a certificate, are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or
-        MapError.
-        """
-        path, folder, selection = Path(out), None if report is None else Path(report), self.selection
-        names = _names(selected=selection is not None, certificate=certificate)
-        check_all(path, folder, [], names, COMMAND)
-        save(self.map, path, COMMAND)
-        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
-        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        texts = [page_of(self.verdict, self.unit, self.faults.lines(doubts=False), sheet, self.comparison)]
-        if selection is not None:
-            drawn = figure_of(map_selection.chart(selection, self.unit))
-            texts += [text_of(map_selection.selection_document(selection, self.unit)), svg(drawn)]
-        if certificate:
-            signed = self._certificate(sheet)
-            texts += [signed.page(), signed.text()]
-        written = dict(zip(names, texts, strict=True))  # a certificate of an earlier map is not of this one
-        self.written = (path, *write_beside(path, folder, written, COMMAND, CERTIFICATE))
+    def _texts(self, sheet: Sheet) -> list[str]:
+        page = page_of(self.verdict, self.unit, self.faults.lines(doubts=False), sheet, self.comparison)
+        if self.selection is None:
+            return [page]
+        drawn = figure_of(map_selection.chart(self.selection, self.unit))
+        return [page, text_of(map_selection.selection_document(self.selection, self.unit)), svg(drawn)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
@@ -239,7 +200,7 @@ def fit_map(
             raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
     if place is not None:
         read = [*understood.files_to_fit(), *paths_of(recordings)]
-        check_all(place, folder, read, _names(selected=neurons is not None, certificate=certificate), COMMAND)
+        check_all(place, folder, read, names_beside(selected=neurons is not None, certificate=certificate), COMMAND)
     result = _fitted(understood, recordings, kind, neurons, compare, progress)
     if place is not None:
         result.save(place, report=folder, certificate=certificate)
@@ -306,12 +267,6 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
         if len(cuts) > 1:
             T[-1][[np.argmin(T[-1]), np.argmax(T[-1])]] = np.min(own_T), np.max(own_T)
     return T, bias
-
-
-def _names(*, selected: bool, certificate: bool) -> list[str]:
-    """Return the names of the page, of the selection's files and of the certificate."""
-    more = ["select.json", "select.svg"] * selected
-    return ["report.html", *more, *(CERTIFICATE if certificate else ())]
 
 
 def _check_family(family: Place | None, lot: str | None, more: bool) -> None:

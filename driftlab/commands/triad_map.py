@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -22,6 +23,7 @@ from driftlab.family.file import load_family
 from driftlab.family.terms import TermsLaw
 from driftlab.filtering.setup import check_map
 from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
+from driftlab.maps.network_size import Selection
 from driftlab.reports import triad as words
 from driftlab.reports.certificate import FILES as CERTIFICATE
 from driftlab.reports.certificate import Certificate
@@ -37,15 +39,83 @@ from driftlab.units import tracked_unit
 from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
 from fusion_core.faults import Faults
+from fusion_core.host.provenance import Participant
 from fusion_core.host.registry import registry
 from fusion_core.thermal.record_texts import recorded
 
 ASKED = {**GROUPS, "g_sensitivity": [len(TERMS) + j for j in range(len(SENSITIVITIES))]}
 USUAL_BIAS = {"rad/s": np.deg2rad(1.0), "m/s^2": 0.5}  # of a unit of which nothing is known
 POINTS = 400  # temperatures of the curve
+COMMAND = "fit-map"  # by which its files are known
 
 
-class TriadMapResult(Result):
+class MapResult(Result):
+    """A fitted map of a sensor, held against the limits of its config; subclasses say what stands on its page.
+
+    Attributes
+    ----------
+    map : FittedMap
+    recordings : list of str or None
+        Those that were given; None: the config's own.
+    limits : list of LimitResult
+        The config's limits, held against the map.
+    sensor, unit : Sensor or None, BiasUnit
+        Whose map it is, and in which unit it is shown.
+    selection : Selection or None
+        How its size was chosen, if it was.
+    plugins : list of dict, or None
+        Those that took part; None: those of the config.
+    written : tuple of Path
+        The files that were written.
+    """
+
+    selection: Selection | None = None
+    plugins: list[Participant] | None = None
+
+    def __init__(self, config: Config, recordings: Sequence[str], fitted: FittedMap, faults: Faults) -> None:
+        self.config, self.recordings, self.map, self.faults = config, list(recordings) or None, fitted, faults
+        self.sensor, self.unit = None if config.filter is None else config.filter.tracked, tracked_unit(config.filter)
+        self.measured = of_map(fitted, self.unit)
+        self.limits = check_limits(config.limits, self.measured, faults.doubts)
+        self.limits_verdict = verdict_line(self.limits)
+        self.written: tuple[Path, ...] = ()
+
+    @abstractmethod
+    def _texts(self, sheet: Sheet) -> list[str]:
+        """Return the texts of the files beside the map, in the order of `names_beside`, but for a certificate's."""
+
+    @abstractmethod
+    def _certificate(self, sheet: Sheet) -> Certificate:
+        """Return the certificate of the map."""
+
+    def save(
+        self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False
+    ) -> None:
+        """Write the map to the file `out`, and its page; where its size was chosen, `select.json` and `select.svg` too.
+
+        Those, and a `certificate` where it is asked for, are beside the map, or in the folder `report`. Raises
+        ConfigError, Unwritable or MapError.
+        """
+        path, folder = Path(out), None if report is None else Path(report)
+        names = names_beside(selected=self.selection is not None, certificate=certificate)
+        check_all(path, folder, [], names, COMMAND)
+        save(self.map, path, COMMAND)
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=self.plugins)
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        texts = self._texts(sheet)
+        if certificate:
+            signed = self._certificate(sheet)
+            texts += [signed.page(), signed.text()]
+        written = dict(zip(names, texts, strict=True))  # a certificate of an earlier map is not of this one
+        self.written = (path, *write_beside(path, folder, written, COMMAND, CERTIFICATE))
+
+
+def names_beside(*, selected: bool = False, certificate: bool = False) -> list[str]:
+    """Return the names of the page, of the files on a chosen size, and of the certificate."""
+    return ["report.html", *["select.json", "select.svg"] * selected, *(CERTIFICATE if certificate else ())]
+
+
+class TriadMapResult(MapResult):
     """The terms of a triad over `temperature` (N,): `terms` and `sigma` (N, 12), the bias, then M row by row.
 
     With g-sensitivity (N, 21), G row by row after them.
@@ -57,7 +127,6 @@ class TriadMapResult(Result):
         `map.corrected(reading, T, force=f)`.
     fit : TriadFit
         Terms with their joint covariance, which of them are not observable is in `lines()`.
-    written : tuple of Path
     """
 
     def __init__(
@@ -70,13 +139,8 @@ class TriadMapResult(Result):
         faults: Faults,
         law: TermsLaw | None = None,
     ) -> None:
-        self.config, self.recordings, self.law = config, list(recordings) or None, law
-        self.fit, self.map, self.faults = fit, fitted, faults
-        self.sensor, self.unit, self.rows = gathered.sensor, tracked_unit(config.filter), gathered.rows
-        self.measured = of_map(fitted, self.unit)
-        self.limits = check_limits(config.limits, self.measured, faults.doubts)
-        self.limits_verdict = verdict_line(self.limits)
-        self.written: tuple[Path, ...] = ()
+        super().__init__(config, recordings, fitted, faults)
+        self.law, self.fit, self.rows = law, fit, gathered.rows
         self.name = f"map of the {gathered.sensor.channel}, with scale factor and misalignment"
         T = np.linspace(*fitted.domain, POINTS)
         inside = np.clip(T, fit.grid[0], fit.grid[-1])
@@ -102,39 +166,18 @@ class TriadMapResult(Result):
     def _chart(self) -> Chart:
         return words.chart(self.fit)
 
-    def save(
-        self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None, certificate: bool = False
-    ) -> None:
-        """Write the map to the file `out`, and its page; with `certificate` that too.
-
-        Page and certificate are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
-        """
-        path, folder, command = Path(out), None if report is None else Path(report), "fit-map"
-        check_all(path, folder, [], names_of(certificate=certificate), command)
-        save(self.map, path, command)
-        sheet = sheet_of(self.config, self.recordings, judged=self.limits)
-        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+    def _texts(self, sheet: Sheet) -> list[str]:
         recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
         lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
-        texts = [words.page_of(self.fit, self.unit, self.sensor.channel, lead, self.faults.lines(), sheet)]
-        if certificate:
-            signed = self._certificate(sheet)
-            texts += [signed.page(), signed.text()]
-        written = dict(zip(names_of(certificate=certificate), texts, strict=True))
-        self.written = (path, *write_beside(path, folder, written, command, CERTIFICATE))
+        return [words.page_of(self.fit, self.unit, self.map.record.channel, lead, self.faults.lines(), sheet)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
         measured = {name: one for name, one in self.measured.items() if not (self.fit.has_bias and name in none)}
         return Certificate(
-            "fit-map", self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
+            COMMAND, self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
             levelled=self.fit.has_bias, remarks=words.verdict(self.fit),
         )  # fmt: skip
-
-
-def names_of(*, certificate: bool) -> list[str]:
-    """Return the names of the page and of the certificate."""
-    return ["report.html", *(CERTIFICATE if certificate else ())]
 
 
 def fit_triad_map(
@@ -172,7 +215,7 @@ def fit_triad_map(
     settings = map_settings(own, kind if kind or own.tracked_maps() else USUAL)
     if out is not None:
         read = [*(own.files_to_fit() if "bias" in names else own.files()), *([] if family is None else [family])]
-        check_all(out, report, [*read, *paths_of(recordings)], names_of(certificate=certificate), "fit-map")
+        check_all(out, report, [*read, *paths_of(recordings)], names_beside(certificate=certificate), COMMAND)
     if "g_sensitivity" in names and "bias" not in names:
         raise ConfigError(
             "--terms: g_sensitivity without bias is of no use, since the bias of a soak has its part of it; add bias"
@@ -278,6 +321,7 @@ def _map_of(
 
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what is not observable, and where the map was written."""
+    assert result.sensor is not None, "the triad is described"
     terminal().print(words.table(result.fit, result.unit))
     say_lines(result.verdict())
     print_verdict(result.limits_verdict, "limits: ")
