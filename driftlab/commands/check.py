@@ -56,12 +56,12 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
     understood = config_with(config, data, units)
     if understood.filter is not None:
         prior(understood.filter)  # says what is wrong with deviations
-    first = head(understood)
+    first, lines = head(understood)
     if first is not None and understood.filter is not None:
-        check_channels(understood.filter, first.chunk)
-    remarks = [*_map_remarks(understood), *(() if first is None else first.lines)]
+        check_channels(understood.filter, first)
+    remarks = [*_map_remarks(understood), *lines]
     if first is not None and understood.filter is not None:
-        remarks += _turns(understood.filter.tracked, first.chunk)
+        remarks += _turns(understood.filter.tracked, first)
     if understood.source is None:
         remarks.append("source: is missing, so no recording can be read; `driftlab init FILE` writes that of a file")
     return CheckResult(understood, dict(quantities(understood)), tuple(remarks))

@@ -72,9 +72,9 @@ def write_smoothed(
             data.attrs["unit"] = unit if isinstance(unit, str) else ", ".join(unit)
             if like == "x":
                 data.attrs["labels"] = model.labels
-        for part in spool.smoothed(model.restarting, block):
-            rows = slice(part.start, part.start + len(part.x))
-            group["x"][rows], group["sigma"][rows], group["bias"][rows] = part.x, part.sigma, part.bias
+        for start, x, sigma, bias in spool.smoothed(model.restarting, block):
+            rows = slice(start, start + len(x))
+            group["x"][rows], group["sigma"][rows], group["bias"][rows] = x, sigma, bias
     spool.remove()
 
 

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
+from driftlab.filtering.extrapolation import Extrapolation
 from driftlab.filtering.setup import RunSetup
 from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
 from fusion_core.chunk import Array, Chunk
@@ -315,7 +315,12 @@ class Prediction:
             "coast": self.coast,
             "thermometer": self.thermometer.snapshot(),
             "uncertainty": self.uncertainty.snapshot(),
-            "extrapolated": (self.extrapolation.memory, self.departed),
+            "extrapolated": (
+                self.extrapolation.memories,
+                self.extrapolation.last,
+                self.extrapolation.lagged,
+                self.departed,
+            ),
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -323,8 +328,8 @@ class Prediction:
         self.coast = snapshot["coast"]
         self.thermometer.restore(snapshot["thermometer"])
         self.uncertainty.restore(snapshot["uncertainty"])
-        memory, self.departed = snapshot["extrapolated"]
-        self.extrapolation.memory = Extrapolated(*memory)
+        own = self.extrapolation
+        own.memories, own.last, own.lagged, self.departed = snapshot["extrapolated"]
         if self.coast is not None:
             self.uncertainty.resume(self.coast)
 
@@ -333,7 +338,7 @@ class Prediction:
         block = self.block
         self.coast = Coast(state.x[block], state.P[block, block], T_0)
         self.uncertainty.depart(self.coast)
-        self.departed = self.extrapolation.memory.last
+        self.departed = self.extrapolation.last
 
     def look(self, done: Chunk, estimates: Estimates, step: Transition, tilt: Array, calibration: Array) -> BiasOutput:
         """Return the bias over the next epochs, whose block went by `step`; `calibration` (N, d) was subtracted.

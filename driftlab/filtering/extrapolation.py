@@ -13,7 +13,6 @@ axes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,6 @@ from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
 from fusion_core.fast import compiled
 
 
-class Extrapolated(NamedTuple):
-    """State between chunks: memories of both evaluations, x and its lag at the last epoch."""
-
-    memories: tuple[tuple[Memory, Memory], ...]
-    last: Array  # (d,)
-    lagged: Array  # (d,)
-
-
 class Extrapolation:
     """Error of a bias whose effects are beyond their domains.
 
@@ -38,12 +29,20 @@ class Extrapolation:
     ----------
     bias : BiasModel
         Of the tracked sensor.
+
+    Attributes
+    ----------
+    memories : tuple of pairs
+        Of both evaluations of each effect, after the last epoch.
+    last, lagged : (d,) arrays
+        x and its lag there.
     """
 
     def __init__(self, bias: BiasModel) -> None:
         self.effects = [effect for effect in with_domain(bias) if effect.coefficients]
         d = len(bias.axes)
-        self.memory = Extrapolated(((None, None),) * len(self.effects), np.zeros(d), np.zeros(d))
+        self.memories: tuple[tuple[Memory, Memory], ...] = ((None, None),) * len(self.effects)
+        self.last, self.lagged = np.zeros(d), np.zeros(d)
 
     def look(self, chunk: Chunk) -> Array | None:
         """Return x (N, d) over the next epochs; None where it is zero."""
@@ -51,7 +50,7 @@ class Extrapolation:
             return None
         chunk = as_measured(chunk)
         x, after = None, []
-        for effect, (held, free) in zip(self.effects, self.memory.memories, strict=True):
+        for effect, (held, free) in zip(self.effects, self.memories, strict=True):
             inside = effect.within_domain(chunk)
             unlimited, own = effect.signature(inside, held)
             within = effect.within_regressors(unlimited)
@@ -63,8 +62,7 @@ class Extrapolation:
             if on is not within:
                 part = (on - within) @ np.asarray(effect.coefficients)
                 x = part if x is None else x + part
-        last = np.zeros_like(self.memory.last) if x is None else x[-1]
-        self.memory = self.memory._replace(memories=tuple(after), last=last)
+        self.memories, self.last = tuple(after), np.zeros_like(self.last) if x is None else x[-1]
         return x
 
     def of_estimate(self, x: Array | None, P: Array, dt: Array, noise: Array) -> Array | None:
@@ -72,12 +70,11 @@ class Extrapolation:
 
         None where that is zero.
         """
-        if x is None and not np.any(self.memory.lagged):
+        if x is None and not np.any(self.lagged):
             return None
         x = np.zeros_like(P) if x is None else x
-        lagged, left = self.memory.lagged.copy(), np.empty_like(P)
-        _follow(x, P / noise**2 * np.broadcast_to(dt, len(x))[:, None], lagged, left)
-        self.memory = self.memory._replace(lagged=lagged)
+        self.lagged, left = self.lagged.copy(), np.empty_like(P)
+        _follow(x, P / noise**2 * np.broadcast_to(dt, len(x))[:, None], self.lagged, left)
         return left
 
 

@@ -56,15 +56,6 @@ class FilterSteps(NamedTuple):
         return Measurement(self.z, self.H, self.R, self.measured)
 
 
-class SmoothedRows(NamedTuple):
-    """Rows from `start` on of the smoothed estimates; the bias with the calibration's part."""
-
-    start: int
-    x: Array  # (N, n)
-    sigma: Array  # (N, n)
-    bias: Array  # (N, d)
-
-
 class Spool:
     """Steps of the filter in a file, written forwards and read backwards.
 
@@ -122,8 +113,10 @@ class Spool:
         """Remove the file."""
         self.path.unlink()
 
-    def smoothed(self, reset: Flags, block: slice) -> Iterator[SmoothedRows]:
+    def smoothed(self, reset: Flags, block: slice) -> Iterator[tuple[int, Array, Array, Array]]:
         """Yield the smoothed estimates, from the recording's end to its beginning.
+
+        The first of their rows, x, sigma (N, n) and the bias (N, d) with the calibration's part.
 
         Parameters
         ----------
@@ -142,7 +135,7 @@ class Spool:
             states = x[:, block]
             bias = states if step.C.size == 0 else np.einsum("...ij,...j->...i", step.C, states)
             stop -= len(x)
-            yield SmoothedRows(stop, x, sigma, bias + step.calibration)
+            yield stop, x, sigma, bias + step.calibration
             if step.fresh:
                 smoother = Smoother(len(reset), reset=reset)
 

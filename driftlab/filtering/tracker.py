@@ -47,11 +47,8 @@ SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bound
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
-class Departure(NamedTuple):
-    """The end of the alignment, from which on the bias is predicted: the state there and the temperature in degC."""
-
-    state: State
-    T: float  # NaN where there is no thermometer
+Departure = tuple[State, float]
+"""The end of the alignment, from which on the bias is predicted: state and temperature in degC, NaN of none."""
 
 
 class Filtered(NamedTuple):
@@ -195,7 +192,7 @@ class Tracker:
         """End the alignment with the epochs that come after it; from here on the filter has the plan's error."""
         at = after if after.previous is None else after.previous
         T = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
-        self.departure, self.aligning = Departure(self.state, T), False
+        self.departure, self.aligning = (self.state, T), False
         error, tracked = np.zeros(len(self.state.x)), self.model.tracked
         start = self.model.places[tracked.channel].start
         error[start : start + len(tracked.axes)] = self.plan.initial_error

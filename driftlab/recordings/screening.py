@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -208,19 +207,14 @@ def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flag
     return rows
 
 
-@dataclass(frozen=True)
-class Head:
-    """The first rows of a recording, and a line for each of its channels and for each thing to know of it."""
+def head(config: Config) -> tuple[Chunk | None, list[str]]:
+    """Return the first rows of the config's source, and a line for each channel and each thing to know of it.
 
-    chunk: Chunk
-    lines: list[str]
-
-
-def head(config: Config) -> Head | None:
-    """Read the first rows of the config's source; None where no file is named."""
+    Neither where no file is named.
+    """
     source = config.source
     if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
-        return None
+        return None, []
     faults = Faults()
     first = next(read(config, faults, rows=1000, few=True))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
@@ -230,7 +224,7 @@ def head(config: Config) -> Head | None:
         said = ", ".join(f"{value:.6g}" for value in np.atleast_1d(values[0]))
         lines.append(f"channel {name}: shape {shape}, first {said} {_unit(config, name)}".rstrip())
     lines += [f"note: {line}" for line in faults.lines()]
-    return Head(first, lines)
+    return first, lines
 
 
 def _unit(config: Config, channel: str) -> str:

@@ -16,7 +16,6 @@ N readings, K groups.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,13 +34,6 @@ ROUNDING = 1e-13  # of the largest second derivative: of a step's direction only
 HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
 
 
-class _Path(NamedTuple):
-    """Temperatures (K,) in degC, and the logarithm of their evidence."""
-
-    T: Array
-    evidence: float
-
-
 def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[Array, Steps]:
     """Return the temperature (N,) in degC of readings T (N,) at times t (N,) in s, and the steps with their noise.
 
@@ -57,13 +49,13 @@ def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[A
     count = np.diff(starts, append=len(T)).astype(np.float64)
     at, means = (np.add.reduceat(values, starts) / count for values in (t, T))
     levels = _Levels(means, each * count, _offset(T, steps.size), steps)
-    path = levels.likeliest(at, WALKS[0], means)
+    path, evidence = levels.likeliest(at, WALKS[0], means)
     for walk in WALKS[1:]:
-        tried = levels.likeliest(at, walk, path.T)
-        if tried.evidence < path.evidence:
+        tried, its_evidence = levels.likeliest(at, walk, path)
+        if its_evidence < evidence:
             break
-        path = tried
-    smooth = np.interp(t, at, path.T)
+        path, evidence = tried, its_evidence
+    smooth = np.interp(t, at, path)
     return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
 
 
@@ -113,8 +105,11 @@ class _Levels:
         self.middle = self.offset + below * steps.size
         self.weights = np.stack([(below + 1 - place) * count, (place - below) * count])
 
-    def likeliest(self, at: Array, walk: float, first: Array) -> _Path:
-        """Return the path (K,) at times `at` (K,) whose rate walks so much; `first` (K,) is where it begins."""
+    def likeliest(self, at: Array, walk: float, first: Array) -> tuple[Array, float]:
+        """Return the path (K,) in degC at times `at` (K,) whose rate walks so much, and the logarithm of its evidence.
+
+        `first` (K,) is where it begins.
+        """
         from scipy.linalg import cho_solve_banded, cholesky_banded
 
         smoothness = _Smoothness(at, walk)
@@ -134,7 +129,7 @@ class _Levels:
                 if np.max(np.abs(share * step)) > NEAR * self.size:
                     continue
             break
-        return _Path(T, smoothness.log_scale - cost - float(np.sum(np.log(root[0]))))
+        return T, smoothness.log_scale - cost - float(np.sum(np.log(root[0])))
 
     def _cost(self, T: Array, smoothness: _Smoothness) -> tuple[float, Array, Array]:
         """Return the logarithm of the posterior, negative, its gradient (K,), and the second derivatives (K,)."""

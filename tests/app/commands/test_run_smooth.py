@@ -157,7 +157,7 @@ def test_a_spool_goes_on_where_an_earlier_run_was_killed(bench, tmp_path):
         again.add(stretch)
     both = (found.smoothed(model.restarting, model.places["gyro"]) for found in (spool, again))
     for one, other in zip(*both, strict=True):
-        assert one.start == other.start
-        np.testing.assert_array_equal(one.x, other.x)
+        assert one[0] == other[0]
+        np.testing.assert_array_equal(one[1], other[1])
     with pytest.raises(ConfigError, match="was begun without it; begin anew without --resume, or leave --smooth out"):
         smoothing.Spool(tmp_path / "none", keep=5)

@@ -29,7 +29,7 @@ def looked(effect, cuts=(), t=T, u=U):
 def test_a_channel_is_held_back_by_what_is_beyond():
     x, own = looked(SUPPLY)
     np.testing.assert_allclose(x, 3 * (U - np.clip(U, 4, 6)), atol=1e-12)
-    assert own.memory.last == x[-1]
+    assert own.last == x[-1]
     ((name, outside),) = beyond(SUPPLY, Chunk(T, {"supply": U}))
     assert name == "supply"
     np.testing.assert_array_equal(outside, (U < 4) | (U > 6))
