@@ -116,13 +116,12 @@ UNITS = (("gyro", "accel"), ("gyro",), ("accel",))
 def writes_what_it_says_it_writes(exporter: Exporter) -> None:
     """One file at the path, or some in the folder, and none beside; the loss is of the unit's sensors, and finite."""
     what = _accepted(exporter)
-    with tempfile.TemporaryDirectory() as folder:
-        loss, files = _written(exporter, what, Path(folder))
-        assert files, "no file is written"
-        assert all(files.values()), f"{', '.join(name for name, content in files.items() if not content)}: is empty"
-        if not exporter.folder:
-            name = f"unit{exporter.suffix}"
-            assert list(files) == [name], f"{', '.join(files)} is written, {name} was asked for"
+    loss, files = _written(exporter, what)
+    assert files, "no file is written"
+    assert all(files.values()), f"{', '.join(name for name, content in files.items() if not content)}: is empty"
+    if not exporter.folder:
+        name = f"unit{exporter.suffix}"
+        assert list(files) == [name], f"{', '.join(files)} is written, {name} was asked for"
     for lost in loss.sensors:
         sensor = what.sensor(lost.sensor.channel)
         assert sensor is not None, f"a loss of {lost.sensor.channel} is reported, which the unit does not have"
@@ -134,8 +133,7 @@ def writes_what_it_says_it_writes(exporter: Exporter) -> None:
 def the_same_calibration_gives_the_same_bytes(exporter: Exporter) -> None:
     """The files depend on the calibration and the settings alone, not on the hour or the place."""
     what = _accepted(exporter)
-    with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
-        (_, first), (_, second) = (_written(exporter, what, Path(folder)) for folder in (one, other))
+    (_, first), (_, second) = (_written(exporter, what) for _ in range(2))
     differs = [name for name in first if first[name] != second.get(name)]
     assert not differs, f"{', '.join(differs)}: differs from export to export"
 
@@ -144,8 +142,7 @@ def what_it_is_given_is_not_changed(exporter: Exporter) -> None:
     """Neither the calibration nor the settings are changed by an export."""
     what, before = _accepted(exporter), exporter.model_copy(deep=True)
     known = _content(what)
-    with tempfile.TemporaryDirectory() as folder:
-        _written(exporter, what, Path(folder))
+    _written(exporter, what)
     assert _content(what) == known, "the calibration is changed"
     assert exporter == before, "the settings are changed"
 
@@ -176,8 +173,7 @@ def takes_effects_that_a_warm__up_does_not_show(exporter: Exporter) -> None:
     what = _accepted(exporter)
     effect = Named(coefficients=(1e-6, 2e-6, 3e-6))
     more = replace(what, sensors=tuple(replace(one, effects=(effect,)) for one in what.sensors))
-    with tempfile.TemporaryDirectory() as folder:
-        loss, _ = _written(exporter, more, Path(folder))
+    loss, _ = _written(exporter, more)
     for lost in loss.sensors:
         _check_deviation(lost.warm_up, len(lost.sensor.axes))
 
@@ -188,8 +184,9 @@ def what_is_read_back_is_what_was_written(exporter: Exporter) -> None:
         return
     what = _accepted(exporter)
     with tempfile.TemporaryDirectory() as folder:
-        loss, _ = _written(exporter, what, Path(folder))
-        back = {again.channel: again for again in exporter.read(_path(exporter, Path(folder)))}
+        path = _path(exporter, Path(folder))
+        loss = exporter.export(what, path)
+        back = {again.channel: again for again in exporter.read(path)}
         other = Path(folder) / "other"
         other.write_bytes(b"\x00\x01 nothing of this kind \xff\n")
         text = "a file of another form is read; raise UnreadableFile or ConfigError"
@@ -282,8 +279,7 @@ def _accepted(exporter: Exporter) -> Export:
     """Return a unit that the exporter takes: with both maps, or one."""
     for mapped in UNITS:
         try:
-            with tempfile.TemporaryDirectory() as folder:
-                _written(exporter, unit(*mapped), Path(folder))
+            _written(exporter, unit(*mapped))
         except ConfigError as error:
             why = error
         else:
@@ -291,9 +287,9 @@ def _accepted(exporter: Exporter) -> Export:
     raise AssertionError(f"refuses a gyro and an accelerometer with maps and noise: {why}")
 
 
-def _written(exporter: Exporter, what: Export, folder: Path) -> tuple[Loss, dict[str, bytes]]:
-    loss = exporter.export(what, _path(exporter, folder))
-    return loss, {path.name: path.read_bytes() for path in _files(folder)}
+def _written(exporter: Exporter, what: Export) -> tuple[Loss, dict[str, bytes]]:
+    with tempfile.TemporaryDirectory() as folder:
+        return exporter.export(what, _path(exporter, Path(folder))), _files(Path(folder))
 
 
 def _written_or_refused(
@@ -301,12 +297,13 @@ def _written_or_refused(
 ) -> tuple[Loss, dict[str, bytes], set[str]] | None:
     """Return the loss, the files and the channels that are read back of an export; None where it is refused."""
     with tempfile.TemporaryDirectory() as folder:
+        path = _path(exporter, Path(folder))
         try:
-            loss, files = _written(exporter, what, Path(folder))
+            loss = exporter.export(what, path)
         except ConfigError:
-            assert not list(_files(Path(folder))), f"{title}a file is written, and then refused"
+            assert not _files(Path(folder)), f"{title}a file is written, and then refused"
             return None
-        channels = {back.channel for back in exporter.read(_path(exporter, Path(folder)))} if read_back else set()
+        files, channels = _files(Path(folder)), {back.channel for back in exporter.read(path)} if read_back else set()
         return loss, files, channels
 
 
@@ -314,8 +311,8 @@ def _path(exporter: Exporter, folder: Path) -> Path:
     return folder if exporter.folder else folder / f"unit{exporter.suffix}"
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+def _files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def _content(what: Export) -> bytes:
