@@ -42,7 +42,6 @@ class Hdf5(TableSource):
     kind: Literal["hdf5"] = "hdf5"
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind, damaged, or being written."""
         import h5py

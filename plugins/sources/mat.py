@@ -15,7 +15,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
@@ -52,7 +51,6 @@ class Mat(TableSource):
     kind: Literal["mat"] = "mat"
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""
         first = head(path)

@@ -25,7 +25,6 @@ from __future__ import annotations
 import mmap
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -59,7 +58,6 @@ class Parquet(TableSource):
     kind: Literal["parquet"] = "parquet"
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the file; raises UnreadableFile where it is of another kind or damaged."""
         import polars as pl

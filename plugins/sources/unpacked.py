@@ -82,14 +82,17 @@ def plain_file(path: Path) -> Iterator[Path]:
 Open = Callable[[Any, Path, Faults], AbstractContextManager[Table]]
 
 
-def unpacking(own: Open) -> Open:
-    """Decorate the `open` of a source, so that it reads gzip archives of its files too."""
+def unpacking(own: Callable[[Any, Path, Faults], Iterator[Table]]) -> Open:
+    """Make the `open` of a source of a function that yields the table, and let it read gzip archives of its files too.
+
+    As `contextlib.contextmanager` does.
+    """
 
     @contextmanager
     @wraps(own)
     def open_(self: Any, path: Path, faults: Faults) -> Iterator[Table]:
-        with plain_file(path) as place, own(self, place, faults) as table:
-            yield table
+        with plain_file(path) as place:
+            yield from own(self, place, faults)
 
     return open_
 

@@ -46,7 +46,6 @@ class DataFlash(FileSource):
     """Of what the autopilot corrected: undo it, refuse a log with a learned polynomial, or keep all as logged."""
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""
         # with the compiler, which nothing else may need

@@ -59,7 +59,6 @@ class Rosbag(FileSource):
     """Clock: the stamps in the messages' headers, or the times of recording."""
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""
         _check_installed()

@@ -14,7 +14,6 @@ columns.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
@@ -85,7 +84,6 @@ class Ulog(FileSource):
         return self
 
     @unpacking
-    @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises MissingChannel where it lacks a sensor that is asked for."""
         from fusion_plugins.sources.ulog.file import LogFile
