@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from driftlab.identification.state import name_of
+from driftlab.identification.state import Search, name_of
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.detectability import families
 from driftlab.planning.search import MIN_COVERAGE, SearchResult
-from driftlab.planning.simulated_search import Body, Information, planned, swing_of
+from driftlab.planning.simulated_search import Information, planned, swing_of
 from driftlab.planning.unit_model import UnitModel
 
 ROWS = 600  # of a recording that is only one of many
@@ -27,17 +27,16 @@ class DiscriminationCriterion:
 
     def __init__(self, unit: UnitModel, chamber: Chamber, hours: float, kinds: Collection[str]) -> None:
         self.unit, self.lag = unit, chamber.lag
-        reference = ramps(chamber, hours, 1)
-        fast = _fastest(chamber, hours) or reference
-        assert fast is not None, "hours in which the chamber comes up and down"
-        search = planned(unit, self._body(fast), fast.duration, ROWS)
+        possible = [profile for cycles in (1, 2, 4, 8, 16) if (profile := ramps(chamber, hours, cycles)) is not None]
+        assert possible, "hours in which the chamber comes up and down"
+        search = self._search(unit, possible[-1])  # up and down as often as fits the hours
         self._own = {name: own for name, own in families(search).items() if own[0].kind in kinds}
         self._sizes = {repr(effect): swing_of(search, unit, effect) for own in self._own.values() for effect in own}
         self.names = tuple(self._own)
 
     def nats(self, profile: Profile) -> float:
         """Return the nats of the worst pair: of any of the effects, with another one in its place; or beside none."""
-        search = planned(self.unit, self._body(profile), profile.duration, ROWS)
+        search = self._search(self.unit, profile)
         effects = [effect for own in self._own.values() for effect in own]
         information = Information(search, self.unit, effects)
         places = {name: [k for k, e in enumerate(effects) if name_of(e) == name] for name in self.names}
@@ -50,14 +49,8 @@ class DiscriminationCriterion:
             worst = min(worst, information.left(k, theta, rivals))
         return float(worst)
 
-    def _body(self, profile: Profile) -> Body:
-        return lambda t: profile.body(t, self.lag)
-
-
-def _fastest(chamber: Chamber, hours: float) -> Profile | None:
-    """Return ramps up and down, as many as fit the hours."""
-    possible = [profile for cycles in (1, 2, 4, 8, 16) if (profile := ramps(chamber, hours, cycles)) is not None]
-    return possible[-1] if possible else None
+    def _search(self, unit: UnitModel, profile: Profile) -> Search:
+        return planned(unit, lambda t: profile.body(t, self.lag), profile.duration, ROWS)
 
 
 def preferred(result: SearchResult, criterion: DiscriminationCriterion) -> SearchResult:

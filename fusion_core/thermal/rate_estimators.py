@@ -107,7 +107,8 @@ def with_rate(
     if "temperature" not in chunk.channels:
         return chunk, memory
     T = chunk["temperature"]
-    memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), _first(T[0])) if memory is None else memory
+    if memory is None:  # before the first sample, that of a straight line too
+        memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), np.array([T[0], *np.zeros(9)]))
     dt, value, windows = np.full(T.shape, chunk.dt), memory.value, np.full(T.shape, estimator.memory_s)
     smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
     if isinstance(estimator, Regression):
@@ -121,8 +122,3 @@ def with_rate(
         smooth = np.clip(smooth, np.minimum(lows, domain[0]), np.maximum(highs, domain[1]))
     conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
     return conditioned, RateMemory(numbers, (min(low, float(np.min(T))), max(high, float(np.max(T)))), value)
-
-
-def _first(T: float) -> Array:
-    """Return the memory of a straight line before the first sample."""
-    return np.array([T, *np.zeros(9)])

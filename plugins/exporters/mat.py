@@ -85,7 +85,8 @@ class Mat(Exporter):
         loss = Loss(tuple(lost), tuple(left_out), tuple(notes))
         about = {"serial": line(what.serial), "interpolation": self.method, "loss": "\n".join(loss.lines())}
         savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
-        _without_date(path)
+        with path.open("r+b") as file:  # no date, no machine: the same calibration gives the same bytes
+            file.write(b"MATLAB 5.0 MAT-file, written by driftlab".ljust(116))
         return loss
 
     def _gain(self, sensor: Calibrated, T: Array) -> Any:
@@ -172,12 +173,6 @@ def _effect(effect: Any) -> dict[str, Any]:
         "requires": _texts(effect.requires),
         **{name: float(value) for name, value in effect.hyper_parameters.items()},
     }
-
-
-def _without_date(path: Path) -> None:
-    """Write a head without the date and the machine: the same calibration gives the same bytes."""
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 5.0 MAT-file, written by driftlab".ljust(116))
 
 
 def _texts_of(variable: Variable) -> tuple[str, ...]:
