@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
-from fusion_core.model import Flags, Measurement, State, Transition
+from fusion_core.chunk import Array, Flags
+from fusion_core.model import Measurement, State, Transition
 
 Shape = tuple[int, ...]
 ROUNDING = 1e-9  # of a covariance, relative to its deviations: less asymmetry is rounding

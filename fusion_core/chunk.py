@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from fusion_core.errors import MissingChannel
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -92,14 +94,14 @@ class Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
         return self._rows(slice(len(self) - 1, len(self)), None)
 
-    def _rows(self, rows: slice | NDArray[np.bool_], previous: Chunk | None) -> Chunk:
+    def _rows(self, rows: slice | Flags, previous: Chunk | None) -> Chunk:
         return Chunk(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
         return Chunk(self.t, {**self.channels, **channels}, self.previous, self.sensors)
 
-    def where(self, keep: NDArray[np.bool_]) -> Chunk:
+    def where(self, keep: Flags) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
         return self._rows(keep, self.previous)
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.fast import compiled
 
 PIECE = 4096  # rows multiplied at once: they stay in the cache
@@ -52,7 +51,7 @@ def gates_of(gate: float, m: int) -> Array:
     return gates
 
 
-def nis_test(nis: Array, m: int | NDArray[np.int64], level: float = 0.99) -> NisTest:
+def nis_test(nis: Array, m: int | Integers, level: float = 0.99) -> NisTest:
     """Compare the mean of nis (N,) of m components each, or of `Estimates.dof` (N,), with its bounds at `level`."""
     total = float(np.sum(nis))
     return (

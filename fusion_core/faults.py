@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.errors import EmptyRecording, TimeBackwards, moment
 
 LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
@@ -153,7 +152,7 @@ def _all_usable(values: Array, low: float, high: float) -> bool:
     return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN
 
 
-def _after(chunk: Chunk, keep: NDArray[np.bool_], faults: Faults) -> str:
+def _after(chunk: Chunk, keep: Flags, faults: Faults) -> str:
     k, good = int(np.argmin(keep)), np.flatnonzero(keep)
     if k:
         return f"after {faults.when(chunk.t[k - 1])}"

@@ -19,9 +19,9 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from fusion_core.checks import check_shape
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.kalman import estimate
-from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+from fusion_core.model import Estimates, Measurement, State, Transition
 
 Nominal = TypeVar("Nominal")
 Path = TypeVar("Path")

@@ -30,8 +30,8 @@ from fusion_core.checks import (
     finite,
     numbers,
 )
-from fusion_core.chunk import Array
-from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+from fusion_core.chunk import Array, Flags
+from fusion_core.model import Estimates, Measurement, State, Transition
 
 Method = Literal["auto", "recursive", "steady", "plain"]
 METHODS = get_args(Method)

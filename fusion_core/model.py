@@ -6,11 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
-
-Flags = NDArray[np.bool_]
+from fusion_core.chunk import Array, Integers
+from fusion_core.chunk import Flags as Flags
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class Estimates:
     white: Array
     nis: Array
     log_det: Array
-    dof: NDArray[np.int64]
+    dof: Integers
     used: Flags
     state: State
     P: Array | None = None

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.checks import checked_measurement, checked_reset, checked_state, checked_transition, flags
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.fast import compiled, inlined
-from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+from fusion_core.model import Estimates, Measurement, State, Transition
 
 Index = NDArray[np.uint64]
 Size = tuple[float, ...]

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.checks import check_shape, common_lead
-from fusion_core.chunk import Array
-from fusion_core.model import Flags, Prior, State, Transition
+from fusion_core.chunk import Array, Flags
+from fusion_core.model import Prior, State, Transition
 
 Pairs = Mapping[tuple[str, str], Array]
 

@@ -27,7 +27,7 @@ from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import document, foreign, sign
 from driftlab.triad.model import GRAVITY
 from fusion_core.budget import read_whole
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import (
     Calibrated,
     Effect,
@@ -45,7 +45,6 @@ from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
-from fusion_core.model import Flags
 from fusion_core.settings import nearest
 from fusion_core.thermal.record_texts import parse_json
 from fusion_core.units import along_axes

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from driftlab.commands.console import print_verdict, say, say_lines, terminal
@@ -36,6 +35,7 @@ from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
+from fusion_core.chunk import Flags
 from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
 from fusion_core.faults import Faults
@@ -238,7 +238,7 @@ def fit_triad_map(
     return result
 
 
-def _wanted(names: Collection[str]) -> NDArray[np.bool_]:
+def _wanted(names: Collection[str]) -> Flags:
     """Return the terms (12 or 21,) of some groups, and the bias."""
     wanted = np.zeros(len(TERMS) + len(SENSITIVITIES) * ("g_sensitivity" in names), dtype=bool)
     for name in ("bias", *names):

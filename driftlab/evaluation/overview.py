@@ -26,12 +26,11 @@ from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_doubts
 from driftlab.recordings.prefetch import prefetch
 from driftlab.units import BiasUnit, unit_of
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor, ThermalBias
 from fusion_core.fast import compiled
 from fusion_core.faults import DOUBT
-from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many

@@ -21,9 +21,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.fast import compiled
-from fusion_core.model import Flags
 
 WINDOW = 30.0  # s, of the moving average
 MIN_AT_REST = 2.0  # s within the window that make a reference

@@ -15,9 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
 from fusion_core.fast import compiled
 
@@ -89,7 +88,7 @@ def as_measured(chunk: Chunk) -> Chunk:
     return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
 
 
-def beyond(effect: Effect, chunk: Chunk) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def beyond(effect: Effect, chunk: Chunk) -> Iterator[tuple[str, Flags]]:
     """Yield the channels of an effect that leave its domain, and in which samples (N,) they do."""
     for name in effect.domain or {}:
         if name in chunk.channels:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import Alignment, Transition
 from fusion_core.faults import Faults
-from fusion_core.model import Estimates, Flags, Measurement, State
+from fusion_core.model import Estimates, Measurement, State
 
 TEMPERATURES = ("temperature", "temperature_rate", "temperature_raw")  # the last one does not lag behind
 
@@ -99,7 +99,7 @@ class Stretches:
     axes: dict[str, int] = field(default_factory=dict)
     open: bool = False  # whether the last one goes on
 
-    def note(self, t: Array, flags: Flags, causes: NDArray[np.bool_], names: Sequence[str]) -> None:
+    def note(self, t: Array, flags: Flags, causes: Flags, names: Sequence[str]) -> None:
         """Note where flags (N,) are true over consecutive epochs at t (N,), and their causes (N, D)."""
         for start, stop in runs(flags):
             for name, count in zip(names, np.sum(causes[start:stop], axis=0), strict=True):

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.filtering.segment import RunSegment
 from fusion_core.budget import next_array
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.errors import ConfigError
-from fusion_core.model import Flags, Measurement, State, Transition
+from fusion_core.model import Measurement, State, Transition
 from fusion_core.smoother import Smoother
 
 
@@ -30,7 +29,7 @@ class FilterSteps(NamedTuple):
     where they are the bias.
     """
 
-    rows: NDArray[np.int64]  # () N
+    rows: Integers  # () N
     fresh: Flags  # ()
     begin: Array
     end: Array

@@ -29,13 +29,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, Steps, noise_before, readings, sawtooth, started
-
-Index = NDArray[np.int64]
 
 HARMONICS = 5
 LEFT = 1.4  # rho = exp(-1.4 x + 2 pi i x) of a sawtooth x of a step further on: -1/2 at a half, as its own is
@@ -98,7 +95,7 @@ class ThermometerError:
         _look(T, raw, dt, steps, table, which, windows, self.memory, *error)
         return error
 
-    def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Index]:
+    def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Integers]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
         # a quarter of an octave is near enough; the least and the largest mostly say it of all
         ends = np.rint(4 * np.log2(np.maximum([variance.min(), variance.max()], NOTHING)))
@@ -127,7 +124,7 @@ def _sawtooth(step: float, variance: float, known: Steps) -> Array:
 
 @compiled
 def _look(
-    T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Index, windows: Array, memory: Array,
+    T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Integers, windows: Array, memory: Array,
     variance: Array, left: Array,
 ) -> None:  # fmt: skip
     one, two, count, noise, ended, since, took, off = memory

@@ -19,11 +19,11 @@ from driftlab.filtering.segment import RunLog, RunSegment, runs
 from driftlab.filtering.setup import RunSetup, bias_steps, prior_again, subtracted
 from driftlab.units import axis_name
 from fusion_core.checks import NotFinite, TooWide, all_finite
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, Flags, concatenate
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.errors import BadValue
 from fusion_core.kalman import estimate
-from fusion_core.model import Estimates, Flags
+from fusion_core.model import Estimates
 
 
 def check_finite(estimates: Estimates, t: Array, when: Callable[[float], str]) -> None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from driftlab.identification.records import Evidence, map_inputs
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import Basis, Effect
 from fusion_core.fast import compiled, inlined
 
@@ -58,7 +58,7 @@ class NormalEquations:
         A[:j, :j] += np.diag(ridge) if ridge.ndim == 1 else ridge
         return NormalEquations(A, self.b, self.yy)
 
-    def restricted(self, keep: Indices | NDArray[np.bool_]) -> NormalEquations:
+    def restricted(self, keep: Indices | Flags) -> NormalEquations:
         """Return those of some columns, the coefficients of the others being 0."""
         return NormalEquations(self.A[np.ix_(keep, keep)], self.b[keep], self.yy)
 

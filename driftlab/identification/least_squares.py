@@ -18,10 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations, free_starts
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import Effect
 
 LOW = 8  # lowest frequencies of a recording whose power is that of slow noise
@@ -74,7 +73,7 @@ class LeastSquares:
         """Let go of fits: smoothing or noise are others."""
         self._fits.clear()
 
-    def fit_rows(self, model: Model, axis: int, rows: NDArray[np.bool_]) -> AxisFit:
+    def fit_rows(self, model: Model, axis: int, rows: Flags) -> AxisFit:
         """Fit a model on one axis over some rows (n,) of all recordings."""
         fixed, starts = self._columns(model, axis, self.columns.everything)
         cols = np.concatenate([fixed, *starts, self.columns.y[axis : axis + 1]])

@@ -15,7 +15,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
@@ -26,7 +25,7 @@ from driftlab.recordings.epochs import epochs
 from driftlab.soak.blocks import means
 from driftlab.soak.temperature import soak_temperatures
 from driftlab.units import BiasUnit, unit_of
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, Integers, concatenate
 from fusion_core.contracts import Effect
 from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -49,7 +48,7 @@ class Record:
     # N means in SI; `temperature` without steps, `excess` (N, d): the sensor's reading less its known input, or its
     # channel where there is none
     chunk: Chunk
-    starts: NDArray[np.int64]  # (n,) the first mean of each row
+    starts: Integers  # (n,) the first mean of each row
     # (columns, 2) smallest and largest value of each channel, update by update
     ranges: Mapping[str, Array] = field(default_factory=dict)
 
@@ -173,7 +172,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, align, noise)
 
 
-def row_starts(t: Array, interval: float) -> NDArray[np.int64]:
+def row_starts(t: Array, interval: float) -> Integers:
     """Return the first mean of each row of `interval` s, the means at t (N,)."""
     return np.flatnonzero(np.diff(np.floor((t - t[0] + 1e-6) / interval), prepend=-1.0))
 

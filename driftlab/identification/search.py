@@ -21,7 +21,6 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.identification.acceptance import WORSE
 from driftlab.identification.candidates import candidates_of
@@ -31,14 +30,13 @@ from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, 
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
+from fusion_core.chunk import Flags
 from fusion_core.contracts import Basis, Effect
 from fusion_core.errors import FusionError
 
 MAX_EFFECTS = 4  # that are added
 END = 0.2  # of the range: rows at either end that are left out
 SURE = 3.0  # deviations of the coefficients
-
-Rows = NDArray[np.bool_]
 
 
 def search(
@@ -223,7 +221,7 @@ def inputs(effect: Effect) -> tuple[str, ...]:
     return () if alone or effect.acts_on_input else tuple(dict.fromkeys(effect.requires))
 
 
-def _ends(state: Search, name: str) -> Iterator[Rows]:
+def _ends(state: Search, name: str) -> Iterator[Flags]:
     """Yield the rows (n,) in the highest and in the lowest part of each column of a channel, where there are enough.
 
     Not of one that stands still in each recording, as an axis in a placement: its parts are whole recordings, which are
@@ -239,7 +237,7 @@ def _ends(state: Search, name: str) -> Iterator[Rows]:
                 yield rows
 
 
-def _squares(squares: LeastSquares, model: Model, axis: int, rows: Rows) -> tuple[float, AxisFit]:
+def _squares(squares: LeastSquares, model: Model, axis: int, rows: Flags) -> tuple[float, AxisFit]:
     """Return the sum of squares of the errors of rows that are left out, in the columns' scale, and the others' fit."""
     columns = squares.columns
     fit = squares.fit_rows(model, axis, ~rows)
@@ -254,7 +252,7 @@ def _squares(squares: LeastSquares, model: Model, axis: int, rows: Rows) -> tupl
     return total, fit
 
 
-def _chance(squares: LeastSquares, model: Model, axis: int, rows: Rows, fit: AxisFit) -> float:
+def _chance(squares: LeastSquares, model: Model, axis: int, rows: Flags, fit: AxisFit) -> float:
     """Return the sum of squares that the uncertainty of the last term's coefficients makes of the rows left out."""
     columns = squares.columns.of(model[-1].effect).columns[axis]
     stop, p = len(squares.fixed(model, axis)), len(columns)

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from driftlab.filtering.segment import RunSegment
 from driftlab.live.status import UPDATES, Status
 from driftlab.storage.json import plain
-from fusion_core.chunk import Array
-from fusion_core.model import Flags
+from fusion_core.chunk import Array, Flags
 
 CAPACITY = 3600  # rows
 WIDTH = 0.5  # s of a row, to begin with

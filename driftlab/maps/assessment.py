@@ -22,7 +22,6 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.filtering.segment import runs
 from driftlab.maps.fit import axes_of, unseen
@@ -31,7 +30,7 @@ from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
 from driftlab.soak.rest import Used
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.faults import DOUBT
 
@@ -262,7 +261,7 @@ def _thin(soak: SoakSummary, near: Array, count: Array, good: Array) -> tuple[Th
     return tuple(thin)
 
 
-def _ranges(where: NDArray[np.bool_], edges: Array, least: float) -> list[tuple[float, float]]:
+def _ranges(where: Flags, edges: Array, least: float) -> list[tuple[float, float]]:
     """Return the ranges in which cells are true, as far as they are wider than `least` of all."""
     pairs = [(float(edges[start]), float(edges[stop])) for start, stop in runs(where)]
     return [(a, b) for a, b in pairs if b - a > least * (edges[-1] - edges[0])]

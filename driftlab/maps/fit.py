@@ -18,11 +18,11 @@ from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
-from driftlab.soak.placements import Index, Placements, placed
+from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import of_thermometer, soak_temperatures
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
@@ -317,7 +317,7 @@ class _Samples(NamedTuple):
     t: Array
     T: Array
     bias: Array
-    placement: Index
+    placement: Integers
     known: Array
     interval: float
     windows: list[Chunk]

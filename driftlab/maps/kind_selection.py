@@ -33,12 +33,11 @@ from os import cpu_count
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import FittedMap, NetworkMap, Plugin, ThermalMap
 from fusion_core.errors import ConfigError, FusionError
-from fusion_core.thermal.sweeps import Index, sweeps_of
+from fusion_core.thermal.sweeps import sweeps_of
 
 ERROR_RANGES = 50  # of temperature, over which the errors of a part are averaged
 NEGLIGIBLE = 1e-4  # of the error without a map: less is no difference
@@ -80,9 +79,9 @@ class KindComparison:
 class ErrorScale:
     """Weighting of the errors of blocks: `cell` (K,), -1 where not scored, and `weight`, `part` of each cell."""
 
-    cell: NDArray[np.int64]
+    cell: Integers
     weight: Array
-    part: NDArray[np.int64]
+    part: Integers
     division: Division
 
     @classmethod
@@ -290,11 +289,11 @@ MIN_SHARE = 0.5  # of the blocks to be scored
 class Division:
     """Division of K blocks for cross-validation."""
 
-    fold: Index  # (K,): number of the fold: its blocks are left out together; -1: never
-    part: Index  # (K,): number of the part: its errors stand for one another
-    scored: NDArray[np.bool_]  # (K,): blocks whose temperature is also among those that were not left out with them
+    fold: Integers  # (K,): number of the fold: its blocks are left out together; -1: never
+    part: Integers  # (K,): number of the part: its errors stand for one another
+    scored: Flags  # (K,): blocks whose temperature is also among those that were not left out with them
     levels: bool  # whether a constant is taken off each level
-    level: Index  # (K,): number of the level: its blocks share a constant
+    level: Integers  # (K,): number of the level: its blocks share a constant
     what: str  # the parts, in words
 
     @property
@@ -321,7 +320,7 @@ def divide(recordings: Sequence[Array]) -> Division:
     return by_time if by_time.share >= MIN_SHARE else _ranges(T)
 
 
-def _pieces(sweeps: Index) -> Index:
+def _pieces(sweeps: Integers) -> Integers:
     """Cut sweeps into about `PARTS` contiguous pieces of equal length, or leave them whole where there are many."""
     lengths = np.bincount(sweeps)
     if len(lengths) >= SWEEPS:
@@ -338,7 +337,7 @@ def _ranges(T: Array) -> Division:
     return _division(T, fold, cell, np.zeros_like(cell), what, levels=False)
 
 
-def _division(T: Array, fold: Index, part: Index, level: Index, what: str, *, levels: bool = True) -> Division:
+def _division(T: Array, fold: Integers, part: Integers, level: Integers, what: str, *, levels: bool = True) -> Division:
     scored = np.zeros(len(T), dtype=np.bool_)
     for k in range(int(fold.max()) + 1):
         out, others = fold == k, np.sort(T[fold != k])
@@ -353,9 +352,9 @@ def _division(T: Array, fold: Index, part: Index, level: Index, what: str, *, le
     return Division(fold, part, scored, levels, level, what)
 
 
-def _numbered(parts: Sequence[Index]) -> Index:
+def _numbered(parts: Sequence[Integers]) -> Integers:
     """Join numbers that each begin at zero to numbers that go on."""
-    joined: list[Index] = []
+    joined: list[Integers] = []
     for own in parts:
         joined.append(own + (joined[-1][-1] + 1 if joined else 0))
     return np.concatenate(joined)

@@ -14,13 +14,10 @@ from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, Integers, concatenate
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, readings, started
-
-Index = NDArray[np.int64]
 
 GAP = 1.5  # a step longer than this many usual ones is a gap
 TURN = 10  # steps in a row that make another pace
@@ -104,7 +101,7 @@ def _owned(t: Array, before: float, pace: Array) -> Array:
 
 
 @compiled
-def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, float]:
+def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Integers, float]:
     """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
     starts = np.empty(len(t), dtype=np.int64)
     count = 0
@@ -118,7 +115,7 @@ def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, 
 
 
 @compiled
-def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
+def _means(values: Array, weights: Array, starts: Integers, total: Array) -> Array:
     """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape
     means = np.empty((len(starts), d))
@@ -132,7 +129,7 @@ def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
     return means
 
 
-def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) -> Chunk:
+def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | None) -> Chunk:
     if len(rows) == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 
 BITS = 64  # of a word, at most
 MAX_WORDS = 200_000  # words of a recording, at most about twice as many: those whose own bits choose them
@@ -101,12 +101,12 @@ def _words(x: Array, long: int) -> Words:
     return word
 
 
-def _noisy(words: Words, bits: int) -> NDArray[np.bool_]:
+def _noisy(words: Words, bits: int) -> Flags:
     """Return the mask of words with noise in them: some of each bit."""
     part = np.unpackbits(words.view(np.uint8).reshape(len(words), 8), axis=1).sum(axis=1) / bits
     return np.asarray((part >= PLAIN) & (part <= 1 - PLAIN))
 
 
-def _chosen(words: Words, sparse: int) -> NDArray[np.bool_]:
+def _chosen(words: Words, sparse: int) -> Flags:
     """Return the mask of words of which one in `sparse`, a power of two, stays: the same in every recording."""
     return np.asarray((words * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40) & np.uint64(sparse - 1) == 0)

@@ -8,13 +8,12 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.fast import compiled
 from fusion_core.faults import Faults, usable
-from fusion_core.model import Flags
 
 ROWS = 65_536  # of a chunk read at once
 FIRST = 11  # rows that show the usual step

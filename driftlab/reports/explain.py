@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.evaluation.overview import thin
 from driftlab.evaluation.summary import Rows, error_rows
@@ -27,7 +26,7 @@ from driftlab.reports.provenance import Sheet
 from driftlab.reports.run import event_shades
 from driftlab.reports.tables import error_table
 from driftlab.units import RATE, BiasUnit, formatted
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -200,7 +199,7 @@ def _sides(outcome: Outcome, changed: bool = True) -> list[tuple[str, Array, Arr
 
 def _extreme_line(t: Array, values: Array, name: str, role: str) -> Line:
     """Return a line through the smallest and the largest value of each stretch: no spike is left out."""
-    rows: NDArray[np.int64] = np.arange(len(values))
+    rows: Integers = np.arange(len(values))
     if len(values) > 2 * STRETCHES:
         filled: Array = np.where(np.isfinite(values), values, 0.0)
         parts = np.linspace(0, len(values), STRETCHES + 1).astype(int)

@@ -17,8 +17,7 @@ from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade
 from driftlab.spc.capability import D2, Capability
 from driftlab.spc.charts import D4, ControlChart, LineReport
 from driftlab.units import BiasUnit, number, rounded
-from fusion_core.chunk import Array
-from fusion_core.model import Flags
+from fusion_core.chunk import Array, Flags
 
 NAMED = SERIES - 1  # units far off that a label names
 SHARES = (5, 25, 50, 75, 95)
@@ -234,7 +233,7 @@ def _deviation_unit(scale: str, unit: BiasUnit) -> tuple[float, str]:
     return (float(np.sqrt(unit.factor)), f"sqrt({unit.shown})") if scale == "sqrt" else (unit.factor, unit.shown)
 
 
-def _points(x: Array, values: Array, out: NDArray[np.bool_]) -> tuple[Line, ...]:
+def _points(x: Array, values: Array, out: Flags) -> tuple[Line, ...]:
     value, low, high = np.array([[rounded(v, 4) for v in row] for row in values.tolist()])
     return (
         Line(x, value, "lot", "data"),

@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.noise.local_level import whitened
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import SLAB
-from fusion_core.thermal.sweeps import Index, directions
+from fusion_core.thermal.sweeps import directions
 
 MAX_BLOCKS = 8192  # half as many, at least, once there are as many samples
 
 
-def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
+def runs(starts: Sequence[int] | Integers, count: int, n: int) -> Integers:
     """Return the begins (K,) of runs of n of `count` values; no run is of two recordings, which begin at `starts`.
 
     All are of equal length, as the laws of a soak's noise have them; what is over at a recording's end belongs to its
@@ -41,7 +41,7 @@ def runs(starts: Sequence[int] | Index, count: int, n: int) -> Index:
     return np.concatenate(parts).astype(np.int64)
 
 
-def means(values: Array, starts: Index, weight: Array | None = None) -> Array:
+def means(values: Array, starts: Integers, weight: Array | None = None) -> Array:
     """Return the means (K, ...) of runs of values (N, ...), which begin at `starts` (K,); each has a `weight` (N,)."""
     wide = (-1, *[1] * (values.ndim - 1))
     if weight is None:
@@ -61,18 +61,18 @@ class SoakRows:
     span: Array  # (R,): how long each was measured, s
     channels: Mapping[str, Array] = field(default_factory=dict)  # (R,) or (R, k): what else was recorded
 
-    def part(self, where: NDArray[np.bool_]) -> SoakRows:
+    def part(self, where: Flags) -> SoakRows:
         """Return the rows of which `where` (R,) is true."""
         channels = {name: values[where] for name, values in self.channels.items()}
         return SoakRows(self.t[where], self.T[where], self.bias[where], self.span[where], channels)
 
-    def coarsened(self, starts: Index) -> SoakRows:
+    def coarsened(self, starts: Integers) -> SoakRows:
         """Return the means of runs of rows, which begin at `starts` (K,)."""
         t, T, bias = (means(values, starts, self.span) for values in (self.t, self.T, self.bias))
         channels = {name: means(values, starts, self.span) for name, values in self.channels.items()}
         return SoakRows(t, T, bias, np.add.reduceat(self.span, starts), channels)
 
-    def within(self, low: float, high: float) -> NDArray[np.bool_]:
+    def within(self, low: float, high: float) -> Flags:
         """Return True for each row (R,) at a temperature from low to high, degC."""
         return np.asarray((low <= self.T) & (high >= self.T))
 
@@ -166,8 +166,8 @@ class SoakSummary(SoakRows):
     """Rows of the samples that a map was fitted on, and their cells, for its assessment."""
 
     domain: tuple[float, float]  # lowest and highest temperature, degC
-    way: Index  # (R,): +1 warming, -1 cooling or 0
-    recording: Index  # (R,): number of the recording that a row is from
+    way: Integers  # (R,): +1 warming, -1 cooling or 0
+    recording: Integers  # (R,): number of the recording that a row is from
     count: Array  # (3, CELLS): samples in each cell on no way, warming, and cooling
     cell_T: Array  # (3, CELLS): their mean temperature; NaN where there are none
     cell_bias: Array  # (3, CELLS, d): their mean bias

@@ -23,15 +23,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.thermal.curve_uncertainty import with_errors
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.penalised import penalised, smooth_lines
 from fusion_core.thermal.soak_noise import Blocks, Contrasts, Smoother, blocks_of
-
-Index = NDArray[np.int64]
 
 WIDER = 2.0  # times: by more, telling the scale from the bias would widen the curve
 PASSES = 2  # the first has not yet taken the bias off the directions
@@ -66,7 +63,7 @@ class Placements:
         return with_errors(fitted, self.blocks, smoother, self.errors)
 
 
-def placed(T: Array, reading: Array, placement: Index, length: float, unsure: float) -> tuple[Array, Placements]:
+def placed(T: Array, reading: Array, placement: Integers, length: float, unsure: float) -> tuple[Array, Placements]:
     """Return the bias (N, d) of samples, and the estimates.
 
     Parameters

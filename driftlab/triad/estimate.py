@@ -11,10 +11,9 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.triad.model import BIAS, GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import CurveError, MatrixCurve, TriadInput, TriadMatrix
 from fusion_core.thermal.curve_error import six_digits
 
@@ -60,9 +59,9 @@ class TriadFit:
     terms: TriadTerms
     domain: tuple[float, float]
     usual: Array
-    free: NDArray[np.bool_]
-    observable: NDArray[np.bool_]
-    unobservable_changes: NDArray[np.bool_]
+    free: Flags
+    observable: Flags
+    unobservable_changes: Flags
     design: Sequence[TermCurve]
     root: Array
     noise: tuple[float, ...]

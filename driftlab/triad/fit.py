@@ -39,7 +39,6 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.triad.estimate import TINY, TriadFit
 from driftlab.triad.model import (
@@ -58,7 +57,7 @@ from driftlab.triad.model import (
     polynomial,
     recordings_of,
 )
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import ThermalMap, TriadInput
 from fusion_core.errors import SingularFit
 
@@ -79,7 +78,7 @@ def fit_triad(
     stimulus: TriadInput,
     settings: ThermalMap,
     bias_size: float,
-    wanted: NDArray[np.bool_] | None = None,
+    wanted: Flags | None = None,
     walk: float | None = None,
     prior: TermPrior | None = None,
 ) -> TriadFit:
@@ -147,7 +146,7 @@ class _Search:
         stimulus: TriadInput,
         curves: list[list[TermCurve]],
         usual: Array,
-        free: NDArray[np.bool_],
+        free: Flags,
         declared: float | None = None,
     ) -> None:
         self.stimulus, self.curves, self.usual, self.free = stimulus, curves, usual, free
@@ -230,7 +229,7 @@ class _Search:
         return self._columns[key]
 
     def _system(
-        self, curves: Sequence[TermCurve], some: NDArray[np.bool_], wide: float = WIDE, *, law: bool = True
+        self, curves: Sequence[TermCurve], some: Flags, wide: float = WIDE, *, law: bool = True
     ) -> tuple[Array, Array]:
         """Return N (n, n), with priors and penalties in it, and the whitened design A (m, n) of curves.
 
@@ -330,7 +329,7 @@ class _Search:
         self.by_walk = list(zip(likely.tolist(), solutions, strict=True))
         self.s = self.s * np.sqrt(white_noise)
 
-    def _regressors(self) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    def _regressors(self) -> tuple[Array, Array, Flags, Array]:
         """Return the columns X (m, n) of the terms over their white noise, and what is left to them (m,).
 
         Coefficients with a law (n,) are left about its mean; without it they have a weak prior, its precision (n,).

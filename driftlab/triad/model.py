@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Equations, NetworkMap, ThermalMap
 from fusion_core.contracts.stimulus import AXES as AXES
 from fusion_core.contracts.stimulus import PAIRS as PAIRS
@@ -143,12 +142,12 @@ def laws_of(curves: Sequence[TermCurve]) -> Array:
     return known
 
 
-def recordings_of(e: Equations) -> NDArray[np.int64]:
+def recordings_of(e: Equations) -> Integers:
     """Return the recording of each equation (m,)."""
     return np.zeros(len(e.t), dtype=np.int64) if e.recording is None else e.recording
 
 
-def clocks_of(e: Equations) -> NDArray[np.int64]:
+def clocks_of(e: Equations) -> Integers:
     """Return the number of the clock of each equation: it goes on in a recording after the end of the one before."""
     names, own = np.unique(recordings_of(e), return_inverse=True)
     first, last = (np.array([end(e.t[own == k]) for k in range(len(names))]) for end in (np.min, np.max))

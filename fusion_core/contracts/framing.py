@@ -11,10 +11,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.errors import ConfigError
 
@@ -56,7 +53,7 @@ class Frames:
 
     N: int
     channels: Mapping[str, Array]
-    count: NDArray[np.int64] | None = None
+    count: Integers | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
 
 

@@ -19,11 +19,11 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.sensor import Alignment, AlwaysStill, Detector, Patience, Sensor, Site
 from fusion_core.errors import ConfigError
-from fusion_core.model import Flags, Measurement, Prior, State, Transition
+from fusion_core.model import Measurement, Prior, State, Transition
 from fusion_core.settings import nearest
 from fusion_core.statespace import Block, StateSpace
 from fusion_core.thermal.rate_estimators import RateEstimator, Regression

@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.plugin import Memory, plugin_error
 from fusion_core.contracts.thermal_map import ThermalMap
-from fusion_core.model import Flags
 from fusion_core.statespace import Block
 from fusion_core.units import convert
 

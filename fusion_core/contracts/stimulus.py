@@ -17,9 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags, Integers
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.sensor import Site
 from fusion_core.errors import ConfigError
@@ -56,8 +55,8 @@ class Equations:
     J: Array
     T: Array
     t: Array
-    group: NDArray[np.int64]
-    recording: NDArray[np.int64] | None = None
+    group: Integers
+    recording: Integers | None = None
 
 
 class TriadInput(ABC):
@@ -82,7 +81,7 @@ class TriadInput(ABC):
         """Return the reason that a term of `TERMS`, then `SENSITIVITIES`, cannot be seen; after `; ` the remedy."""
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Flags:
         """True for those of `TERMS` (12,) that are looked for."""
         free = np.ones(len(TERMS), dtype=bool)
         free[list(BELOW)] = not self.sensor_frame

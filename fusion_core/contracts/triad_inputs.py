@@ -24,9 +24,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts.stimulus import (
     AXES,
     PAIRS,
@@ -78,7 +77,7 @@ class KnownRates(TriadInput):
     temperatures: Array
     times: Array
     force: Array | None = None
-    recordings: NDArray[np.int64] | None = None
+    recordings: Integers | None = None
 
     @property
     def T(self) -> Array:
@@ -123,7 +122,7 @@ class PlacedForces(TriadInput):
     times: Array
     gravity: float
     unsure: float = 0.0
-    recordings: NDArray[np.int64] | None = None
+    recordings: Integers | None = None
     sensor_frame = True
 
     @property

@@ -14,11 +14,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.fast import compiled
-from fusion_core.model import Flags
 
-Index = NDArray[np.int64]
 Size = tuple[float, ...]
 
 
@@ -36,8 +34,8 @@ class IndependentGroups:
         States and components of the model.
     """
 
-    states: Index
-    rows: Index
+    states: Integers
+    rows: Integers
     n: int
     m: int
 
@@ -57,7 +55,7 @@ class IndependentGroups:
         """True if all groups have as many states, and as many components: no place is filled up."""
         return self.states.size == self.n and self.rows.size == self.m
 
-    def blocks(self, matrix: Array, rows: Index, columns: Index) -> Array:
+    def blocks(self, matrix: Array, rows: Integers, columns: Integers) -> Array:
         """Return the groups' blocks (G, i, j) of a matrix, by their places in its rows (G, i) and columns (G, j)."""
         wide = matrix if self.even else np.pad(matrix, ((0, 1), (0, 1)))
         return wide[rows[:, :, None], columns[:, None, :]]
@@ -68,13 +66,13 @@ class IndependentGroups:
         wide[..., self.states[:, :, None], self.states[:, None, :]] = blocks
         return wide[..., : self.n, : self.n]
 
-    def lanes(self, array: Array, places: Index) -> Array:
+    def lanes(self, array: Array, places: Integers) -> Array:
         """Return an array (N, n) or (N, m) as lanes (N, s, G) or (N, c, G); a copy only if need be."""
         if not self.ordered:
             array = np.take(array if self.even else np.pad(array, ((0, 0), (0, 1))), places.T.ravel(), axis=1)
         return array.reshape(len(array), *places.T.shape)
 
-    def from_lanes(self, lanes: Array, places: Index, size: int) -> Array:
+    def from_lanes(self, lanes: Array, places: Integers, size: int) -> Array:
         """Return lanes (N, s, G) or (N, c, G) in the model's order, which has `size` of them."""
         flat = lanes.reshape(len(lanes), -1)
         return flat if self.ordered else np.take(flat, np.argsort(places.T.ravel(), kind="stable")[:size], axis=1)
@@ -104,7 +102,7 @@ def _groups(coupling: bytes, measuring: bytes, shape: tuple[int, int]) -> Indepe
     return IndependentGroups(_filled(states, n), _filled(rows, len(measured)), n, len(measured))
 
 
-def _filled(lists: list[Index], filling: int) -> Index:
+def _filled(lists: list[Integers], filling: int) -> Integers:
     width = max(len(entry) for entry in lists)
     return np.array([np.pad(entry, (0, width - len(entry)), constant_values=filling) for entry in lists])
 

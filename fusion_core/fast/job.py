@@ -17,12 +17,12 @@ import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import FLOAT, covariance
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.fast import compiled, inlined
 from fusion_core.fast.groups import IndependentGroups, Size, find_groups
 from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive, single
 from fusion_core.fast.steady import Gains, Invariant, invariant
-from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+from fusion_core.model import Estimates, Measurement, State, Transition
 
 DETOUR = 256  # samples of recursion once one is refused: others are often near
 SPAN = 16_384  # samples with steady gains at first; each further stretch is longer

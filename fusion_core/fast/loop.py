@@ -17,10 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.fast import compiled, inlined
 from fusion_core.fast.groups import Size
-from fusion_core.model import Flags
 
 Index = NDArray[np.uint64]  # unsigned: no index counts from the end, which would cost a comparison each
 

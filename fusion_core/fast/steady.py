@@ -14,9 +14,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from fusion_core.chunk import Array
-from fusion_core.fast.groups import IndependentGroups, Index, find_groups
-from fusion_core.model import Flags
+from fusion_core.chunk import Array, Flags, Integers
+from fusion_core.fast.groups import IndependentGroups, find_groups
 
 TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
 MAX_TRANSIENTS = 8  # of a model in the cache: recordings begin alike, and so do units of one config
@@ -80,7 +79,7 @@ class Gains:
         Logarithm of the determinant of S, of all groups.
     """
 
-    kind: Index
+    kind: Integers
     P: Array
     K: Array
     root: Array

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion_core.chunk import Array
-from fusion_core.thermal.sweeps import TURN, Index, directions
+from fusion_core.chunk import Array, Integers
+from fusion_core.thermal.sweeps import TURN, directions
 
 CHANCE = 1e-3  # probability that noise alone is taken for a ripple, of an axis
 HALVINGS = 6  # widths of cells: the widest is half of what the curve is looked at with
@@ -60,7 +60,7 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
     return found
 
 
-def _products(cell: Index, way: Index, left: Array) -> tuple[Array, Index]:
+def _products(cell: Integers, way: Integers, left: Array) -> tuple[Array, Integers]:
     """Return u v (M, d) of each three neighbouring cells that both ways have gone through, and the middle ones (M,)."""
     count = 3 * (int(cell.max()) // 3 + 1)
     apart, there = [], np.ones(count // 3, dtype=np.bool_)

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
-Index = NDArray[np.int64]
+Index = Integers
 
 TURN = 0.1  # of the whole swing: a smaller way back is no turning point
 ONE_WAY = 0.1  # of the way up (or down) that the other way must have at least
@@ -33,7 +32,7 @@ def turning_points(T: Array, turn: float) -> list[int]:
     return [*points, high if way > 0 else low] if way else []
 
 
-def directions(T: Array, turn: float) -> Index:
+def directions(T: Array, turn: float) -> Integers:
     """Return +1 (up), -1 (down) or 0 (neither so far) for each of T (K,)."""
     ways_of_T = np.zeros(len(T), dtype=np.int64)
     for start, stop in pairwise(turning_points(T, turn)):
@@ -41,7 +40,7 @@ def directions(T: Array, turn: float) -> Index:
     return ways_of_T
 
 
-def sweeps_of(T: Array, turn: float) -> Index:
+def sweeps_of(T: Array, turn: float) -> Integers:
     """Return the number of the sweep of each of T (K,): a new one begins after each turn."""
     turns = turning_points(T, turn)[1:-1]
     return np.searchsorted(np.asarray(turns, dtype=np.int64), np.arange(len(T))).astype(np.int64)

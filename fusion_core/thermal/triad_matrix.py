@@ -15,10 +15,9 @@ from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import FiniteFloat, model_validator
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.settings import Frozen
 from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.record_texts import Plain
@@ -109,7 +108,7 @@ class TriadMatrix(MatrixCurve):
         return self
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Flags:
         """True for the terms (9,) that the frame leaves free, row by row."""
         whole = np.ones((3, 3), dtype=bool)
         return (whole if self.frame == "given" else np.triu(whole)).ravel()

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags, Integers
 from fusion_core.contracts import Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
@@ -63,7 +63,7 @@ class Checksum(Settings):
         """Number of bytes."""
         return SIMPLE.get(self.kind) or int(self.kind.split("/")[0].removeprefix("CRC-")) // 8
 
-    def good(self, frames: Bytes, order: Literal["big", "little"]) -> NDArray[np.bool_]:
+    def good(self, frames: Bytes, order: Literal["big", "little"]) -> Flags:
         """Return the frames (N, L) that end with the checksum of the bytes before it, as flags (N,)."""
         body, sent = frames[:, self.start : -self.size], frames[:, -self.size :]
         sent = sent if (self.byte_order or order) == "big" else sent[:, ::-1]
@@ -77,7 +77,7 @@ class Checksum(Settings):
         value = self._of(body[:, self.start :]).astype(">i8").reshape(-1, 1).view(np.uint8)[:, -self.size :]
         return value if (self.byte_order or order) == "big" else value[:, ::-1]
 
-    def _of(self, body: Bytes) -> NDArray[np.int64]:
+    def _of(self, body: Bytes) -> Integers:
         if self.kind == "xor8":
             return np.asarray(np.bitwise_xor.reduce(body, axis=1), dtype=np.int64)
         if self.kind in SIMPLE:
@@ -294,6 +294,6 @@ class Binary(Framing):
         return Frames(len(values), channels, count, {what: n for what, n in rejections.items() if n})
 
 
-def _until_false(flags: NDArray[np.bool_]) -> int:
+def _until_false(flags: Flags) -> int:
     k = int(flags.argmin()) if len(flags) else 0
     return len(flags) if not len(flags) or flags[k] else k

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
@@ -133,7 +133,7 @@ class XsensMtdata2(Framing):
         left = {what: n for what, n in rejected.items() if n}
         return Frames(int(np.sum(good)), channels, count[good], left), dict(held)
 
-    def _clock(self, messages: Bytes, items: Mapping[int, Item]) -> NDArray[np.int64] | None:
+    def _clock(self, messages: Bytes, items: Mapping[int, Item]) -> Integers | None:
         """Return the time or the counter (N,) of messages, None where they have none."""
         identifier, code = CLOCKS[self.clock]
         item = items.get(identifier)
@@ -158,7 +158,7 @@ def _length(stream: bytes, at: int) -> int | None:
     return 7 + length if length <= LONGEST else 0
 
 
-def _alike(text: Bytes, places: NDArray[np.int64]) -> Iterable[NDArray[np.int64]]:
+def _alike(text: Bytes, places: Integers) -> Iterable[Integers]:
     """Yield the rows of `places` in groups whose messages have the same items at the same places."""
     for length in np.unique(places[:, 1]):
         rows = np.flatnonzero(places[:, 1] == length)

@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from fusion_core import contracts
 from fusion_core.budget import TEXTS, check_all
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts.file_source import Conversions, problem
 from fusion_core.contracts.framing import DAMAGED
 from fusion_core.errors import UnreadableFile, seconds
@@ -38,8 +37,6 @@ OFF = 0.02  # of the declared interval: more is reported
 RESTARTS = "restarts of the device's counter"
 TIME = "time"
 STAMP = ""  # under which a block gives the times that are made here: no field is called so
-
-Numbers = NDArray[np.int64]
 
 
 @hookimpl
@@ -162,7 +159,7 @@ class Stamps:
 
     def of(self, frames: contracts.Frames) -> Array:
         """Return the times (N,) of the next samples, s from the first; report what was rejected before them."""
-        where = self._where()
+        where = "at the start" if self.raw is None or self.tick is None else f"after {seconds(self.x * self.tick)}"
         for what, count in frames.rejected.items():
             self.faults.add(what, count, where)
         if frames.N == 0:
@@ -178,7 +175,7 @@ class Stamps:
         self.x = int(x[-1])
         return np.asarray(x * (self.tick or 0.0), dtype=np.float64)
 
-    def _steps(self, count: Numbers, where: str) -> Numbers:
+    def _steps(self, count: Integers, where: str) -> Integers:
         """Return the steps of the counter, without its wraps; one that ran backwards has begun anew."""
         assert self.counter is not None
         modulo, first = self.counter.modulo, self.raw is None
@@ -194,6 +191,3 @@ class Stamps:
         lost = np.maximum(np.rint(steps[int(first) :] / self.step) - 1, 0)
         self.faults.add(LOST, int(np.sum(lost)), where)
         return steps
-
-    def _where(self) -> str:
-        return "at the start" if self.raw is None or self.tick is None else f"after {seconds(self.x * self.tick)}"

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import RANGES, Faults
@@ -146,7 +146,7 @@ def bridged(chunks: Iterable[Chunk], size: int, faults: Faults) -> Iterator[Chun
         yield from (part.part(start, start + size) for start in range(0, len(part), size))
 
 
-def _readings(chunk: Chunk) -> NDArray[np.bool_]:
+def _readings(chunk: Chunk) -> Flags:
     """Return the rows (N,) that have a reading of the thermometer."""
     low, high, _ = RANGES["temperature"]
     T = chunk["temperature"]
@@ -228,7 +228,7 @@ def interval(t: Array) -> float:
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
 
 
-def records(data: NDArray[np.uint8] | bytes, at: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any]:
+def records(data: NDArray[np.uint8] | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes.
 
     What of a mapped file is held in memory for it is given back, piece by piece: a log is larger than what it takes.

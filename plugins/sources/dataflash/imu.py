@@ -25,12 +25,10 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_plugins.ardupilot_names import ParameterNames, of_axes
 
-Places = NDArray[np.int64]
 Sensor = Literal["Gyr", "Acc"]
 
 REFERENCE = 35.0  # degC, of the polynomial
@@ -67,7 +65,7 @@ class Parameters:
     values : (P,) array
     """
 
-    def __init__(self, names: list[str], at: Places, values: Array) -> None:
+    def __init__(self, names: list[str], at: Integers, values: Array) -> None:
         self._rows: dict[str, tuple[list[int], list[float]]] = {}
         for name, place, value in zip(names, at.tolist(), values.tolist(), strict=True):
             places, known = self._rows.setdefault(name, ([], []))
@@ -126,23 +124,23 @@ class ImuCorrections:
         """Names of the sensor's parameters."""
         return ParameterNames(self.sensor.upper(), self.k + 1)
 
-    def undo(self, v: Array, T: Array, at: Places) -> Array:
+    def undo(self, v: Array, T: Array, at: Integers) -> Array:
         """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them."""
         raw = np.empty_like(v)
         for rows, place in self._spans(at):
             raw[rows] = self._undone(v[rows], T[rows], place)
         return raw
 
-    def polynomial(self, at: Places) -> bool:
+    def polynomial(self, at: Integers) -> bool:
         """Return True if a learned polynomial was applied to one of the rows."""
         return any(self._compensated(place) for _, place in self._spans(at))
 
-    def unknown(self, at: Places) -> int | None:
+    def unknown(self, at: Integers) -> int | None:
         """Return an AHRS_ORIENTATION of the rows that is none that is known; None where there is none such."""
         places = [place for _, place in self._spans(at) if self._rotation(place) is None]
         return int(self._value("AHRS_ORIENTATION", places[0])) if places else None
 
-    def applied(self, at: Places) -> list[str]:
+    def applied(self, at: Integers) -> list[str]:
         """Return the names of what was applied to one of the rows."""
         n, others, offsets = self.names, dict[str, None](), list[Array]()
         for _, place in self._spans(at):
@@ -155,7 +153,7 @@ class ImuCorrections:
         changed = f" (changed {len(offsets) - 1} times)" if len(offsets) > 1 else ""
         return [*([n.offset + changed] if np.any(offsets) else []), *others]
 
-    def _spans(self, at: Places) -> Iterator[tuple[slice, int]]:
+    def _spans(self, at: Integers) -> Iterator[tuple[slice, int]]:
         """Yield stretches of rows over which no parameter changed, and the place of their first one."""
         edges = np.searchsorted(at, self.parameters.changes(self._relevant())).tolist()
         for begin, end in pairwise(sorted({0, *edges, len(at)})):

@@ -29,10 +29,9 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TimeBudget, check_count
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
@@ -62,7 +61,7 @@ class MessageStream:
     """
 
     message: records.Message
-    at: records.Places
+    at: Integers
     data: records.Bytes
     unit: int | None = None
     samples: dict[str, Array] = field(default_factory=dict, init=False)
@@ -284,9 +283,7 @@ ROOM = 0.25  # of the span of a field
 MIN_WHOLE_RECORDS = 3  # whole records that say what a field can be
 
 
-def credible(
-    message: records.Message, data: records.Bytes, whole: records.Places, doubtful: records.Places
-) -> NDArray[np.bool_]:
+def credible(message: records.Message, data: records.Bytes, whole: Integers, doubtful: Integers) -> Flags:
     """Return the records in doubt (D,) whose values those of whole ones at `whole` (N,) cover, as flags."""
     good = np.full(len(doubtful), len(whole) >= MIN_WHOLE_RECORDS)
     for label in message.numbers if np.any(good) else ():
@@ -304,7 +301,7 @@ FEW = 8  # rows in a row: damage is a sector of 512 bytes, which holds so many
 MIN_HOLE = 60.0  # s: a hole that is shorter is a hole
 
 
-def plausible(t: Array) -> NDArray[np.bool_]:
+def plausible(t: Array) -> Flags:
     """Return the time stamps t (N,) in s, in the order of the file, that are not damaged, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
     if np.any(np.diff(t) < 0):
@@ -317,7 +314,7 @@ def plausible(t: Array) -> NDArray[np.bool_]:
     return good
 
 
-def _near(t: Array) -> NDArray[np.bool_]:
+def _near(t: Array) -> Flags:
     """Return the rows that are not a few beyond a hole, at either end, that is longer than all the rest, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
     for part in (t, -t[::-1]):
@@ -328,7 +325,7 @@ def _near(t: Array) -> NDArray[np.bool_]:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _rising(t: Array) -> NDArray[np.bool_]:
+def _rising(t: Array) -> Flags:
     """Return the samples of t (N,) on the longest subsequence that does not fall, as flags (patience sorting)."""
     n, piles = len(t), 0
     tops, before, last = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)  # last: t at the top of each pile

@@ -29,13 +29,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TimeBudget
+from fusion_core.chunk import Flags, Integers
 from fusion_plugins.sources.joining import records, release
 
 PIECE = 1 << 22  # bytes between two looks at the clock, and of a mapped log that are held
-Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
+Into = tuple[Integers, NDArray[np.uint8], Integers, Integers]
 State = tuple[int, int, int, int, int, int]
 Bytes = NDArray[np.uint8]
-Places = NDArray[np.int64]
 
 SIZES = {"a": 64, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "f": 4, "d": 8, "n": 4, "N": 16, "Z": 64, "c": 2,
          "C": 2, "e": 4, "E": 4, "L": 4, "M": 1, "q": 8, "Q": 8, "g": 2}  # fmt: skip
@@ -66,10 +66,10 @@ class Scan(NamedTuple):
         Where the last record ends.
     """
 
-    at: Places
+    at: Integers
     types: Bytes
-    counts: Places
-    doubtful: Places
+    counts: Integers
+    doubtful: Integers
     doubtful_types: Bytes
     lost: int
     first_lost: int
@@ -95,7 +95,7 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: TimeBudget) -> 
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _walk(data: Bytes, stop: int, wanted: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
+def _walk(data: Bytes, stop: int, wanted: Flags, lengths: Integers, into: Into, state: State) -> State:
     """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
 
     `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
@@ -147,7 +147,7 @@ def _follows(data: Bytes, end: int, length: int) -> bool:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _format_size(data: Bytes, pos: int, letters: Places) -> int:
+def _format_size(data: Bytes, pos: int, letters: Integers) -> int:
     """Return the length of the records that an FMT at `pos` describes, by its letters; 0 where it is damaged.
 
     By what it declares, where a letter is none that is known.
@@ -241,14 +241,14 @@ class Message:
         """Bytes of a record, by its letters."""
         return 3 + sum(SIZES[letter] for letter in self.letters)
 
-    def raw(self, data: Bytes, at: Places, label: str) -> np.ndarray:
+    def raw(self, data: Bytes, at: Integers, label: str) -> np.ndarray:
         """Return a field as it stands in the records at `at` (N,), unscaled."""
         k = self.labels.index(label)
         offset = 3 + sum(SIZES[letter] for letter in self.letters[:k])
         code = CODES.get(self.letters[k], f"S{SIZES[self.letters[k]]}")
         return records(data, at + offset, np.dtype(code))
 
-    def values(self, data: Bytes, at: Places, label: str) -> np.ndarray:
+    def values(self, data: Bytes, at: Integers, label: str) -> np.ndarray:
         """Return a field of the records at `at` (N,) as float64 (N,), or (N, 32) where it is an array."""
         with np.errstate(invalid="ignore"):  # a signalling NaN is damage, and NaN then
             values = self.raw(data, at, label).astype(np.float64)
@@ -257,12 +257,12 @@ class Message:
         scale = self.scales.get(label)
         return values if scale is None else values * scale
 
-    def text(self, data: Bytes, at: Places, label: str) -> list[str]:
+    def text(self, data: Bytes, at: Integers, label: str) -> list[str]:
         """Return a field of characters, without what follows its end."""
         return [bytes(raw).split(b"\0")[0].decode("latin-1") for raw in self.raw(data, at, label)]
 
 
-def described(data: Bytes, at: Places) -> dict[int, list[tuple[int, Message]]]:
+def described(data: Bytes, at: Integers) -> dict[int, list[tuple[int, Message]]]:
     """Return the messages by type that the FMT records at `at` (N,) describe, each with where it does.
 
     A description that only repeats the one before it is left out.

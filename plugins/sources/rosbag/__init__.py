@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.budget import COPIED, check_count, keep, temporary_folder, unpacked_at_most
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import Block, FileSource, Table, foreign, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
@@ -38,7 +38,7 @@ from fusion_core.settings import nearest
 from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
-from fusion_plugins.sources.rosbag.storage import Batch, ChunkedFile, Connection, Integers, plain, zstd
+from fusion_plugins.sources.rosbag.storage import Batch, ChunkedFile, Connection, plain, zstd
 from fusion_plugins.sources.unpacked import damaged, unpacking
 
 Storage = ChunkedFile | sqlite.Sqlite
@@ -313,7 +313,7 @@ class TopicStream:
         """Return a column of what was last taken; the time, where the path names the topic alone."""
         return self.t if self.fields[path] is None else self._columns.get(path, np.empty(0))
 
-    def _timed(self, log: Integers, columns: Mapping[str, NDArray[Any]], good: NDArray[np.bool_]) -> Integers:
+    def _timed(self, log: Integers, columns: Mapping[str, NDArray[Any]], good: Flags) -> Integers:
         """Return the times of messages, ns, and leave out of `good` those that have none."""
         n = int(np.sum(good))
         self._seen += n
@@ -342,7 +342,7 @@ class TopicStream:
                     f"were expected; name one value of them, as {path}[0]"
                 )
 
-    def _note(self, what: str, which: NDArray[np.bool_], times: Integers, at: str = "logged at") -> None:
+    def _note(self, what: str, which: Flags, times: Integers, at: str = "logged at") -> None:
         """Count messages, by flags and the times (n,) of all in ns."""
         if np.any(which):
             first = times[np.argmax(which)]

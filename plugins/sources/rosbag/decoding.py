@@ -32,10 +32,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.budget import TimeBudget, size_of
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.errors import UnreadableFile, quote
 from fusion_plugins.sources.joining import records
-from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
+from fusion_plugins.sources.rosbag.storage import Batch, Connection
 
 MAX_LAYOUTS = 8  # layouts at a time
 STEPS = 100_000  # of a walk through one message, and
@@ -72,7 +72,7 @@ class Decoder:
         self.widths: dict[str, set[int]] = {leaf: set() for leaf in leaves}  # lengths of arrays that messages had
         self._layouts: list[MessageLayout] = []
 
-    def decode(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
+    def decode(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], Flags]:
         """Return the wanted numbers as columns of (n,) or, of arrays, (n, length), and which messages could be read.
 
         A number that a message does not have, of a sequence too short for its index, is NaN.
@@ -98,9 +98,7 @@ class Decoder:
             self.clock.check(len(good))
         return columns, good
 
-    def _take(
-        self, layout: MessageLayout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]
-    ) -> NDArray[np.bool_]:
+    def _take(self, layout: MessageLayout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]) -> Flags:
         """Copy what messages of a layout hold into the columns; return which they were."""
         fits = batch.sizes[at] >= layout.record.itemsize
         if not np.any(fits):

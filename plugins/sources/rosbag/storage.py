@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_core.budget import LISTED, TEXTS, TimeBudget, check_size, inflated
+from fusion_core.chunk import Integers
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
 
-Integers = NDArray[np.int64]
 U32 = struct.Struct("<I")
 ZSTD = b"\x28\xb5\x2f\xfd"  # what a message begins with that was compressed on its own; CDR begins with a zero
 

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 
 BEGAN = 1_767_225_600  # s since 1970, of the first sample: 2026-01-01
 SECOND = 10**9
@@ -66,7 +66,7 @@ class BagWriter:
                 self._bag.write(topic, stamp, messages[k].tobytes())
         self._sent += len(chunk)
 
-    def _messages(self, stamps: NDArray[np.int64], numbers: Array) -> NDArray[np.void]:
+    def _messages(self, stamps: Integers, numbers: Array) -> NDArray[np.void]:
         """Return messages of a header and numbers, (N,)."""
         size = len(FRAME) if self._ros1 else len(FRAME) + 1
         first, filling = ("seq", 0) if self._ros1 else ("encoding", -(12 + size) % 8)

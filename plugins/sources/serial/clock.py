@@ -19,9 +19,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts.framing import Counter
 from fusion_core.errors import seconds
 from fusion_core.faults import LOST, Faults
@@ -32,8 +31,6 @@ PULL = 1.0  # s^2: until arrivals are spread by about a second, the declared rat
 OFF = 0.02  # of the declared rate: more is reported
 LONG_ENOUGH = 5.0  # s before the measured rate counts
 WINDOW = 2.5  # s over which the rate is measured that the declared one is compared with
-
-Numbers = NDArray[np.int64]
 
 
 class SampleClock:
@@ -73,7 +70,7 @@ class SampleClock:
         elapsed = self.at - self.began
         return elapsed / self.x if elapsed >= LONG_ENOUGH and self.x else self.nominal
 
-    def stamp(self, N: int, count: Numbers | None, at: float) -> Array:
+    def stamp(self, N: int, count: Integers | None, at: float) -> Array:
         """Return the times (N,) in s of the next samples, the last of which had come at the host's time `at`."""
         if N == 0:
             return np.empty(0)
@@ -89,7 +86,7 @@ class SampleClock:
         self.t = float(t[-1])
         return np.asarray(t, dtype=np.float64)
 
-    def _by_number(self, N: int, at: float, first: bool) -> Numbers:
+    def _by_number(self, N: int, at: float, first: bool) -> Integers:
         """Return the steps between samples that have no counter: a pause is as long as the host's clock says."""
         steps = np.ones(N, dtype=np.int64)
         steps[0] = 0 if first else 1
@@ -98,7 +95,7 @@ class SampleClock:
             steps[0] += int(missing)
         return steps
 
-    def _by_count(self, count: Numbers, at: float, first: bool) -> Numbers:
+    def _by_count(self, count: Integers, at: float, first: bool) -> Integers:
         """Return the steps of the counter, without its wraps."""
         assert self.counter is not None
         modulo = self.counter.modulo
@@ -117,7 +114,7 @@ class SampleClock:
         self._report(LOST, lost)
         return steps
 
-    def _restarted(self, steps: Numbers, elapsed: float, stuck: NDArray[np.bool_]) -> Numbers:
+    def _restarted(self, steps: Integers, elapsed: float, stuck: Flags) -> Integers:
         k = int(np.argmax(np.where(stuck, np.inf, np.abs(steps - self.step))))
         steps = np.where(stuck, self.step, steps)
         others = int(np.sum(steps) - steps[k])
@@ -142,7 +139,7 @@ class SampleClock:
             )
             self.faults.add(self.advice, 1, f"at {seconds(self.t)}")
 
-    def _line(self, x: Numbers, before: int, at: float) -> Array:
+    def _line(self, x: Integers, before: int, at: float) -> Array:
         """Return the host's time (N,) of samples x (N,), on the line through what has arrived."""
         w, wx, wy, wxx, wxy, pull = self.sums
         moved = (self.x - before) * self.nominal

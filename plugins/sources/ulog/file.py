@@ -33,7 +33,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
@@ -50,7 +50,6 @@ NUMBERS = {
     "float": "<f4", "double": "<f8", "bool": "i1", "char": "i1",
 }  # fmt: skip
 U16 = np.dtype("<u2")
-Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +70,7 @@ class Instance:
 
     topic: str
     number: int
-    at: Places
+    at: Integers
     row: np.dtype[np.void]
     data: NDArray[np.uint8]
 
@@ -183,7 +182,7 @@ class LogFile:
             )
         return data
 
-    def _messages(self, begin: int, ends: Sequence[int]) -> tuple[Places, NDArray[np.uint16]]:
+    def _messages(self, begin: int, ends: Sequence[int]) -> tuple[Integers, NDArray[np.uint16]]:
         """Read the definitions, and return the places of the rows of what they define, and which these are."""
         rows, numbers = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
         out, at, count, text = np.empty(BLOCK // 5 + 1, np.int64), begin, 0, 0
@@ -225,7 +224,7 @@ class LogFile:
             form, name = content[1 : 1 + content[0]].decode(errors="ignore").split(" ")[:2]
             (self.parameters[name],) = np.frombuffer(content[1 + content[0] :], NUMBERS[form]).tolist()
 
-    def _found(self, rows: Places, numbers: NDArray[np.uint16]) -> Iterator[tuple[tuple[str, int], Instance]]:
+    def _found(self, rows: Integers, numbers: NDArray[np.uint16]) -> Iterator[tuple[tuple[str, int], Instance]]:
         """Yield the instances that have rows with a time; of several subscriptions of one, the first comes last."""
         order = np.argsort(numbers, kind="stable")
         rows, numbers = rows[order], numbers[order]
@@ -308,9 +307,9 @@ _D = ord("D")
 NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
 
-def sampled(rows: int) -> Places:
+def sampled(rows: int) -> Integers:
     """Return the numbers of an instance's rows that tell about it: the first, second, fourth and so on, and more."""
-    n: Places = np.arange(rows)
+    n: Integers = np.arange(rows)
     return np.asarray(n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)])
 
 
