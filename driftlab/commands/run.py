@@ -147,19 +147,15 @@ class RunResult(Result):
         both = in_sample(fitted, (str(one["name"]) for one in sheet.recordings))
         remarks = [f"the map was fitted on {name} too, so it predicts what it has seen" for name in both]
         if not both:
-            remarks = [
-                f"the bias over temperature is the map's, of another recording; this one was at {_span(*measured)}"
-            ]
+            low, high = measured
+            at = f"this one was at {low:.2f} to {high:.2f} °C"
+            remarks = [f"the bias over temperature is the map's, of another recording; {at}"]
         T = float(self.overview.curves["temperature_raw"][-1])
         if record.domain[0] <= T <= record.domain[1]:
             less = (self.overview.bias - fitted.bias(np.array([T]))[0]) * unit.factor
             values = ", ".join(f"{axis} {v:.3g}" for axis, v in zip(self.model.tracked.axes, less, strict=True))
             remarks.append(f"the bias at the end less the map's there is {values} {unit.shown}")
         return remarks
-
-
-def _span(low: float, high: float) -> str:
-    return f"{low:.2f} to {high:.2f} °C"
 
 
 def run(
