@@ -96,35 +96,33 @@ class Status:
     @property
     def state(self) -> str:
         """The state of the run in a few words."""
-        if self.phase != "listening":
-            return self.phase
-        silent, cause = self.no_data, self.cause
-        if silent:
-            return f"no data for {silent:,.0f} s" + (f": {cause}" if cause else "")
-        if self.faults.unavailable or not self.samples:
-            return cause
-        if self.waiting is not None:
-            return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)"
-        if self.moving:
-            return "moving, not used"
-        if self.refused:
-            return "at rest, and refused: the model does not fit"
-        if self.map is None or not self.map.unused:
-            return "at rest"
-        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map"
+        return self._state_and_level[0]
 
     @property
     def level(self) -> Level:
         """The level of that state."""
+        return self._state_and_level[1]
+
+    @property
+    def _state_and_level(self) -> tuple[str, Level]:
         if self.phase != "listening":
-            return "waiting"
-        if self.no_data or self.faults.unavailable:
-            return "bad"
-        if self.waiting is not None or not self.samples:
-            return "waiting"
-        if self.moving or (self.map is not None and self.map.unused and not self.refused):
-            return "warning"
-        return "bad" if self.refused else "good"
+            return self.phase, "waiting"
+        silent, cause = self.no_data, self.cause
+        if silent:
+            return f"no data for {silent:,.0f} s" + (f": {cause}" if cause else ""), "bad"
+        if self.faults.unavailable:
+            return cause, "bad"
+        if not self.samples:
+            return cause, "waiting"
+        if self.waiting is not None:
+            return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)", "waiting"
+        if self.moving:
+            return "moving, not used", "warning"
+        if self.refused:
+            return "at rest, and refused: the model does not fit", "bad"
+        if self.map is None or not self.map.unused:
+            return "at rest", "good"
+        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map", "warning"
 
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""
