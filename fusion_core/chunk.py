@@ -18,6 +18,7 @@ from fusion_core.errors import MissingChannel
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 

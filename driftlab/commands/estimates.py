@@ -18,12 +18,11 @@ from driftlab.evaluation.overview import OverviewAccumulator
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.segment import TEMPERATURES, RunLog, RunSegment
 from driftlab.filtering.smoothing import Spool
-from driftlab.storage.hdf5 import PIECE, GrowingFile, columns_of, continued, named, reading
+from driftlab.storage.hdf5 import PIECE, Columns, GrowingFile, columns_of, continued, named, reading
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
 from fusion_core.host.provenance import participants, upgraded
 
-Columns = Mapping[str, NDArray[Any]]
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
 CHECKPOINT = "checkpoint.npz"
 SPOOL = "smoothing.part"
@@ -44,7 +43,7 @@ def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
     return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | sized
 
 
-def at_file_precision(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def at_file_precision(columns: Columns) -> dict[str, NDArray[Any]]:
     """Return the columns of a run as precise as `estimates.h5` keeps them."""
     return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
 

@@ -16,7 +16,6 @@ from driftlab import __version__
 from driftlab.commands.console import keep_freed_memory, print_verdict, say, say_lines, terminal
 from driftlab.commands.estimates import (
     CHECKPOINT,
-    Columns,
     EstimatesWriter,
     Stored,
     at_file_precision,
@@ -41,7 +40,7 @@ from driftlab.reports.provenance import Sheet, sheet_of
 from driftlab.reports.run import bias_chart, page_of
 from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
-from driftlab.storage.hdf5 import reading
+from driftlab.storage.hdf5 import Columns, reading
 from driftlab.storage.json import write_json
 from driftlab.storage.ownership import document
 from fusion_core.contracts import FittedMap

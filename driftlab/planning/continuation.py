@@ -7,7 +7,7 @@ the sigma of the map that is fitted to both together; the misfit of the kind so 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.maps.fit import gather
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
-from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, RatedProfile, SearchResult, SigmaCurve
+from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, Progress, RatedProfile, SearchResult, SigmaCurve
 from driftlab.planning.unit_model import UnitModel
 from driftlab.soak.blocks import means, runs
 from fusion_core.chunk import Array
@@ -28,8 +28,6 @@ LITTLE = 0.05  # of sigma: an hour that gains less is not worth it
 EDGE = 0.02  # of the range, by which its end may be missed
 CYCLES = (1, 2, 4)
 STEPS = 5.0  # K
-
-Progress = Callable[..., None] | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_core.checks import all_finite
+from fusion_core.checks import Shape, all_finite
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
@@ -32,8 +32,6 @@ from fusion_core.thermal.soak_noise import Blocks, Smoother
 ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
 MAX_MATRICES = 8  # of N, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
 KINDS = {"fiu": "numbers", "iu": "whole numbers", "b": "true or false"}
-
-Shape = tuple[int, ...]
 
 
 class Sizes(dict[str, Any]):

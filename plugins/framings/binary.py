@@ -22,10 +22,9 @@ from functools import cache, cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from fusion_core.chunk import Array, Chunk, Flags, Integers
+from fusion_core.chunk import Array, Bytes, Chunk, Flags, Integers
 from fusion_core.contracts import Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
@@ -33,7 +32,6 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings, nearest
 from fusion_plugins.framings.field import VALID, DeviceCounter, channel, check_channel, counts, sent
 
-Bytes = NDArray[np.uint8]
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
 
 

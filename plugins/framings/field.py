@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import USUAL, Channel
+from fusion_core.contracts import USUAL, Channel, Counter
 from fusion_core.contracts.file_source import problem
-from fusion_core.contracts.framing import Counter
 from fusion_core.errors import UnitError
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, convert

@@ -24,9 +24,8 @@ import numpy as np
 from pydantic import model_validator
 
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import Memory
+from fusion_core.contracts import Counter, Frames, Framing, Memory
 from fusion_core.contracts.file_source import problem
-from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit
 from fusion_plugins.framings.binary import Binary

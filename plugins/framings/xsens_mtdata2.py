@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fusion_core.chunk import Array, Chunk, Integers
+from fusion_core.chunk import Array, Bytes, Chunk, Integers
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
@@ -38,7 +38,6 @@ NUMBERS = {0: (">f4", 1.0), 1: (">i4", 2.0**-20), 3: (">f8", 1.0)}  # by the for
 CLOCKS = {"sample_time": (0x1060, ">u4"), "packet_counter": (0x1020, ">u2")}
 INCOMPLETE = "messages without rate of turn or time, left out"
 
-Bytes = NDArray[np.uint8]
 Channel = Literal["gyro", "accel", "temperature"]
 
 

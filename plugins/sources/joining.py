@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk, Flags, Integers, concatenate
+from fusion_core.chunk import Array, Bytes, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import RANGES, Faults
@@ -53,7 +53,7 @@ def taken_apart(path: str) -> FieldPath | None:
     return None if match is None else FieldPath(match[1], None if match[2] is None else int(match[2]), match[3])
 
 
-def mapped(path: Path) -> NDArray[np.uint8]:
+def mapped(path: Path) -> Bytes:
     """Return the bytes of a log, read when they are asked for; raises UnreadableFile where they cannot be mapped."""
     try:
         return np.asarray(np.memmap(path, np.uint8, "r"))
@@ -61,7 +61,7 @@ def mapped(path: Path) -> NDArray[np.uint8]:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); free memory, or copy it again") from None
 
 
-def release(data: NDArray[np.uint8] | bytes) -> None:
+def release(data: Bytes | bytes) -> None:
     """Let the system have the memory back in which it holds what was read of a mapped file; it reads it again."""
     base: Any = data
     while base is not None and not isinstance(base, mmap.mmap):
@@ -228,7 +228,7 @@ def interval(t: Array) -> float:
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
 
 
-def records(data: NDArray[np.uint8] | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
+def records(data: Bytes | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes.
 
     What of a mapped file is held in memory for it is given back, piece by piece: a log is larger than what it takes.

@@ -20,8 +20,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Export, Exporter, Loss, SensorLoss
-from fusion_core.contracts.exporter import Deviation, warm_up
+from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, SensorLoss, warm_up
 from fusion_core.errors import ConfigError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension

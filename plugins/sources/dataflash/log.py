@@ -31,7 +31,7 @@ import numpy as np
 from numba import njit
 
 from fusion_core.budget import COUNT, TimeBudget, check_count
-from fusion_core.chunk import Array, Flags, Integers
+from fusion_core.chunk import Array, Bytes, Flags, Integers
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
@@ -62,7 +62,7 @@ class MessageStream:
 
     message: records.Message
     at: Integers
-    data: records.Bytes
+    data: Bytes
     unit: int | None = None
     samples: dict[str, Array] = field(default_factory=dict, init=False)
 
@@ -102,7 +102,7 @@ class DataFlashMessages:
         If no message is described, or what is described is beyond the budget.
     """
 
-    def __init__(self, path: Path, data: records.Bytes, wanted: Iterable[str], faults: Faults) -> None:
+    def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
         self.path, self.data = path, data
         clock = TimeBudget(path, "what is no record")
         first = records.scan(data, (records.FMT,), len(data) // records.FMT_LENGTH + 1, clock)
@@ -269,7 +269,7 @@ def _letters(rows: MessageStream) -> list[str]:
     return [chr(code % 256) for code in rows.values("Id").astype(int)]
 
 
-def _end_of_content(tail: records.Bytes) -> int:
+def _end_of_content(tail: Bytes) -> int:
     """Return the number of bytes before an end of nothing but 0 or 255, at least 16 of them."""
     last = 0
     for fill in (0, 255):
@@ -283,7 +283,7 @@ ROOM = 0.25  # of the span of a field
 MIN_WHOLE_RECORDS = 3  # whole records that say what a field can be
 
 
-def credible(message: records.Message, data: records.Bytes, whole: Integers, doubtful: Integers) -> Flags:
+def credible(message: records.Message, data: Bytes, whole: Integers, doubtful: Integers) -> Flags:
     """Return the records in doubt (D,) whose values those of whole ones at `whole` (N,) cover, as flags."""
     good = np.full(len(doubtful), len(whole) >= MIN_WHOLE_RECORDS)
     for label in message.numbers if np.any(good) else ():

@@ -26,16 +26,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TimeBudget
-from fusion_core.chunk import Flags, Integers
+from fusion_core.chunk import Bytes, Flags, Integers
 from fusion_plugins.sources.joining import records, release
 
 PIECE = 1 << 22  # bytes between two looks at the clock, and of a mapped log that are held
-Into = tuple[Integers, NDArray[np.uint8], Integers, Integers]
+Into = tuple[Integers, Bytes, Integers, Integers]
 State = tuple[int, int, int, int, int, int]
-Bytes = NDArray[np.uint8]
 
 SIZES = {"a": 64, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "f": 4, "d": 8, "n": 4, "N": 16, "Z": 64, "c": 2,
          "C": 2, "e": 4, "E": 4, "L": 4, "M": 1, "q": 8, "Q": 8, "g": 2}  # fmt: skip

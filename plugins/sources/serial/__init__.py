@@ -29,9 +29,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import Source
+from fusion_core.contracts import Counter, Framing, Source
 from fusion_core.contracts.file_source import problem
-from fusion_core.contracts.framing import Counter, Framing
 from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl

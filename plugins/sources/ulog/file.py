@@ -33,7 +33,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
-from fusion_core.chunk import Array, Integers
+from fusion_core.chunk import Array, Bytes, Integers
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
@@ -72,7 +72,7 @@ class Instance:
     number: int
     at: Integers
     row: np.dtype[np.void]
-    data: NDArray[np.uint8]
+    data: Bytes
 
     def columns(self, fields: Collection[str]) -> dict[str, Array]:
         """Return all rows of it by field, of those fields that it has."""
