@@ -16,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperCommand
@@ -146,10 +146,10 @@ class Command:
 
     def made(self) -> TyperCommand:
         """Return it as typer runs it."""
-        declared = declaration(self.module, self.name)
-        texts = {**declaration("driftlab.commands.run", "run").texts, **declared.texts, **HELP}
+        declared, own = declaration(self.module, self.name)
+        texts = {**declaration("driftlab.commands.run", "run")[1], **own, **HELP}
         parameters, rest = [], dict(self.options)
-        for name, (annotation, default) in declared.parameters.items():
+        for name, (annotation, default) in declared.items():
             if name in rest:
                 option = rest.pop(name)
                 parameters.append(replace(option, help=option.help or texts[name]).parameter(name))
@@ -161,7 +161,7 @@ class Command:
                 parameters.append(Option(form, texts[name], TYPES[annotation], value).parameter(name))
         parameters += [option.parameter(name) for name, option in rest.items()]
 
-        options = {**({"set_": SET} if {"config", "configs"} & declared.parameters.keys() else {}), **SAID}
+        options = {**({"set_": SET} if {"config", "configs"} & declared.keys() else {}), **SAID}
         parameters += [option.parameter(name) for name, option in options.items()]
 
         def call(*, quiet: bool, verbose: bool, set_: list[str] | None = None, **given: Any) -> None:
@@ -180,7 +180,7 @@ class Command:
         from driftlab.storage.json import plain
 
         function = getattr(module, self.name)
-        known = declaration(self.module, self.name).parameters
+        known, _ = declaration(self.module, self.name)
         options = {name: value for name, value in given.items() if name not in known}
         arguments = {name: value for name, value in given.items() if name in known and value is not None}
         if "config" in arguments:
@@ -227,13 +227,6 @@ class Deferred(TyperCommand):
         return self.command.made().make_context(*given, **named)
 
 
-class Declaration(NamedTuple):
-    """A function as its source text declares it: each parameter's annotation and default, and the texts on them."""
-
-    parameters: dict[str, tuple[str, Any]]
-    texts: dict[str, str]
-
-
 @cache
 def _head(module: str, name: str) -> str:
     """Return the text of a function at the top of a module, which is not imported, to the end of its docstring."""
@@ -253,8 +246,11 @@ def summary(module: str, name: str) -> str:
 
 
 @cache
-def declaration(module: str, name: str) -> Declaration:
-    """Read the signature and the docstring of a function at the top of a module, which is not imported."""
+def declaration(module: str, name: str) -> tuple[dict[str, tuple[str, Any]], dict[str, str]]:
+    """Read a function at the top of a module, which is not imported: its parameters, and the texts on them.
+
+    Of each parameter the annotation and the default.
+    """
     node = ast.parse(_head(module, name)).body[0]
     assert isinstance(node, ast.FunctionDef)
     arguments = node.args
@@ -274,4 +270,4 @@ def declaration(module: str, name: str) -> Declaration:
         for names, line in re.findall(r"^(\w[\w, ]*) :.*\n {4}(.*)", section, re.MULTILINE)
         for name in names.split(", ")
     }
-    return Declaration(parameters, texts)
+    return parameters, texts
