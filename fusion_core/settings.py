@@ -90,8 +90,7 @@ class Settings(Frozen):
         known = {name for name, info in cls.model_fields.items() if info.init is not False} | cls.written_too
         for key in data if isinstance(data, dict) else ():
             if key not in known:
-                hint = nearest(str(key), known)
-                advice = f"did you mean '{hint}'?" if hint else f"known keys: {', '.join(sorted(known))}"
+                advice = did_you_mean(str(key), known, f"known keys: {', '.join(sorted(known))}", "'")
                 raise PydanticCustomError("unknown_key", "{text}", {"text": f"unknown key; {advice}", "key": key})
         return data
 
@@ -127,3 +126,9 @@ def nearest(word: str, known: Any, cutoff: float = 0.5) -> str | None:
     alike = [k for k in map(str, known) if not axis or [found.lower() for found in AXIS.findall(k)] in ([], axis)]
     matches = difflib.get_close_matches(word, alike, n=1, cutoff=cutoff)
     return matches[0] if matches else None
+
+
+def did_you_mean(word: str, known: Any, otherwise: str, mark: str = "", cutoff: float = 0.5) -> str:
+    """Return the advice to take the known word most like `word`, between marks; what `otherwise` says where none is."""
+    hint = nearest(word, known, cutoff)
+    return f"did you mean {mark}{hint}{mark}?" if hint else otherwise

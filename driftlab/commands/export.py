@@ -45,7 +45,7 @@ from fusion_core.errors import ConfigError, UnreadableFile, quote
 from fusion_core.host.config import Document, document_of, validate
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_core.thermal.record_texts import parse_json
 from fusion_core.units import along_axes
 
@@ -131,8 +131,8 @@ def installed(base: type, kind: str, option: str) -> Any:
     """Return the installed class of a kind; raises ConfigError, which names the option, with a near one."""
     classes = registry().classes(base)
     if kind not in classes:
-        hint = nearest(kind, classes, 0.6)
-        raise ConfigError(f"{option} {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
+        advice = did_you_mean(kind, classes, f"known: {', '.join(classes)}", cutoff=0.6)
+        raise ConfigError(f"{option} {kind}: {advice}")
     return classes[kind]
 
 

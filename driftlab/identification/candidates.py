@@ -26,7 +26,7 @@ from fusion_core.contracts.plugin import built_in
 from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, quote
 from fusion_core.host.registry import kind_of, registry
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 
 MAX_POWER = 6  # of temperature above which a map needs no further ones
 MAX_MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
@@ -98,11 +98,8 @@ def check_kinds(kinds: Collection[str], option: str = "--without") -> None:
     known = [kind_of(cls) for cls in installed()]
     for kind in kinds:
         if kind not in known:
-            hint = nearest(kind, known)
-            raise ConfigError(
-                f"{option} {quote(kind)}: is no installed effect; "
-                + (f"did you mean {hint}?" if hint else f"known: {', '.join(known)}")
-            )
+            advice = did_you_mean(kind, known, f"known: {', '.join(known)}")
+            raise ConfigError(f"{option} {quote(kind)}: is no installed effect; {advice}")
 
 
 def _offers(search: Search, chunks: Sequence[Chunk], degree: int | None, cls: type[Effect]) -> list[Effect]:

@@ -28,7 +28,7 @@ from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTo
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_core.thermal.thermometer import NO_STEPS, Steps
 
 Progress = Callable[[float, int], None]
@@ -66,8 +66,7 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
         known = ", ".join(classes)
         raise ConfigError(f"no thermal map is named in the config; add one under {section}, or give --kind ({known})")
     if kind not in classes:
-        hint = nearest(kind, classes)
-        raise ConfigError(f"--kind {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
+        raise ConfigError(f"--kind {kind}: " + did_you_mean(kind, classes, f"known: {', '.join(classes)}"))
     return classes[kind].model_validate({"kind": kind})  # type: ignore[return-value]
 
 

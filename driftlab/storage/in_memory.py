@@ -22,7 +22,7 @@ from fusion_core.contracts import USUAL, Source, Usual
 from fusion_core.contracts.table import si_of_channel
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, quote
 from fusion_core.faults import Faults
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_core.units import convert
 
 _COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\])?")
@@ -183,11 +183,8 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
     """Take the units out of pairs, and return those of all channels that have one."""
     for name in units:
         if name not in given:
-            hint = nearest(name, given)
-            raise ConfigError(
-                f"units: names '{quote(name)}', which {title} does not have; "
-                + (f"did you mean '{hint}'?" if hint else "remove it")
-            )
+            advice = did_you_mean(name, given, "remove it", "'")
+            raise ConfigError(f"units: names '{quote(name)}', which {title} does not have; {advice}")
     written = dict(units)
     for name, item in given.items():
         if isinstance(item, tuple) and len(item) == 2 and isinstance(item[1], str):

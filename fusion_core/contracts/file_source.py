@@ -33,7 +33,7 @@ from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import USUAL, Block, Channel, Table, Window
 from fusion_core.errors import BadValue, ConfigError, EmptyRecording, MissingChannel, UnitError, UnreadableFile
 from fusion_core.faults import Faults
-from fusion_core.settings import ConfigPath, nearest
+from fusion_core.settings import ConfigPath, did_you_mean
 from fusion_core.units import Unit, convert
 
 Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI unit of each path of a channel
@@ -214,11 +214,10 @@ class FileSource(Source):
         for path in channel.paths:
             if not table.has(path):
                 known = list(table.names)
-                hint = nearest(path, known)
                 have = ", ".join(known[:30]) + (f" and {len(known) - 30} more" if len(known) > 30 else "")
                 raise MissingChannel(
                     f"{self.path}: has no {table.noun} '{path}' for channel {name}, it has {have or 'none'}; "
-                    + (f"did you mean '{hint}'?" if hint else f"correct source.channels.{name}.path")
+                    + did_you_mean(path, known, f"correct source.channels.{name}.path", "'")
                 )
         return [channel.conversion(self.path or Path(), name, path, table.unit(path)) for path in channel.paths]
 

@@ -24,7 +24,7 @@ from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.sensor import Alignment, AlwaysStill, Detector, Patience, Sensor, Site
 from fusion_core.errors import ConfigError
 from fusion_core.model import Measurement, Prior, State, Transition
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_core.statespace import Block, StateSpace
 from fusion_core.thermal.rate_estimators import RateEstimator, Regression
 from fusion_core.units import Quantity, Unit
@@ -177,8 +177,7 @@ class MeasurementModel(Plugin):
         """
         known = [sensor.channel for sensor in self.sensors]
         if channel not in known:
-            like = nearest(channel, known)
-            advice = f"did you mean '{like}'?" if like else "name one of these"
+            advice = did_you_mean(channel, known, "name one of these", "'")
             raise ConfigError(
                 f"filter: kind {self.kind} has no sensor '{channel}', it has {', '.join(known)}; {advice}"
             )

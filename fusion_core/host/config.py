@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from fusion_core.errors import ConfigError, quote
 from fusion_core.host.document import Lines, Location, parse, parse_value
 from fusion_core.host.provenance import parts
-from fusion_core.settings import can_be_path, nearest
+from fusion_core.settings import can_be_path, did_you_mean
 from fusion_core.units import Quantity
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -112,8 +112,7 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
     path = document.path.parent / base
     if can_be_path(base) and path.is_file():
         return path
-    hint = nearest(base, products)
-    known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
+    known = did_you_mean(base, products, f"products are {', '.join(sorted(products))}")
     raise ConfigError(
         f"{document.where(('extends',))}: extends: '{quote(base)}' is neither a packaged product nor a file; {known}"
     )
@@ -185,10 +184,8 @@ def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
             f"kind '{context['tag']}' is installed but broken ({broken[context['tag']]}); mend or reinstall its plugin"
         )
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
-    hint = nearest(context["tag"], known)
-    return f"kind '{quote(context['tag'])}' is not installed; " + (
-        f"did you mean {hint}?" if hint else f"known: {', '.join(known)}"
-    )
+    advice = did_you_mean(context["tag"], known, f"known: {', '.join(known)}")
+    return f"kind '{quote(context['tag'])}' is not installed; {advice}"
 
 
 def quantities(model: BaseModel) -> Iterator[tuple[str, Quantity]]:

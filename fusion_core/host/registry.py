@@ -31,7 +31,7 @@ from fusion_core.contracts.plugin import HOME, LOADERS, Family, Origin, Plugin
 from fusion_core.errors import FusionError, PluginError, describe_error, quote
 from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_core.units import bias_unit, unsettled
 
 PLUGINS = "fusion_plugins"
@@ -163,11 +163,9 @@ class Registry:
         known = (*self.families, PRODUCTS, "families")
         unknown = [hook for hook in hooks if hook not in known]
         if unknown or not (hooks or _classes_of(module)):
-            hint = nearest(unknown[0], known) if unknown else None
-            advice = f"did you mean {hint}?" if hint else f"decorate a function named like one of {', '.join(known)}"
-            raise PluginError(
-                f"{name} implements {f'an unknown hook {unknown[0]}' if unknown else 'no hook'}; {advice}"
-            )
+            have = f"an unknown hook {unknown[0]}" if unknown else "no hook"
+            otherwise = f"decorate a function named like one of {', '.join(known)}"
+            raise PluginError(f"{name} implements {have}; {did_you_mean(''.join(unknown[:1]), known, otherwise)}")
         for hook, item in self._items(module):
             try:
                 self._add(hook, item, name, point)

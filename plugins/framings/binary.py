@@ -29,7 +29,7 @@ from fusion_core.contracts import Memory
 from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_core.settings import Settings, nearest
+from fusion_core.settings import Settings, did_you_mean
 from fusion_plugins.framings.field import VALID, DeviceCounter, channel, check_channel, counts, sent
 
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
@@ -50,8 +50,7 @@ class Checksum(Settings):
     @model_validator(mode="after")
     def _known(self) -> Self:
         if self.kind not in SIMPLE and _crc(self.kind) is None:
-            hint = nearest(self.kind, names())
-            advice = f"did you mean '{hint}'?" if hint else "write e.g. CRC-16/MODBUS"
+            advice = did_you_mean(self.kind, names(), "write e.g. CRC-16/MODBUS", "'")
             text = f"checksum '{self.kind}' is neither one of {', '.join(SIMPLE)} nor a CRC of the catalogue; {advice}"
             raise problem(text)
         return self

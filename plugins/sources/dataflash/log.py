@@ -34,7 +34,7 @@ from fusion_core.budget import COUNT, TimeBudget, check_count
 from fusion_core.chunk import Array, Bytes, Flags, Integers
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_plugins.sources.dataflash import scan as records
 from fusion_plugins.sources.dataflash.imu import Parameters
 
@@ -244,14 +244,11 @@ class DataFlashMessages:
         have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
         have = [(rows, name) for rows, name in have if rows and name not in records.DESCRIPTIONS]
         name = path.partition(".")[0].partition("[")[0]
-        hint = nearest(name, [known for _, known in have])
         listed = ", ".join(f"{known} ({rows} rows)" for rows, known in have[:20])
-        inertial = name in records.INERTIAL
-        advice = "set LOG_BITMASK and LOG_DISARMED before the next log" if inertial else "correct the path"
-        return MissingChannel(
-            f"{self.path}: has no message '{name}' for '{path}', it has {listed or 'none'}; "
-            + (f"did you mean '{hint}'?" if hint and not inertial else advice)
-        )
+        advice = "set LOG_BITMASK and LOG_DISARMED before the next log"
+        if name not in records.INERTIAL:
+            advice = did_you_mean(name, [known for _, known in have], "correct the path", "'")
+        return MissingChannel(f"{self.path}: has no message '{name}' for '{path}', it has {listed or 'none'}; {advice}")
 
     def sound(self, stream: MessageStream, faults: Faults | None, clock: str | None = None) -> MessageStream:
         """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""

@@ -34,7 +34,7 @@ from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_core.settings import nearest
+from fusion_core.settings import did_you_mean
 from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
@@ -190,7 +190,7 @@ class Topics(Table):
             have = list(self.types.paths(connection.type))
             raise MissingChannel(
                 f"{self.path}: topic '{topic}' of {connection.type} has no field '{wanted}' of numbers, it has "
-                f"{_listed(have, len(have))}; " + _advice(nearest(wanted, have), f"name {topic}.FIELD")
+                f"{_listed(have, len(have))}; " + did_you_mean(wanted, have, f"name {topic}.FIELD", "'")
             )
         return topic, field
 
@@ -204,16 +204,12 @@ class Topics(Table):
         have = [f"{topic} ({of_topic[0].type}, {self._count(topic)} messages)" for topic, of_topic in some]
         return MissingChannel(
             f"{self.path}: has no topic '{named}', it has {_listed(have, len(self.topics))}; "
-            + _advice(nearest(named, list(self.topics)), "name one of them, then its field, as /imu.angular_velocity.x")
+            + did_you_mean(named, self.topics, "name one of them, then its field, as /imu.angular_velocity.x", "'")
         )
 
 
 def _listed(words: Sequence[str], count: int) -> str:
     return ", ".join(words[:SHOWN]) + (f" and {count - SHOWN} more" if count > SHOWN else "")
-
-
-def _advice(hint: str | None, otherwise: str) -> str:
-    return f"did you mean '{hint}'?" if hint else otherwise
 
 
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
