@@ -64,8 +64,7 @@ def yaml_text(text: str) -> str:
 
 def csv_cell(text: str) -> str:
     """Return a text as a cell of a CSV file; before a sign that begins a formula there is an apostrophe."""
-    plain = line(text)
-    plain = re.sub(rf"^(\s*)(?=[{FORMULA}])", r"\1'", plain)
+    plain = re.sub(rf"^(\s*)(?=[{FORMULA}])", r"\1'", line(text))
     return '"' + plain.replace('"', '""') + '"' if re.search(r"[,;\"]|^\s|\s$", plain) else plain
 
 

@@ -22,7 +22,6 @@ from fusion_core.chunk import Array, Flags
 from fusion_core.fast import compiled, inlined
 from fusion_core.model import Estimates, Measurement, State, Transition
 
-Index = NDArray[np.uint64]
 Size = tuple[float, ...]
 
 BLOCK = 16_384  # samples whose gains are held at once
@@ -123,8 +122,8 @@ class Smoother:
 class Passed(NamedTuple):
     """The filter's results of N samples, G groups of s states and c components; K is N, or 1 for F and H."""
 
-    states: Index  # (G, s) places of the states, n where filled up
-    rows: Index  # (G, c)
+    states: NDArray[np.uint64]  # (G, s) places of the states, n where filled up
+    rows: NDArray[np.uint64]  # (G, c)
     reset: Flags  # (n,)
     used: Flags  # (N,)
     F: Array  # (K, n, n)
