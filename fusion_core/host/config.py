@@ -166,10 +166,8 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
         case "union_tag_invalid":
             return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
-            known = "`driftlab plugins` lists those known"
-            return f"needs a `kind:`; {known}" + (
-                ", and `driftlab init FILE` writes it" if "source" in item["loc"] else ""
-            )
+            more = ", and `driftlab init FILE` writes it" if "source" in item["loc"] else ""
+            return f"needs a `kind:`; `driftlab plugins` lists those known{more}"
         case "model_type" | "model_attributes_type":
             return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":
@@ -179,13 +177,12 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
 
 
 def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
-    if context["tag"] in broken:
-        return (
-            f"kind '{context['tag']}' is installed but broken ({broken[context['tag']]}); mend or reinstall its plugin"
-        )
+    kind = context["tag"]
+    if kind in broken:
+        return f"kind '{kind}' is installed but broken ({broken[kind]}); mend or reinstall its plugin"
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
-    advice = did_you_mean(context["tag"], known, f"known: {', '.join(known)}")
-    return f"kind '{quote(context['tag'])}' is not installed; {advice}"
+    advice = did_you_mean(kind, known, f"known: {', '.join(known)}")
+    return f"kind '{quote(kind)}' is not installed; {advice}"
 
 
 def quantities(model: BaseModel) -> Iterator[tuple[str, Quantity]]:

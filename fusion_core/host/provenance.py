@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.plugin import Origin, Plugin, kind_default, origin_of
@@ -51,15 +50,12 @@ def parts(value: Any, at: str = "", unit: str | None = None) -> Iterator[tuple[s
     yield at, value, unit
     items: Iterable[tuple[Any, Any, str | None]] = ()
     if isinstance(value, BaseModel):
-        known = type(value).model_fields
-        items = ((name, item, _unit_of(known.get(name))) for name, item in value)
+        marks = ((name, mark) for name, info in type(value).model_fields.items() for mark in info.metadata)
+        units = {name: mark.unit for name, mark in marks if isinstance(mark, Unit)}
+        items = ((name, item, units.get(name)) for name, item in value)
     elif isinstance(value, Mapping):
         items = ((key, item, unit) for key, item in value.items())
     elif isinstance(value, tuple | list | set | frozenset):
         items = ((k, item, unit) for k, item in enumerate(value))
     for key, item, unit_of_item in items:
         yield from parts(item, f"{at}.{key}" if at else str(key), unit_of_item)
-
-
-def _unit_of(info: FieldInfo | None) -> str | None:
-    return next((item.unit for item in (info.metadata if info else ()) if isinstance(item, Unit)), None)
