@@ -41,6 +41,7 @@ class MatrixStates(Settings):
     """Density of the random walk of each."""
 
 
+@hookimpl
 class Driven(Held):
     """A sensor at a known input that changes."""
 
@@ -102,9 +103,3 @@ class Driven(Held):
         u = RATE * np.eye(d)[np.arange(N) // 20 % d] * np.where(np.arange(N) // 10 % 2, -1.0, 1.0)[:, None]
         noise = super().simulated(N, site, rng)[self.channel]
         return {self.channel: u + noise, self.reference: u}
-
-
-@hookimpl
-def measurement_models() -> list[type[contracts.MeasurementModel]]:
-    """Register the plugin."""
-    return [Driven]

@@ -56,6 +56,7 @@ Reference = Annotated[
 ]
 
 
+@hookimpl
 class Held(contracts.MeasurementModel):
     """A sensor at a constant or known input."""
 
@@ -205,9 +206,3 @@ def unit_of(noise: Any) -> tuple[str | None, str]:
         return quantities.unit_of_density(text) if isinstance(text, str) else (None, "")
     except UnitError:  # the field itself will say
         return None, ""
-
-
-@hookimpl
-def measurement_models() -> list[type[contracts.MeasurementModel]]:
-    """Register the plugin."""
-    return [Held]

@@ -93,6 +93,7 @@ class Rest(Settings):
     """After how long a rest that is refused the filter begins anew."""
 
 
+@hookimpl
 class Zupt(contracts.MeasurementModel):
     """An inertial unit at rest (zero-velocity update)."""
 
@@ -251,9 +252,3 @@ def _sensor(triad: _Corrected, channel: str, unit: str, shown: str, **others: An
     noise = along_axes(triad.noise, len(triad.bias.axes))
     section = f"filter.{channel}"
     return contracts.Sensor(channel, section, unit, shown, noise, triad.range, triad.bias, triad.calibration, **others)
-
-
-@hookimpl
-def measurement_models() -> list[type[contracts.MeasurementModel]]:
-    """Register the plugin."""
-    return [Zupt]

@@ -141,6 +141,7 @@ class OnnxMap(contracts.FittedMap):
         return result.reshape(N, d)
 
 
+@hookimpl
 class OnnxNetwork(contracts.NetworkMap):
     """Map as a small neural network for each axis."""
 
@@ -264,9 +265,3 @@ def _smoother(networks: list[net.Weights], bins: Bins, target: contracts.Target)
         return np.asarray(taken @ blocks.shares(bins.of_sample, len(bins.T)))
 
     return smoother
-
-
-@hookimpl
-def thermal_maps() -> list[type[contracts.ThermalMap]]:
-    """Register the plugin."""
-    return [OnnxNetwork]

@@ -69,6 +69,7 @@ class PolynomialMap(contracts.FittedMap):
         return _polynomial(T, self.domain, derivative)
 
 
+@hookimpl
 class Polynomial(contracts.ThermalMap):
     """Map as a polynomial of temperature."""
 
@@ -176,9 +177,3 @@ def _triangle(x: Array, bias: Array, order: int) -> tuple[Array, Array, Array]:
         rows = np.hstack([chebyshev.chebvander(x[part], order), bias[part]])
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
     return triangle[:n, :n], triangle[:n, n:], np.sum(triangle[n:, n:] ** 2, axis=0)
-
-
-@hookimpl
-def thermal_maps() -> list[type[contracts.ThermalMap]]:
-    """Register the plugin."""
-    return [Polynomial]

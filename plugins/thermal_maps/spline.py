@@ -96,6 +96,7 @@ class _Fits:
         return np.asarray(_basis(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
 
 
+@hookimpl
 class Spline(contracts.ThermalMap):
     """Map as a penalised cubic spline of temperature."""
 
@@ -196,9 +197,3 @@ def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:
     from scipy.interpolate import BSpline
 
     return BSpline(_knots(domain, len(coefficients) - 3), coefficients, 3)
-
-
-@hookimpl
-def thermal_maps() -> list[type[contracts.ThermalMap]]:
-    """Register the plugin."""
-    return [Spline]
