@@ -91,18 +91,15 @@ def bias_budget(
     a soak of several recordings and placements, is in the budget where it is given; `level` is how far the level
     differs from one recording of a stimulus to another, 0 where it is not known.
     """
-    T, record = temperatures(*fitted.domain), fitted.record
-    holes = record.error.holes if record.error is not None else ()
-    for low, high in holes:
-        T = np.unique(np.where((low < T) & (high > T), np.where((low + high) / 2 > T, low, high), T))
+    record, error = fitted.record, fitted.record.error
+    T = temperatures(*fitted.domain, holes=error.holes if error is not None else ())
     bias, shape = fitted.bias(T), (len(T), record.d)
-    if record.error is None:
+    if error is None:
         return UncertaintyBudget(T, bias, [], ["anything: this kind of map does not say how sure its curve is"])
-    sources, missing = [UncertaintySource("curve", "A", fitted.sigma(T))], []
-    missing += [f"the curve between {low:.4g} and {high:.4g} °C, of which there is no sample" for low, high in holes]
-    left = np.zeros(record.d) if record.residual is None else np.asarray(record.residual)
+    sources = [UncertaintySource("curve", "A", fitted.sigma(T))]
+    missing = [f"the curve between {low:.4g} and {high:.4g} °C: there is no sample" for low, high in error.holes]
     if record.samples and record.residual is not None:
-        mean = np.broadcast_to(left / np.sqrt(record.samples), shape)
+        mean = np.broadcast_to(np.asarray(record.residual) / np.sqrt(record.samples), shape)
         sources += [] if _knows_its_level(record) else [UncertaintySource("mean", "A", mean)]
     else:
         missing.append("the noise of the level: the map's file does not say its samples")
@@ -116,8 +113,7 @@ def bias_budget(
         sources.append(UncertaintySource("placements", "A", np.broadcast_to(own, shape)))
         missing += across
     ups = None if soak is None or placements is not None else power_ups(fitted, soak)
-    if level:
-        ups = np.full(record.d, level)
+    ups = np.full(record.d, level) if level else ups
     if ups is None:
         missing.append("the level after another power-up: it was not measured (three recordings or more measure it)")
     else:
@@ -160,13 +156,19 @@ def matrix_budget(
     return UncertaintyBudget(T, terms, sources, missing)
 
 
-def temperatures(low: float, high: float, most: int = MAX_ROWS) -> Array:
-    """Return both ends of a domain and round temperatures between, degC; `most` at most."""
+def temperatures(low: float, high: float, most: int = MAX_ROWS, holes: Sequence[tuple[float, float]] = ()) -> Array:
+    """Return both ends of a domain and round temperatures between, degC; `most` at most.
+
+    In place of those within a hole stand its ends.
+    """
     for step in STEPS:
         between = np.arange(np.ceil((low + NEAR * step) / step), np.floor((high - NEAR * step) / step) + 1) * step + 0.0
         if len(between) <= most - 2:
             break
-    return np.concatenate([[low], between, [high]])
+    T = np.concatenate([[low], between, [high]])
+    for start, stop in holes:
+        T = np.unique(np.where((start < T) & (stop > T), np.where((start + stop) / 2 > T, start, stop), T))
+    return np.asarray(T)
 
 
 def _knows_its_level(record: MapRecord) -> bool:

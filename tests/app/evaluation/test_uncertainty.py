@@ -49,7 +49,7 @@ def test_no_row_stands_where_nothing_was_recorded():
     budget = bias_budget(verdict_on(T[keep], bias[keep]).map)
     assert not np.any((budget.T > 3.1) & (budget.T < 21.9))
     assert {3.0, 22.0} <= set(np.round(budget.T, 1))
-    assert any(text.endswith("°C, of which there is no sample") for text in budget.missing)
+    assert any(text.endswith("°C: there is no sample") for text in budget.missing)
     assert not any("no sample" in text for text in bias_budget(verdict_on(T, bias).map).missing)
 
 
