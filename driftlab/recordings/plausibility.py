@@ -109,7 +109,7 @@ class Rounding:
         least = np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf)
         step = np.minimum(self.step, least)
         known = np.where(np.isfinite(self.step), self.step, 0.0)
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where there are no steps
             times = np.vstack([changes.reshape(-1, len(step)), known]) / step
             odd = np.max(np.abs(times - np.rint(times)), axis=0, where=np.isfinite(times), initial=0.0)
         self.step = np.where(odd < EXACT, step, 0.0)
