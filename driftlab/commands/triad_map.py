@@ -30,15 +30,16 @@ from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_all, save, write_beside
+from driftlab.triad.consistency import contradictions, unsteady
 from driftlab.triad.estimate import TriadFit
 from driftlab.triad.fit import fit_triad
-from driftlab.triad.model import GROUPS, SENSITIVITIES, TERMS
+from driftlab.triad.model import BIAS, GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Flags
 from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
-from fusion_core.faults import Faults
+from fusion_core.faults import DOUBT, Faults
 from fusion_core.host.provenance import Participant
 from fusion_core.host.registry import registry
 from fusion_core.thermal.record_texts import recorded
@@ -149,19 +150,22 @@ class TriadMapResult(MapResult):
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
         self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
         self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
-            "triad": plain(words.as_json(fit, self.unit)), "serial": config.serial,
+            "triad": plain(words.as_json(fit, self.unit, self._doubts())), "serial": config.serial,
             "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }  # fmt: skip
 
     def lines(self) -> list[str]:
         """Return the frame, what is not observable, and the notes on the recordings."""
-        return [*self.verdict(), *self.faults.lines()]
+        return [*self.verdict(), *self.faults.lines(doubts=False)]
 
     def verdict(self) -> list[str]:
-        """Return the frame, how far levels differ, the family, and what is not observable, a sentence each."""
+        """Return doubts, the frame, how far levels differ, the family, what is not observable, a sentence each."""
         of_family = [] if self.law is None else [words.family_line(self.fit, self.law.units)]
         levels = words.level_lines(self.fit, self.unit)
-        return [words.frame_line(self.fit), *levels, *of_family, *words.verdict(self.fit)]
+        return [*self._doubts(), words.frame_line(self.fit), *levels, *of_family, *words.verdict(self.fit)]
+
+    def _doubts(self) -> list[str]:
+        return [f"in doubt: {text}" for text in self.faults.doubts]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit)
@@ -169,14 +173,15 @@ class TriadMapResult(MapResult):
     def _texts(self, sheet: Sheet) -> list[str]:
         recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
         lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
-        return [words.page_of(self.fit, self.unit, self.map.record.channel, lead, self.faults.lines(), sheet)]
+        notes, channel = self.faults.lines(doubts=False), self.map.record.channel
+        return [words.page_of(self.fit, self.unit, channel, lead, self._doubts(), notes, sheet)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
         measured = {name: one for name, one in self.measured.items() if not (self.fit.has_bias and name in none)}
         return Certificate(
             COMMAND, self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
-            levelled=self.fit.has_bias, remarks=words.verdict(self.fit),
+            levelled=self.fit.has_bias, remarks=[*self._doubts(), *words.verdict(self.fit)],
         )  # fmt: skip
 
 
@@ -230,8 +235,10 @@ def fit_triad_map(
         gathered.stimulus, settings, size, _wanted(names),
         None if walk is None else float(np.max(walk)), None if law is None else law.prior(),
     )  # fmt: skip
+    for text in [*contradictions(gathered.stimulus, size), *unsteady(fit, gathered.sensor.unit)]:
+        faults.doubt(text)
     fit = fit if known is None else fit.without_bias()
-    fitted = _map_of(own, gathered, fit, settings, known, provenance(settings, recordings or [own.recording]))
+    fitted = _map_of(own, gathered, fit, settings, known, recordings, faults.doubts)
     result = TriadMapResult(own, recordings, gathered, fit, fitted, faults, law)
     if out is not None:
         result.save(out, report=report, certificate=certificate)
@@ -298,17 +305,21 @@ def _map_of(
     fit: TriadFit,
     settings: ThermalMap,
     known: FittedMap | None,
-    about: Mapping[str, str],
+    recordings: Sequence[str],
+    doubts: Sequence[str],
 ) -> FittedMap:
     """Return the map: the bias of the fit, or one that is known, and the matrix."""
     try:
         parts = {"matrix": fit.matrix(), "sensitivity": fit.sensitivity()}
     except ValidationError as error:
         raise MapError(
-            f"the fit gives no map: {error.errors()[0]['msg']}; check the units of the config against the stimulus"
+            f"the fit gives no map: {error.errors()[0]['msg']}; "
+            f"{doubts[0] if doubts else 'check the units of the config against the stimulus'}"
         ) from None
+    doubt = {DOUBT: doubts[0]} if doubts else {}
     if known is not None:
-        return known.noting(**parts)
+        return known.noting(**parts, provenance=recorded({**known.record.provenance, **doubt}))
+    about = {**provenance(settings, recordings or [config.recording]), **doubt}
     T = np.linspace(fit.grid[0], fit.grid[-1], POINTS)
     record = MapRecord(
         kind=settings.kind, domain=(float(T[0]), float(T[-1])), channel=gathered.sensor.channel,
@@ -326,7 +337,10 @@ def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     say_lines(result.verdict())
     print_verdict(result.limits_verdict, "limits: ")
     say_lines((row.line(result.unit) for row in result.limits), "  ")
-    say_lines(result.faults.lines(), "note: ")
+    say_lines(result.faults.lines(doubts=False), "note: ")
     say(f"written to {', '.join(map(str, result.written))}\n")
+    if not np.any(result.fit.observable[len(BIAS) :]):
+        say("no term of scale factor and misalignment is known: the map is of no use\n")
+        return
     line = f"{{kind: {result.map.record.kind}, path: {result.written[0]}}}"
     say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")

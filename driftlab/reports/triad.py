@@ -11,7 +11,7 @@ from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, band
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
-from driftlab.triad.estimate import TriadFit
+from driftlab.triad.estimate import SURE, TriadFit
 from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, SCALE, TERMS
 from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
@@ -32,8 +32,14 @@ def verdict(fit: TriadFit) -> list[str]:
     """Return a sentence for each term that is not observable, with the reason and the remedy."""
     lines = []
     middle = fit.sigma(np.array([np.mean(fit.domain)]))[0]
+    if drowned := [name for name, own in zip(fit.names, fit.free & fit.drowned, strict=True) if own]:
+        lines.append(
+            f"{', '.join(drowned)}: not observable, and taken as zero, since the fit leaves {fit.noise[0]:.2g} in SI "
+            f"of the equations (rms), where {SURE * fit.usual[0]:.2g} is usual: the stimulus is not that of the "
+            "recording, or contradicts itself; check axes, signs, units and times"
+        )
     for j, name in enumerate(fit.names):
-        if not fit.free[j]:
+        if not fit.free[j] or fit.drowned[j]:
             continue
         if not fit.observable[j]:
             lines.append(f"{name}: not observable, and taken as zero, since {fit.stimulus.lacking(j)}")
@@ -220,7 +226,9 @@ def chart(fit: TriadFit) -> Chart:
     return _term_chart(fit, title, "scale (0.1 %) and misalignment", ("mrad", 1e3), terms)
 
 
-def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Sequence[str], sheet: Sheet) -> str:
+def page_of(
+    fit: TriadFit, unit: BiasUnit, channel: str, lead: str, doubts: Sequence[str], notes: Sequence[str], sheet: Sheet
+) -> str:
     """Return the page of a fit."""
     strained = len(fit.names) > len(TERMS)
     terms = "scale factor, misalignment and g-sensitivity" if strained else "scale factor and misalignment"
@@ -229,7 +237,7 @@ def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Seque
         title=f"{', '.join(['bias'] * fit.has_bias + [terms]).capitalize()} of the {channel}",
         lead=lead,
         sheet=sheet,
-        result=result(fit, unit, channel),
+        result="; ".join([*doubts, result(fit, unit, channel)]),
         use=use(fit, unit),
         hidden=verdict(fit),
         terms=table(fit, unit),
@@ -239,8 +247,8 @@ def page_of(fit: TriadFit, unit: BiasUnit, channel: str, lead: str, notes: Seque
     )
 
 
-def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:
-    """Return the terms in SI over the grid of temperatures."""
+def as_json(fit: TriadFit, unit: BiasUnit, doubts: Sequence[str]) -> dict[str, Any]:
+    """Return the terms in SI over the grid of temperatures, and the verdict behind doubts."""
     T: Array = fit.grid
     change, of_change = fit.change()
     values, sigma = fit.terms.at(T), fit.sigma(T)
@@ -248,7 +256,7 @@ def as_json(fit: TriadFit, unit: BiasUnit) -> dict[str, Any]:
     return {
         "frame": "sensor" if fit.stimulus.sensor_frame else "given",
         "temperature": T.tolist(),
-        "verdict": verdict(fit),
+        "verdict": [*doubts, *verdict(fit)],
         "terms": {
             name: {
                 "unit": si_unit_of(j, unit), "told": bool(fit.observable[j]), "free": bool(fit.free[j]),

@@ -20,6 +20,8 @@ from fusion_core.thermal.curve_error import six_digits
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
 SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
 TINY = 1e-30
+UNOBSERVABLE = 0.5  # of the usual size: a term that is not known better is not observable
+SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class TriadFit:
         Deviation of an equation in each group.
     columns : tuple of int
         How many of the columns of the root are of each of SOURCES.
+    walk : float
+        Density of the random walk of the bias, its unit/sqrt(s).
     level : float
         Deviation of the level of the bias from one recording to another; 0 where the recordings are too few to tell it.
     parabolas : pair of (9, 3) and (9, 3, 3) arrays, or None
@@ -66,6 +70,7 @@ class TriadFit:
     root: Array
     noise: tuple[float, ...]
     columns: tuple[int, ...]
+    walk: float
     level: float = 0.0
     parabolas: tuple[Array, Array] | None = None
     distance: tuple[float, int] | None = None
@@ -104,6 +109,14 @@ class TriadFit:
     def sigma(self, T: Array) -> Array:
         """Return the deviation (N, q) of the terms at T (N,)."""
         return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
+
+    @cached_property
+    def drowned(self) -> NDArray[np.bool_]:
+        """True for terms (q,) that what is left of the equations hides, where it would not with a usual noise."""
+        e = self.stimulus.equations(self.terms.at(self.stimulus.T))
+        J = np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1])))
+        part = UNOBSERVABLE * self.usual * np.sqrt(np.sum(J[e.group == 0] ** 2, axis=0))
+        return np.asarray((self.noise[0] > part) & (part > SURE * self.usual[0]) & ~self.observable)
 
     def parts(self, T: Array) -> dict[str, Array]:
         """Return the deviation (N, q) of the terms at T (N,) by source."""

@@ -40,7 +40,7 @@ from itertools import product
 
 import numpy as np
 
-from driftlab.triad.estimate import TINY, TriadFit
+from driftlab.triad.estimate import SURE, TINY, UNOBSERVABLE, TriadFit
 from driftlab.triad.model import (
     BIAS,
     GRAVITY,
@@ -63,10 +63,8 @@ from fusion_core.errors import SingularFit
 
 STEPS = 30
 WIDE = 20.0  # times the usual size: the prior with which a fit begins
-UNOBSERVABLE = 0.5  # of the usual size: a term that is not known better is not observable
 USUAL_SENSITIVITY = float(np.deg2rad(0.1)) / GRAVITY  # rad/s a m/s^2: of MEMS gyros, 0.1 deg/s/g
 PASSES = 4
-SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
 WALKS = tuple(10.0 ** (k / 2) for k in range(-6, 5))  # variance of the walk over that of an equation, at the end
 LEVELS = tuple(10.0 ** (k / 2) for k in range(-6, 13))  # and of the level from one recording to another
 LEVEL = 0.01  # of a usual bias: that level, of a usual unit
@@ -449,13 +447,13 @@ class _Search:
         free = np.sum(~lawful) - len(pinned) + float(np.diag(whole @ (A.T @ A)) @ lawful)
         student = 1 + 2 / max(len(self.z) - free - 2, 1.0)  # f / (f - 2), of f degrees of freedom
         half = np.linalg.cholesky(N - (1 - 1 / student) * A.T @ A)  # priors are as sure as they are
-        inside = np.hstack([np.linalg.inv(half).T, doubt * np.sqrt(student)])
         scatter = self._scatter_over_walks(starts)
-        root = np.hstack([inside, scatter, length])
+        root = np.hstack([np.linalg.inv(half).T, doubt * np.sqrt(student), scatter, length])
+        density = float(np.sqrt(self.walk / max(float(np.max(np.diag(self._walked()))), TINY)))
         columns = len(N), len(pinned) + scatter.shape[1], 1
         return TriadFit(
             self.stimulus, self.terms, domain, self.usual, self.free, self.observable.copy(), hidden, design, root,
-            tuple(self.s.tolist()), columns, self._level(), self._parabolas(domain), self._distance(),
+            tuple(self.s.tolist()), columns, density, self._level(), self._parabolas(domain), self._distance(),
         )  # fmt: skip
 
     def _parabolas(self, domain: tuple[float, float]) -> tuple[Array, Array] | None:

@@ -66,6 +66,8 @@ class TriadInput(ABC):
     """True where the frame is the sensor's own: M then has 6 terms."""
     unsure: float = 0.0
     """Deviation of the size of the input, as a share of it, the same in all equations."""
+    parts: TriadInput | None = None
+    """The first quarter and the rest of each segment or placement in turn, whose input is the same, if it is known."""
 
     @property
     @abstractmethod

@@ -70,6 +70,8 @@ class KnownRates(TriadInput):
         The specific force.
     recordings : (S,) array of int, optional
         Recording of each.
+    parts : KnownRates, optional
+        First quarter and rest of each.
     """
 
     u: Array
@@ -78,6 +80,7 @@ class KnownRates(TriadInput):
     times: Array
     force: Array | None = None
     recordings: Integers | None = None
+    parts: KnownRates | None = None
 
     @property
     def T(self) -> Array:
@@ -123,6 +126,7 @@ class PlacedForces(TriadInput):
     gravity: float
     unsure: float = 0.0
     recordings: Integers | None = None
+    parts: PlacedForces | None = None
     sensor_frame = True
 
     @property
@@ -182,6 +186,8 @@ class PlacedRates(TriadInput):
         The specific force at the placements.
     forces : sequence of (N, 3) arrays
         And during the turns.
+    parts : KnownRates, optional
+        First quarter and rest of each placement, whose rate is zero.
     """
 
     y: Array
@@ -192,6 +198,7 @@ class PlacedRates(TriadInput):
     steps: Sequence[Array]
     force: Array | None = None
     forces: Sequence[Array] = ()
+    parts: KnownRates | None = None
 
     @property
     def T(self) -> Array:

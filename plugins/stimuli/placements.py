@@ -6,17 +6,18 @@ N samples, P placements.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import PlacedForces, PlacedRates, Site, Stimulus, TriadInput
+from fusion_core.contracts import KnownRates, PlacedForces, PlacedRates, Site, Stimulus, TriadInput
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.earth import STANDARD_GRAVITY
-from fusion_plugins.stimuli.tables import Files, file_of, rows_of, segments
+from fusion_plugins.stimuli.tables import Files, file_of, halved, rows_of, segments
 
 WINDOW = 0.5  # s, over which the scatter of a triad is looked at
 QUIET = 4.0  # times the scatter of the quietest tenth of the windows: more is motion
@@ -47,12 +48,8 @@ class PlacedStimulus(Stimulus):
         if length is None:
             raise ConfigError(f"stimulus: kind {self.kind} is for an accelerometer or a gyro, not for {channel}")
         gravity, unsure = length if self.gravity is None else (float(self.gravity), 0.0)
-        rows = [(chunk, slice(*ends)) for chunk, places in zip(recordings, parts, strict=True) for ends in places]
-        y = np.stack([chunk[channel][part].mean(axis=0) for chunk, part in rows])
-        T = np.array([chunk["temperature"][part].mean() for chunk, part in rows])
-        t = np.array([chunk.t[part].mean() for chunk, part in rows])
-        own = np.repeat(np.arange(len(parts)), [len(places) for places in parts])
-        return PlacedForces(y, T, t, gravity, unsure / gravity, own)
+        halves = _forces(recordings, channel, list(map(halved, parts)), gravity)
+        return replace(_forces(recordings, channel, parts, gravity), unsure=unsure / gravity, parts=halves)
 
     def _places(self, chunk: Chunk, k: int) -> list[tuple[int, int]]:
         if self.placements:
@@ -79,6 +76,17 @@ class PlacedStimulus(Stimulus):
             y = y + f @ values[12:].reshape(3, 3).T
         channels = {"gyro": u + rng.normal(0, 1e-7, u.shape), "accel": f + rng.normal(0, 1e-7, u.shape), channel: y}
         return [Chunk(dt * np.arange(1.0, len(u) + 1), {**channels, "temperature": np.full(len(u), 20.0)})]
+
+
+def _forces(
+    recordings: Sequence[Chunk], channel: str, places: Sequence[Sequence[tuple[int, int]]], gravity: float
+) -> PlacedForces:
+    """Return the mean readings of an accelerometer in ranges of rows of each recording."""
+    rows = [(chunk, slice(*ends)) for chunk, own in zip(recordings, places, strict=True) for ends in own]
+    y = np.stack([chunk[channel][part].mean(axis=0) for chunk, part in rows])
+    T = np.array([chunk["temperature"][part].mean() for chunk, part in rows])
+    t = np.array([chunk.t[part].mean() for chunk, part in rows])
+    return PlacedForces(y, T, t, gravity, recordings=np.repeat(np.arange(len(places)), list(map(len, places))))
 
 
 def rests(t: Array, *triads: Array, least: float) -> list[tuple[int, int]]:
@@ -124,7 +132,12 @@ def placed_rates(chunk: Chunk, places: Sequence[tuple[int, int]]) -> PlacedRates
     force = np.stack([f[a:b].mean(axis=0) for a, b in places])
     up = force / np.linalg.norm(force, axis=1)[:, None]
     rest = np.stack([y[a:b].mean(axis=0) for a, b in places])
+    halves = [slice(*ends) for ends in halved(places)]
+    still = np.stack([y[part].mean(axis=0) for part in halves])
+    T_still, t_still = (np.array([values[part].mean() for part in halves]) for values in (T, t))
+    pulled = np.repeat(force, 2, axis=0)
     return PlacedRates(
         rest, up, np.array([T[a:b].mean() for a, b in places]), np.array([t[a:b].mean() for a, b in places]),
         [y[part] for part in between], [step[part] for part in between], force, [f[part] for part in between],
+        KnownRates(np.zeros_like(still), still, T_still, t_still, pulled),
     )  # fmt: skip

@@ -6,6 +6,7 @@ N samples, S segments.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -17,7 +18,7 @@ from fusion_core.errors import ConfigError, DataError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.earth import RATE, STANDARD_GRAVITY, gravity
-from fusion_plugins.stimuli.tables import Directions, Files, direction, file_of, rows_of, segments
+from fusion_plugins.stimuli.tables import Directions, Files, direction, file_of, halved, rows_of, segments
 
 STEADY = 0.05  # of the largest, within a segment: a commanded rate that changes by more is left out
 
@@ -62,19 +63,9 @@ class RateTable(Stimulus):
             raise ConfigError(f"stimulus: rate_table tells of a gyro, not of {channel}; use kind positions")
         if (self.segments is None) == (self.channel is None):
             raise ConfigError("stimulus: rate_table needs segments, a table, or channel, its rate; give one of them")
-        known = all("accel" in chunk.channels for chunk in recordings)
-        vertical = 0.0 if site.latitude is None else RATE * float(np.sin(site.latitude))
-        u, y, T, t, force, own = [], [], [], [], [], []
-        for k, chunk in enumerate(recordings):
-            for (a, b), axis, rate in self._turns(chunk, k, len(recordings)):
-                u.append((rate + vertical) * axis)
-                y.append(chunk["gyro"][a:b].mean(axis=0))
-                T.append(chunk["temperature"][a:b].mean())
-                t.append(chunk.t[a:b].mean())
-                own.append(k)
-                force.append(chunk["accel"][a:b].mean(axis=0) if known else gravity(site.latitude) * axis)
-        pulled = np.stack(force) if known or site.latitude is not None else None
-        return KnownRates(np.stack(u), np.stack(y), np.array(T), np.array(t), pulled, np.array(own))
+        turns = [self._turns(chunk, k, len(recordings)) for k, chunk in enumerate(recordings)]
+        parts = [[_Turn(rows, turn.axis, turn.rate) for turn in own for rows in halved([turn.rows])] for own in turns]
+        return replace(_known_rates(recordings, turns, site), parts=_known_rates(recordings, parts, site))
 
     def _turns(self, chunk: Chunk, k: int, count: int) -> list[_Turn]:
         if self.segments is not None:
@@ -115,3 +106,20 @@ class RateTable(Stimulus):
             channels = {"gyro": y, "accel": force, self.channel: rate, "temperature": np.full(len(rate), 20.0)}
             made.append(Chunk(dt * np.arange(1.0, len(rate) + 1), channels))
         return made
+
+
+def _known_rates(recordings: Sequence[Chunk], turns: Sequence[Sequence[_Turn]], site: Site) -> KnownRates:
+    """Return the rates of the turns of each recording."""
+    known = all("accel" in chunk.channels for chunk in recordings)
+    vertical = 0.0 if site.latitude is None else RATE * float(np.sin(site.latitude))
+    u, y, T, t, force, own = [], [], [], [], [], []
+    for k, chunk in enumerate(recordings):
+        for (a, b), axis, rate in turns[k]:
+            u.append((rate + vertical) * axis)
+            y.append(chunk["gyro"][a:b].mean(axis=0))
+            T.append(chunk["temperature"][a:b].mean())
+            t.append(chunk.t[a:b].mean())
+            own.append(k)
+            force.append(chunk["accel"][a:b].mean(axis=0) if known else gravity(site.latitude) * axis)
+    pulled = np.stack(force) if known or site.latitude is not None else None
+    return KnownRates(np.stack(u), np.stack(y), np.array(T), np.array(t), pulled, np.array(own))

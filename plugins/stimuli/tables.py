@@ -108,6 +108,12 @@ def file_of(files: tuple[Path, ...], k: int) -> Path:
     return files[k]
 
 
+def halved(rows: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return first quarter and rest of each of some ranges of rows."""
+    cuts = [(a, a + max((b - a) // 4, 1), b) for a, b in rows]
+    return [part for a, cut, b in cuts for part in ((a, cut), (cut, b))]
+
+
 def rows_of(t: Array, start: float, stop: float) -> tuple[int, int]:
     """Return the first row of a segment and that after its last, s from the first row; raises DataError."""
     a, b = np.searchsorted(t, [t[0] + start, t[0] + stop])

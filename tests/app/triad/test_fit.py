@@ -279,14 +279,17 @@ def test_gravity_that_is_unsure_is_unsure_in_all_scale_factors_alike():
 
 
 def test_a_stimulus_whose_input_is_not_what_it_says_tells_nothing():
-    """Faces that are off by half: each term is worse known than a usual unit's, and each has a line."""
+    """Rates that are none of the readings': each term is worse known than a usual unit's, and the reason says why."""
     own = known_rates()
     rng = np.random.default_rng(0)
     wrong = KnownRates(own.u, rng.normal(0, 2.0, own.y.shape), own.temperatures, own.times)
     fit = fit_triad(wrong, POLYNOMIAL, 0.02)
     assert not fit.observable.any()
     assert np.all(fit.sigma(AT) > 0.4 * fit.usual)
-    assert len(verdict(fit)) >= 12
+    reason = verdict(fit)[0]
+    assert all(name in reason for name in TERMS)
+    assert "the stimulus is not that of the recording, or contradicts itself" in reason
+    assert not any("add segments" in line for line in verdict(fit))
 
 
 def test_too_few_segments_are_refused():

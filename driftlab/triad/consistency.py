@@ -1,0 +1,98 @@
+"""Consistency of a stimulus with the recording, by what no terms of a triad explain.
+
+A segment or placement has one input, so its first quarter and the rest leave the same of the fitted terms, up to white
+noise s, of the mean of a segment, and the walk q of the bias over the time dt between the middles of the two::
+
+    r_1 - r_2 ~ N(0, 16/3 s^2 + 2/3 q^2 dt)
+
+Student's t for as many equations as the fit has left over. A few segments that are not steady make s large, so FAR
+times the deviation of r_1 - r_2 by its median is enough. What the temperature does within a segment is in the terms.
+And its input is what the triad reads, up to errors that are small beside it. S segments or placements.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftlab.triad.estimate import TINY, TriadFit
+from driftlab.triad.model import AXES
+from fusion_core.chunk import Array
+from fusion_core.contracts import KnownRates, TriadInput
+
+FALSE_ALARM = 1e-4  # probability, of a stimulus that is steady
+HALF = 0.5  # of the fastest rate: no scale factor and no mounting is off by so much
+SPREAD = 3  # times a usual bias, by which that may differ over temperature
+FAR = 3  # times the scatter of most segments
+NORMAL = 0.6745  # median of the size of a normal variable of deviation one
+NAMED = 5  # segments that are listed
+RADIAN = 180 / np.pi
+
+
+def unsteady(fit: TriadFit, unit: str) -> list[str]:
+    """Return a doubt where a segment or placement is not steady, with axis, time and remedy; empty where all are."""
+    from scipy.special import stdtrit
+
+    if (parts := fit.stimulus.parts) is None:
+        return []
+    e = parts.equations(fit.terms.at(parts.T))
+    S = len(parts.T) // 2
+    left, t = e.left.reshape(S, 2, -1), e.t.reshape(S, 2, -1)[:, :, 0]
+    difference = left[:, 0] - left[:, 1]
+    used = sum(curve.q for curve, seen in zip(fit.terms.curves, fit.observable, strict=True) if seen)
+    freedom = max(len(fit.stimulus.equations(fit.terms.at(fit.stimulus.T)).left) - used, 1)
+    sigma = np.sqrt(16 / 3 * fit.noise[0] ** 2 + 2 / 3 * fit.walk**2 * (t[:, 1] - t[:, 0]))[:, None]
+    scatter = np.median(np.abs(difference), axis=0) / NORMAL  # of most of them, where few spoil the fit's noise
+    allowed = np.minimum(sigma, FAR * scatter) * stdtrit(freedom, 1 - FALSE_ALARM / (2 * difference.size))
+    off = np.any(np.abs(difference) > allowed, axis=1)
+    if not np.any(off):
+        return []
+    k, i = np.unravel_index(int(np.argmax(np.abs(difference) / allowed)), difference.shape)
+    factor, shown = (RADIAN, "deg/s") if unit == "rad/s" else (1.0, unit)
+    axis, middle = f"axis {AXES[i]}" if left.shape[2] > 1 else "the length of the input", t[k] @ [0.25, 0.75]
+    return [
+        f"{_listed(off)} not steady: in the first quarter of {k + 1} (middle at {middle:.1f} s) {axis} differs "
+        f"from the rest by {difference[k, i] * factor:.3g} {shown}, and noise, walk and temperature allow "
+        f"{allowed[k, i] * factor:.2g}; give a larger stimulus.settle, or correct start and stop of the segments"
+    ]
+
+
+def contradictions(stimulus: TriadInput, usual_bias: float) -> list[str]:
+    """Return a doubt where known rates are not those that the gyro shows, with the likely cause; empty where they are.
+
+    A scale factor, a mounting and a bias do not make so much of it.
+    """
+    if not isinstance(stimulus, KnownRates):
+        return []
+    u, y = stimulus.u, stimulus.y - np.median(stimulus.y - stimulus.u, axis=0)
+    away = np.linalg.norm(y - u, axis=1)
+    fastest = float(np.max(np.linalg.norm(u, axis=1)))
+    off = away > HALF * fastest + SPREAD * usual_bias
+    if not np.any(off):
+        return []
+    k = int(np.argmax(away))
+    said, read = (f"({', '.join(f'{v:.4g}' for v in np.round(w[k] * RADIAN, 2) + 0.0)})" for w in (u, y))
+    return [
+        f"{_listed(off)} not as the table says: {k + 1} (middle at {stimulus.times[k]:.1f} s) is {said} deg/s there, "
+        f"and the gyro reads {read} less its bias; {_cause(u[k], y[k])}"
+    ]
+
+
+def _listed(off: Array) -> str:
+    """Return those that are off (S,) as text: `3 of 36 segments (5, 6, 7) are`."""
+    numbers = [str(k + 1) for k in np.flatnonzero(off)]
+    more = ["..."] * (len(numbers) > NAMED)
+    verb = "is" if len(numbers) == 1 else "are"
+    return f"{len(numbers)} of {len(off)} segments or placements ({', '.join([*numbers[:NAMED], *more])}) {verb}"
+
+
+def _cause(u: Array, y: Array) -> str:
+    """Return the likely cause that an input u (3,) is read as y (3,), and the remedy."""
+    size, reading = (float(np.linalg.norm(w)) + TINY for w in (u, y))
+    ratio, along = reading / size, float(u @ y) / (reading * size)
+    if any(abs(ratio / by - 1) < 0.2 for by in (RADIAN, 1 / RADIAN)):
+        return "correct the unit of the rate, deg/s or rad/s"
+    if abs(ratio - 1) < HALF and along < -HALF:
+        return "correct the sign of its rate or axis"
+    if abs(ratio - 1) < HALF and along < HALF:
+        return f"correct its axis: it turns about {AXES[int(np.argmax(np.abs(y)))]}"
+    return "correct its rate, start and stop"
