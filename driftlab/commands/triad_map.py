@@ -150,7 +150,8 @@ class TriadMapResult(MapResult):
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
         self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
         self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
-            "triad": plain(words.as_json(fit, self.unit, self._doubts())), "serial": config.serial,
+            "triad": plain(words.as_json(fit, self.unit, [*self._doubts(), *words.untested_lines(fit)])),
+            "serial": config.serial,
             "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }  # fmt: skip
 
@@ -159,10 +160,11 @@ class TriadMapResult(MapResult):
         return [*self.verdict(), *self.faults.lines(doubts=False)]
 
     def verdict(self) -> list[str]:
-        """Return doubts, the frame, how far levels differ, the family, what is not observable, a sentence each."""
+        """Return doubts, frame, how far levels differ, family, what is not tested or observable, a sentence each."""
         of_family = [] if self.law is None else [words.family_line(self.fit, self.law.units)]
         levels = words.level_lines(self.fit, self.unit)
-        return [*self._doubts(), words.frame_line(self.fit), *levels, *of_family, *words.verdict(self.fit)]
+        untested = words.untested_lines(self.fit)
+        return [*self._doubts(), words.frame_line(self.fit), *levels, *of_family, *untested, *words.verdict(self.fit)]
 
     def _doubts(self) -> list[str]:
         return [f"in doubt: {text}" for text in self.faults.doubts]
@@ -173,7 +175,7 @@ class TriadMapResult(MapResult):
     def _texts(self, sheet: Sheet) -> list[str]:
         recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
         lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
-        notes, channel = self.faults.lines(doubts=False), self.map.record.channel
+        notes, channel = [*words.untested_lines(self.fit), *self.faults.lines(doubts=False)], self.map.record.channel
         return [words.page_of(self.fit, self.unit, channel, lead, self._doubts(), notes, sheet)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
@@ -181,7 +183,8 @@ class TriadMapResult(MapResult):
         measured = {name: one for name, one in self.measured.items() if not (self.fit.has_bias and name in none)}
         return Certificate(
             COMMAND, self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
-            levelled=self.fit.has_bias, remarks=[*self._doubts(), *words.verdict(self.fit)],
+            levelled=self.fit.has_bias,
+            remarks=[*self._doubts(), *words.untested_lines(self.fit), *words.verdict(self.fit)],
         )  # fmt: skip
 
 

@@ -142,7 +142,11 @@ def matrix_budget(
     if matrix.error is None:
         return UncertaintyBudget(T, terms, [], ["scale factor and misalignment: the map was imported without"])
     each = {"stimulus": matrix.sigma(T)} if parts is None else parts(T)
-    sources = [UncertaintySource(name, "B" if name == "input" else "A", u) for name, u in each.items() if np.any(u)]
+    sources = [
+        UncertaintySource(name, "B" if name in ("input", "temperatures") else "A", u)
+        for name, u in each.items()
+        if np.any(u)
+    ]
     if thermometer is not None:
         ends = np.clip([T - h, T + h], low, high)
         slope = (matrix.terms(ends[1]) - matrix.terms(ends[0])) / (ends[1] - ends[0])[:, None]

@@ -51,6 +51,7 @@ SOURCES = {
     "equations": "noise, walk of the bias",
     "choice": "choice of curve and walk",
     "input": "size of the input",
+    "temperatures": "curve between temperatures, or beyond one, not measured",
     "stimulus": "fit to the stimulus",
 }
 NAMES = {

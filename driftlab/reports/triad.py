@@ -12,7 +12,7 @@ from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.triad.estimate import SURE, TriadFit
-from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, SCALE, TERMS
+from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, PARABOLA, SCALE, TERMS
 from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
@@ -31,7 +31,8 @@ POOR = 0.1  # of a usual size: a term that is known better is well known
 def verdict(fit: TriadFit) -> list[str]:
     """Return a sentence for each term that is not observable, with the reason and the remedy."""
     lines = []
-    middle = fit.sigma(np.array([np.mean(fit.domain)]))[0]
+    low, high = fit.domain
+    known = np.min(fit.sigma(np.array([low, (low + high) / 2, high])), axis=0)
     if drowned := [name for name, own in zip(fit.names, fit.free & fit.drowned, strict=True) if own]:
         lines.append(
             f"{', '.join(drowned)}: not observable, and taken as zero, since the fit leaves {fit.noise[0]:.2g} in SI "
@@ -43,10 +44,9 @@ def verdict(fit: TriadFit) -> list[str]:
             continue
         if not fit.observable[j]:
             lines.append(f"{name}: not observable, and taken as zero, since {fit.stimulus.lacking(j)}")
-        elif middle[j] > POOR * fit.usual[j]:
-            lines.append(f"{name}: poorly observable, {middle[j] / fit.usual[j]:.0%} of a usual size, since "
+        elif known[j] > POOR * fit.usual[j]:
+            lines.append(f"{name}: poorly observable, {known[j] / fit.usual[j]:.0%} of a usual size, since "
                          f"{fit.stimulus.lacking(j)}")  # fmt: skip
-    low, high = fit.domain
     hidden = [fit.names[j] for j in np.flatnonzero(fit.unobservable_changes)]
     if high - low < NARROW:
         lines.append(
@@ -59,6 +59,17 @@ def verdict(fit: TriadFit) -> list[str]:
             "stimulus lies at too few temperatures; repeat that part near both ends"
         )
     return lines
+
+
+def untested_lines(fit: TriadFit) -> list[str]:
+    """Return the number of temperatures where no term's curve is tested between them, in a sentence."""
+    k, names = fit.temperatures, [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
+    said = f"{k} temperatures: the curve between them is not tested"
+    if k == PARABOLA and names and "family" not in names:
+        return [f"{said}; a curvature of usual size (1 %, 10 mrad) counts in sigma there, add a temperature between"]
+    if k == PARABOLA + 1 and f"order {PARABOLA}" in names:
+        return [f"{said} where it has order {PARABOLA}, which meets any {k} points; add a temperature between"]
+    return []
 
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:
@@ -248,7 +259,7 @@ def page_of(
 
 
 def as_json(fit: TriadFit, unit: BiasUnit, doubts: Sequence[str]) -> dict[str, Any]:
-    """Return the terms in SI over the grid of temperatures, and the verdict behind doubts."""
+    """Return the terms in SI over the grid of temperatures, and the verdict behind doubts and remarks."""
     T: Array = fit.grid
     change, of_change = fit.change()
     values, sigma = fit.terms.at(T), fit.sigma(T)

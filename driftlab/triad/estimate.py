@@ -12,13 +12,25 @@ from typing import Self
 
 import numpy as np
 
-from driftlab.triad.model import BIAS, GRID, NARROW, SENSITIVITIES, TERMS, TermCurve, TriadTerms
+from driftlab.triad.model import (
+    BIAS,
+    GRID,
+    NARROW,
+    PARABOLA,
+    SENSITIVITIES,
+    SPAN,
+    TERMS,
+    TermCurve,
+    TriadTerms,
+    distinct,
+)
 from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import CurveError, MatrixCurve, TriadInput, TriadMatrix
 from fusion_core.thermal.curve_error import six_digits
 
 LEFT = 1e-3  # of the largest mode: smaller ones are left out of a file
-SOURCES = ("equations", "choice", "input")  # of the error: noise and walk, what was decided, the size of the input
+# of the error: noise and walk, what was decided, the size of the input, what lies between temperatures
+SOURCES = ("equations", "choice", "input", "temperatures")
 TINY = 1e-30
 UNOBSERVABLE = 0.5  # of the usual size: a term that is not known better is not observable
 SURE = 1e-2  # of a usual bias: noise of an equation where a fit has not shown another
@@ -47,7 +59,7 @@ class TriadFit:
     noise : tuple of float
         Deviation of an equation in each group.
     columns : tuple of int
-        How many of the columns of the root are of each of SOURCES.
+        How many of the columns of the root are of each of SOURCES but the last.
     walk : float
         Density of the random walk of the bias, its unit/sqrt(s).
     level : float
@@ -104,7 +116,24 @@ class TriadFit:
         for curve in self.design:
             parts.append(curve.values(T) @ self.root[at : at + curve.q])
             at += curve.q
-        return np.asarray(np.stack(parts, axis=2).transpose(1, 0, 2))
+        return np.concatenate([np.stack(parts, axis=2).transpose(1, 0, 2), self._untested_modes(T)])
+
+    @cached_property
+    def temperatures(self) -> int:
+        """Number of temperatures of the stimulus that are apart."""
+        return distinct(self.stimulus.T)
+
+    def _untested_modes(self, T: Array) -> Array:
+        """Return the modes (q, N, q) of terms between two temperatures, or about a single one, where nothing is seen.
+
+        In the middle between two a term is off a straight line by its usual size, and moves by it over SPAN.
+        """
+        low, high = self.domain
+        x = T - (low + high) / 2
+        shape = x / SPAN if self.temperatures == 1 else np.clip(1 - (2 * x / (high - low)) ** 2, 0, 1)
+        lawless = np.array([curve.precision is None for curve in self.design])
+        sizes = self.usual * (self.observable & lawless) * (self.temperatures <= PARABOLA)
+        return np.asarray(shape[None, :, None] * np.diag(sizes)[:, None, :])
 
     def sigma(self, T: Array) -> Array:
         """Return the deviation (N, q) of the terms at T (N,)."""
@@ -120,7 +149,7 @@ class TriadFit:
 
     def parts(self, T: Array) -> dict[str, Array]:
         """Return the deviation (N, q) of the terms at T (N,) by source."""
-        parts = np.split(self.modes(T), np.cumsum(self.columns)[:-1])
+        parts = np.split(self.modes(T), np.cumsum(self.columns))
         return {name: np.sqrt(np.sum(part**2, axis=0)) for name, part in zip(SOURCES, parts, strict=True)}
 
     def change(self) -> tuple[Array, Array]:

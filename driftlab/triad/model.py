@@ -30,6 +30,7 @@ GRAVITY = 9.80665  # m/s^2, in a g
 BIAS, SCALE = range(3), (3, 7, 11)
 GROUPS = {"bias": [*BIAS], "scale": [*SCALE], "misalignment": [j for j in range(3, len(TERMS)) if j not in SCALE]}
 NARROW = 2.0  # K: temperatures that move less have one value of each term
+SPAN = 60.0  # K, over which a term of a usual unit moves by its usual size
 ORDERS = 3  # highest order that is tried, where the map's kind names none
 SMOOTHINGS = tuple(10.0**k for k in range(-3, 5))  # of a kind with a penalty, relative to its information
 GRID = 25  # temperatures at which the error is kept
@@ -86,8 +87,17 @@ class TermPrior:
         return [TermCurve("family", values, flat, mean, precision) for mean, precision in laws]
 
 
-def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCurve]:
-    """Return the forms that are tried for each term, the simplest first.
+def distinct(T: Array) -> int:
+    """Return the number of temperatures among T (m,) that are apart: by NARROW, and by a tenth of the range."""
+    count, last, apart = 0, -np.inf, max(NARROW, float(np.ptp(T)) / 10)
+    for value in np.sort(T):
+        if value - last > apart:
+            count, last = count + 1, float(value)
+    return count
+
+
+def curves_of(settings: ThermalMap, domain: tuple[float, float], temperatures: int) -> list[TermCurve]:
+    """Return the forms that are tried for each term, the simplest first, none with more freedom than temperatures.
 
     Raises
     ------
@@ -101,10 +111,10 @@ def curves_of(settings: ThermalMap, domain: tuple[float, float]) -> list[TermCur
         )
     if domain[1] - domain[0] < NARROW:
         return [polynomial(0, domain)]
-    most = getattr(settings, "order", ORDERS)
+    most = min(getattr(settings, "order", ORDERS), temperatures - 1)
     curves = [polynomial(order, domain) for order in range(most + 1)]
     basis = settings.basis(domain)
-    if np.any(basis.penalty):
+    if np.any(basis.penalty) and temperatures > ORDERS:
         unit = basis.penalty / np.trace(basis.penalty) * len(basis.penalty)
         curves += [TermCurve(settings.kind, basis.values, smoothing * unit) for smoothing in SMOOTHINGS[::-1]]
     return curves

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from turned_units import bias_of, matrix_of, sensitivity_of, sensor_frame, strained, tumble, turntable
 
-from driftlab.reports.triad import verdict
+from driftlab.reports.triad import untested_lines, verdict
 from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import TERMS
 from fusion_core.chunk import Chunk
@@ -265,6 +265,44 @@ def test_one_temperature_gives_constants_and_says_so():
     assert all(curve.name == "constant" for curve in fit.terms.curves)
     assert "no change over temperature is observable: all of it lies at 25.0 °C" in verdict(fit)[0]
     assert fit.grid.tolist() == [24.0, 26.0]
+
+
+def bent_matrix(T):
+    """The matrix of the turned units with a curvature of 2000 ppm in the middle of -20 to 60 degC, none at its ends."""
+    return matrix_of(T) + 2e-3 * (1 - ((T - 20.0) / 40.0) ** 2)
+
+
+def test_between_two_temperatures_a_curvature_of_usual_size_counts():
+    fit = fit_triad(known_rates(temperatures=[-20.0, 60.0] * 2, matrix=bent_matrix), POLYNOMIAL, 0.02)
+    error = np.array([bent_matrix(T) for T in AT]).reshape(3, 9) - fit.terms.matrix(AT).reshape(3, 9)
+    sigma = fit.sigma(AT)[:, 3:]
+    assert np.all(np.abs(error) < 5 * sigma)
+    assert np.all(np.abs(error[1, :8]) > 1e-3)  # scale z has the opposite curvature itself
+    assert np.all(sigma[[0, 2]] < 3e-5)
+    np.testing.assert_allclose(fit.parts(AT)["temperatures"][1, 3:], 0.01)
+    assert "2 temperatures: the curve between them is not tested; a curvature of usual size" in untested_lines(fit)[0]
+
+
+def test_three_temperatures_have_no_curve_that_meets_more_and_say_so():
+    """Temperatures that scatter by what a thermometer does are none of their own."""
+    whole = known_rates(temperatures=[-20.0, 20.0, 60.0])
+    T = whole.temperatures + np.random.default_rng(0).uniform(-0.3, 0.3, len(whole.temperatures))
+    fit = fit_triad(KnownRates(whole.u, whole.y, T, whole.times), POLYNOMIAL, 0.02)
+    assert {curve.name for curve in fit.terms.curves} <= {"constant", "order 1", "order 2"}
+    assert "3 temperatures: the curve between them is not tested where it has order 2" in untested_lines(fit)[0]
+    five = fit_triad(known_rates(), POLYNOMIAL, 0.02)
+    assert untested_lines(five) == []
+    assert not np.any(five.parts(AT)["temperatures"])
+
+
+def test_about_a_single_temperature_a_change_of_usual_size_counts():
+    """Scale x moves by 6000 ppm over 40 K: 150 ppm/K."""
+    fit = fit_triad(known_rates(temperatures=[20.0] * 3), POLYNOMIAL, 0.02)
+    T = np.array([19.0, 20.0, 21.0])
+    error = np.array([matrix_of(t) for t in T]).reshape(3, 9) - fit.terms.matrix(T).reshape(3, 9)
+    assert np.all(np.abs(error) < 4.5 * fit.sigma(T)[:, 3:])
+    assert abs(error[0, 0]) > 1e-4
+    assert np.all(fit.sigma(T)[1, 3:] < 3e-5)
 
 
 def test_gravity_that_is_unsure_is_unsure_in_all_scale_factors_alike():
