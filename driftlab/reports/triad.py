@@ -11,6 +11,7 @@ from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, band
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
+from driftlab.triad.consistency import excess
 from driftlab.triad.estimate import SURE, TriadFit
 from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, PARABOLA, SCALE, TERMS
 from driftlab.units import BiasUnit, number
@@ -62,14 +63,17 @@ def verdict(fit: TriadFit) -> list[str]:
 
 
 def untested_lines(fit: TriadFit) -> list[str]:
-    """Return the number of temperatures where no term's curve is tested between them, in a sentence."""
+    """Return a sentence where segments contradict one another, and where no curve is tested between temperatures."""
+    lines = excess(fit)
     k, names = fit.temperatures, [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
     said = f"{k} temperatures: the curve between them is not tested"
     if k == PARABOLA and names and "family" not in names:
-        return [f"{said}; a curvature of usual size (1 %, 10 mrad) counts in sigma there, add a temperature between"]
+        lines.append(
+            f"{said}; a curvature of usual size (1 %, 10 mrad) counts in sigma there, add a temperature between"
+        )
     if k == PARABOLA + 1 and f"order {PARABOLA}" in names:
-        return [f"{said} where it has order {PARABOLA}, which meets any {k} points; add a temperature between"]
-    return []
+        lines.append(f"{said} where it has order {PARABOLA}, which meets any {k} points; add a temperature between")
+    return lines
 
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:

@@ -23,6 +23,7 @@ FALSE_ALARM = 1e-4  # probability, of a stimulus that is steady
 HALF = 0.5  # of the fastest rate: no scale factor and no mounting is off by so much
 SPREAD = 3  # times a usual bias, by which that may differ over temperature
 FAR = 3  # times the scatter of most segments
+EXCESS = 10  # times the noise within a segment
 NORMAL = 0.6745  # median of the size of a normal variable of deviation one
 NAMED = 5  # segments that are listed
 RADIAN = 180 / np.pi
@@ -32,12 +33,9 @@ def unsteady(fit: TriadFit, unit: str) -> list[str]:
     """Return a doubt where a segment or placement is not steady, with axis, time and remedy; empty where all are."""
     from scipy.special import stdtrit
 
-    if (parts := fit.stimulus.parts) is None:
+    if fit.stimulus.parts is None:
         return []
-    e = parts.equations(fit.terms.at(parts.T))
-    S = len(parts.T) // 2
-    left, t = e.left.reshape(S, 2, -1), e.t.reshape(S, 2, -1)[:, :, 0]
-    difference = left[:, 0] - left[:, 1]
+    difference, t = _differences(fit, fit.stimulus.parts)
     used = sum(curve.q for curve, seen in zip(fit.terms.curves, fit.observable, strict=True) if seen)
     freedom = max(len(fit.stimulus.equations(fit.terms.at(fit.stimulus.T)).left) - used, 1)
     sigma = np.sqrt(16 / 3 * fit.noise[0] ** 2 + 2 / 3 * fit.walk**2 * (t[:, 1] - t[:, 0]))[:, None]
@@ -48,12 +46,33 @@ def unsteady(fit: TriadFit, unit: str) -> list[str]:
         return []
     k, i = np.unravel_index(int(np.argmax(np.abs(difference) / allowed)), difference.shape)
     factor, shown = (RADIAN, "deg/s") if unit == "rad/s" else (1.0, unit)
-    axis, middle = f"axis {AXES[i]}" if left.shape[2] > 1 else "the length of the input", t[k] @ [0.25, 0.75]
+    axis, middle = f"axis {AXES[i]}" if difference.shape[1] > 1 else "the length of the input", t[k] @ [0.25, 0.75]
     return [
         f"{_listed(off)} not steady: in the first quarter of {k + 1} (middle at {middle:.1f} s) {axis} differs "
         f"from the rest by {difference[k, i] * factor:.3g} {shown}, and noise, walk and temperature allow "
         f"{allowed[k, i] * factor:.2g}; give a larger stimulus.settle, or correct start and stop of the segments"
     ]
+
+
+def excess(fit: TriadFit) -> list[str]:
+    """Return a sentence where segments differ from one another by far more than each does within itself."""
+    if fit.stimulus.parts is None:
+        return []
+    within = float(np.median(np.abs(_differences(fit, fit.stimulus.parts)[0]))) / NORMAL / np.sqrt(16 / 3)
+    if fit.noise[0] <= EXCESS * within:
+        return []
+    return [
+        f"the terms leave {fit.noise[0] / max(within, TINY):.0f} times as much of the segments or placements as noise "
+        "within them makes: they contradict one another, and sigma has it in it; see that the unit has the temperature "
+        "of its thermometer when each begins (wait for longer), and that no term jumps between"
+    ]
+
+
+def _differences(fit: TriadFit, parts: TriadInput) -> tuple[Array, Array]:
+    """Return the residuals of each first quarter less those of the rest (S, d), and the middles of both (S, 2)."""
+    e, S = parts.equations(fit.terms.at(parts.T)), len(parts.T) // 2
+    left, t = e.left.reshape(S, 2, -1), e.t.reshape(S, 2, -1)[:, :, 0]
+    return left[:, 0] - left[:, 1], t
 
 
 def contradictions(stimulus: TriadInput, usual_bias: float) -> list[str]:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from turned_units import tumble, turntable
+from turned_units import matrix_of, tumble, turntable
 
 import driftlab
 from driftlab.commands.triad_map import show_triad_map
@@ -103,6 +103,17 @@ def test_a_row_that_the_recording_contradicts_is_named_with_its_cause(tmp_path, 
     show_triad_map(made, {})
     assert "to use it" not in (said := capsys.readouterr().out)
     assert "no term of scale factor and misalignment is known: the map is of no use" in said
+
+
+@pytest.mark.parametrize("jump", [0.0, 3e-3])
+def test_terms_that_jump_between_temperatures_leave_more_than_noise_and_the_verdict_says_so(tmp_path, jump):
+    """A step of M at 30 degC, which no polynomial of order 3 meets at seven temperatures."""
+    temperatures = [-20.0, -5.0, 10.0, 25.0, 35.0, 50.0, 65.0]
+    t, y, T, table = turntable(0, temperatures, hold=8.0, matrix=lambda T: matrix_of(T) + jump * (T > 30.0))
+    made = fitted(tmp_path, t, y, T, rows_of(table))
+    said = [line for line in made.verdict() if "as noise within them makes: they contradict one another" in line]
+    assert len(said) == (jump > 0)
+    assert made.faults.doubts == []
 
 
 @pytest.mark.parametrize("late", [0.0, 0.5])
