@@ -140,7 +140,7 @@ class TriadFit:
         return np.asarray(np.sqrt(np.sum(self.modes(np.atleast_1d(T)) ** 2, axis=0)))
 
     @cached_property
-    def drowned(self) -> NDArray[np.bool_]:
+    def drowned(self) -> Flags:
         """True for terms (q,) that what is left of the equations hides, where it would not with a usual noise."""
         e = self.stimulus.equations(self.terms.at(self.stimulus.T))
         J = np.pad(e.J, ((0, 0), (0, len(self.free) - e.J.shape[1])))
