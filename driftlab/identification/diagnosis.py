@@ -209,6 +209,7 @@ def _questions(findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> l
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales
 SLOW = 120.0  # s: a residual over means of that length spoils a coast
 MATTERS = 0.5  # of the error on left-out parts
+BEYOND = 2.0  # of the declared mean square: from there on most of what is left is neither declared noise nor walk
 MAX_NATS = 700.0  # exp of minus that is nearly the least number of a computer
 
 
@@ -249,7 +250,33 @@ def structures(search: Search, error: Array) -> list[Structure]:
         text = f"what is left jumps within {duration(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
-    return [s for s in worst if s.log_likelihood_gain > s.threshold]
+    return [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
+
+
+def beyond_declared(evidence: Evidence, parts: Sequence[Array]) -> list[Structure]:
+    """Return the axes and slow time scales at which residuals (n, d), SI, wander beyond declared noise and walk.
+
+    The farthest first. The noise of the search is the residual's own, to which whatever wanders is a walk.
+    """
+    if evidence.noise is None or evidence.walk is None:
+        return []
+    h, axes = evidence.interval, evidence.axes
+    noises = [LocalLevel.of(w**2 / h, q**2 * h) for w, q in zip(evidence.noise, evidence.walk, strict=True)]
+    white = []
+    for part, record in zip(parts, evidence.records, strict=True):
+        steps = np.diff(record.t, prepend=record.t[0] - h) / h
+        white.append(np.stack([innovations(e, noise, steps) for e, noise in zip(part.T, noises, strict=True)], axis=1))
+    scales = [(W * h, z) for W, z in _sums(white) if W * h >= SLOW]
+    limit = -float(np.log(SIGNIFICANT / max(len(scales) * len(axes), 1)))
+    found = []
+    for length, z in scales:
+        for axis, square in zip(axes, np.mean(z**2, axis=0), strict=True):
+            nats = nats_of(len(z) * float(square) / BEYOND, len(z))
+            times = f"{float(np.sqrt(square)):.2g} times as far in {duration(length)}"
+            text = f"on {axis} what is left wanders {times} as declared noise and walk"
+            if nats > limit:
+                found.append((float(square), Structure("time", length, text, min(nats, MAX_NATS), limit)))
+    return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
 
 
 def _white(search: Search, parts: list[Array]) -> list[Array]:
@@ -260,12 +287,13 @@ def _white(search: Search, parts: list[Array]) -> list[Array]:
     ]
 
 
-def innovations(e: Array, noise: LocalLevel) -> Array:
+def innovations(e: Array, noise: LocalLevel, steps: Array | float = 1.0) -> Array:
     """Return the normalised innovations (n - 1,) of a residual e (n,) whose level at the start is not known.
 
     An average of the first few rows is off by their noise, and a sum over those that follow would show it as a jump.
+    `steps` (n,) is the time from the row before to each, in rows.
     """
-    walk = np.full(len(e), noise.walk)
+    walk = np.full(len(e), noise.walk) * steps
     walk[0] = np.inf
     return np.asarray(whitened(e[:, None], np.full(len(e), noise.white), walk)[0][1:, 0])
 

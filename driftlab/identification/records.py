@@ -30,6 +30,7 @@ from fusion_core.contracts import Effect
 from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.thermal.sweeps import one_way, ways
+from fusion_core.units import along_axes
 
 FINE = 10.0  # s: longest mean that effects are computed on
 ROWS = 3000  # of a recording, at most
@@ -80,6 +81,7 @@ class Evidence:
     interval: float  # of a row, s
     align: float  # how long a unit is aligned, s
     noise: Array | None = None  # (d,) declared density of white noise, SI/sqrt(Hz); None: as the model leaves it
+    walk: Array | None = None  # (d,) declared density of the random walk, SI/sqrt(s); None: as the model leaves it
 
     def __len__(self) -> int:
         return sum(len(record) for record in self.records)
@@ -168,8 +170,10 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous, whole.sensors)
         starts = row_starts(whole.t, interval)
         records.append(Record(name, name in calibration, name in train, _without(whole, "tau"), starts, ends))
-    align, noise = float(settings.align), np.asarray(tracked.noise, dtype=np.float64)
-    return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, align, noise)
+    align, unit, density = float(settings.align), unit_of(tracked), getattr(tracked.bias, "walk", None)
+    noise = np.asarray(tracked.noise, dtype=np.float64)
+    walk = None if density is None else along_axes(density, len(tracked.axes))
+    return Evidence(tuple(records), tracked.channel, tracked.axes, unit, interval, align, noise, walk)
 
 
 def row_starts(t: Array, interval: float) -> Integers:
