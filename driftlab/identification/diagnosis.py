@@ -23,7 +23,7 @@ from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
 from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations
 from driftlab.identification.least_squares import Model, Term
-from driftlab.identification.records import Evidence, Progress, Record, row_starts
+from driftlab.identification.records import Evidence, Progress, Record, move_together, row_starts
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, contains, tried
 from driftlab.noise.local_level import LocalLevel, one_step, whitened
@@ -105,6 +105,7 @@ def _findings(search: Search) -> tuple[Finding, ...]:
         trial, rivals = named[0]
         added.remove(named[0])
         trial, rivals = _beside_all(search, place, trial, rivals)
+        rivals = (*rivals, *_copies(search, place, trial))
         others = [rival for rival in rivals if not _more_than(search, rival, trial)]
         alike = [rival for rival in others if _same_physics(search, rival, trial)]
         others = [rival for rival in others if rival not in alike]
@@ -122,11 +123,40 @@ def _beside_all(search: Search, place: int, trial: Trial, rivals: tuple[Trial, .
     names = {one.name for one in (trial, *rivals)}
     view = replace(search, model=others)
     trials = tried(view, others, {key: terms for key, terms in candidates_of(view).items() if key[0] in names})
+    return _as_good(trials, trial) or (trial, rivals)
+
+
+def _as_good(trials: Sequence[Trial], trial: Trial) -> tuple[Trial, tuple[Trial, ...]] | None:
+    """Return the best of trials that has a trial's name, and those of others that are as good; None where none has."""
     same = [one for one in trials if one.name == trial.name]
     if not same:
-        return trial, rivals
+        return None
     best = min(same, key=lambda one: one.evidence.ratio)
     return best, tuple(one for one in trials if one not in same and one.passes and as_good(one, best))
+
+
+def _copies(search: Search, place: int, trial: Trial) -> tuple[Trial, ...]:
+    """Return the same effect of channels that move with its own, where it is as good at the same hyper-parameters.
+
+    Each on a grid of its own, the two differ by what lies between the points.
+    """
+    others, effect = tuple(term for k, term in enumerate(search.model) if k != place), search.model[place].effect
+    names = {one.name for one in search.trials if _is_copy(search, effect, one.term.effect)}
+    if not names:
+        return ()
+    view, families = replace(search, model=others), {}
+    for key, (term, *_) in candidates_of(view).items():
+        if key[0] in {trial.name, *names}:
+            families[key] = [replace(term, effect=term.effect.model_copy(update=effect.hyper_parameters))]
+    return (_as_good(tried(view, others, families), trial) or (trial, ()))[1]
+
+
+def _is_copy(search: Search, effect: Effect, other: Effect) -> bool:
+    """Return True if an effect is another one of channels that move with that one's."""
+    own, theirs = set(effect.requires) - set(other.requires), set(other.requires) - set(effect.requires)
+    if type(effect) is not type(other) or not own or len(own) != len(theirs):
+        return False
+    return all(any(move_together(search.evidence.chunks, a, b) for a in own) for b in theirs)
 
 
 def _more_than(search: Search, rival: Trial, trial: Trial) -> bool:

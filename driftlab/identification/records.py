@@ -262,7 +262,7 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
         )
     names = set.intersection(*(set(chunk.channels) for chunk in chunks)) - DERIVED - {"temperature", evidence.channel}
     for name in sorted(name for name in names if all(chunk[name].ndim == 1 for chunk in chunks)):
-        r = _correlation(np.concatenate(T), np.concatenate([chunk[name] for chunk in chunks]))
+        r = _correlation(chunks, "temperature", name)
         if abs(r) > TOGETHER:
             yield (
                 f"in your recordings {name} moves with temperature alone (correlation {r:.2f}): their "
@@ -270,7 +270,12 @@ def missing_excitation(evidence: Evidence) -> Iterator[str]:
             )
 
 
-def _correlation(one: Array, other: Array) -> float:
-    one, other = one - np.mean(one), other - np.mean(other)
+def move_together(chunks: Sequence[Chunk], one: str, other: str) -> bool:
+    """Return True if two channels are hardly to be distinguished, being nearly in proportion over all recordings."""
+    return all(chunks[0][name].ndim == 1 for name in (one, other)) and abs(_correlation(chunks, one, other)) > TOGETHER
+
+
+def _correlation(chunks: Sequence[Chunk], *names: str) -> float:
+    one, other = (values - np.mean(values) for values in (np.concatenate([c[name] for c in chunks]) for name in names))
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(one @ other) / size if size > 0 else 0.0

@@ -37,9 +37,12 @@ def difference(trial: Trial, other: Trial) -> float:
 
 
 def uncertainty(trial: Trial, other: Trial) -> float:
-    """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice."""
+    """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice.
+
+    What is left moves all axes at once where they have one cause, so that a block is one draw, and not one an axis.
+    """
     a, b = (t.blocks / t.blocks.sum(axis=1, keepdims=True) for t in (trial, other))
-    return float(np.sqrt(2 * np.sum((a - b) ** 2)) / len(a))
+    return float(np.sqrt(2 * np.sum(np.mean(a - b, axis=0) ** 2)))
 
 
 def as_good(trial: Trial, chosen: Trial) -> bool:

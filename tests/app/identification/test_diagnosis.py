@@ -1,12 +1,21 @@
 """The diagnosis of residuals: noise, or something that is left."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
-from rows_at_rest import STEP, WHITE, evidence, search_of
+import pytest
+from rows_at_rest import STEP, WHITE, evidence, search_of, signature
+from scipy.signal import lfilter
+from third_parties import registry_of
 
-from driftlab.identification.diagnosis import innovations, structures
+from driftlab.identification import candidates
+from driftlab.identification.diagnosis import innovations, judge, structures
+from driftlab.identification.search import search
+from driftlab.identification.trials import difference, uncertainty
 from driftlab.noise.local_level import LocalLevel, fit_local_level
+from fusion_plugins.effects.relaxation import Relaxation
+from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 
 def test_what_is_left_is_noise_or_is_not():
@@ -65,3 +74,36 @@ def test_a_gap_is_as_many_steps_of_a_walk_as_it_lasts():
         level = np.cumsum(rng.normal(0, np.sqrt(noise.walk * steps)))
         seen.append(innovations(level + rng.normal(0, np.sqrt(noise.white), 60), noise, steps))
     assert np.all(np.abs(np.var(seen, axis=0) - 1) < 5 * np.sqrt(2 / 2000))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_copy_of_the_temperature_is_a_rival_of_it_whatever_is_left(monkeypatch, seed):
+    """A relaxation between the points of any grid under a slow cause without a channel, which moves all axes."""
+    monkeypatch.setattr(candidates, "registry", lambda: registry_of(kinds=("relaxation",)))
+    rng, counts = np.random.default_rng(seed), (1500, 1200, 1200)
+    hidden = [lfilter([1], [1, -np.exp(-STEP / 1500)], rng.normal(0, 4e-7, n))[:, None] for n in counts]
+    late, sizes = Relaxation(tau="640 s"), np.array([1.0, 0.8, -1.2])
+    rows = evidence(lambda k, chunk: (signature(late, chunk) @ (2e-6 * sizes)) + hidden[k] * sizes, counts, seed)
+    T = [chunk["temperature"] for chunk in rows.chunks]
+    copies = [5 + 0.004 * (one + rng.normal(0, 0.01, len(one))) for one in T]
+    chunks = [chunk.having(voltage=copy) for chunk, copy in zip(rows.chunks, copies, strict=True)]
+    records = [replace(record, chunk=chunk) for record, chunk in zip(rows.records, chunks, strict=True)]
+    rows, T = replace(rows, records=tuple(records)), np.concatenate(T)
+    found = search(rows, Polynomial(order=3).basis((float(T.min()), float(T.max()))), lambda text: None)
+    verdict = judge(found, np.full(3, 1e-5), lambda text: None)
+    finding = verdict.findings[0]
+    assert {finding.trial.name, *finding.names} == {"relaxation", "relaxation of voltage"}
+    assert verdict.word == "ambiguous"
+
+
+@pytest.mark.parametrize("common", [0.0, 1.0])
+def test_a_difference_scatters_as_said_where_one_cause_moves_all_axes(common):
+    """Left-out errors of two candidates, drawn anew many times; each row counts twice in them."""
+    rng, seen = np.random.default_rng(2), []
+    for _ in range(300):
+        own, of_all = rng.normal(size=(3, 54)), rng.normal(size=54)
+        ratio = 1 + 0.1 * (of_all * common + own * (1 - common))
+        one, other = (SimpleNamespace(blocks=blocks) for blocks in (np.ones((3, 54)), ratio))
+        seen.append((difference(one, other), uncertainty(one, other)))
+    differences, said = np.array(seen).T
+    assert np.isclose(np.sqrt(2) * np.std(differences), np.mean(said), rtol=0.15)
