@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, gammaln, stdtrit
 
+from driftlab.identification.columns import NormalEquations
 from driftlab.identification.least_squares import LeastSquares, Model, Term
 from driftlab.noise.local_level import LocalLevel, one_step
 from fusion_core.chunk import Array
@@ -106,9 +107,12 @@ def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) 
 
 
 def whitened(
-    squares: LeastSquares, base: Model, term: Term, axis: int, noise: LocalLevel
+    squares: LeastSquares, base: Model, term: Term, axis: int, noise: LocalLevel, *, generalised: bool = False
 ) -> tuple[Array, Array] | None:
-    """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
+    """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white.
+
+    `generalised` takes the base out of what is white already, so that it is as uncertain as noise and walk make it.
+    """
     columns, everything = squares.columns, squares.columns.everything
     fit, W = squares.fit(base, axis, everything), columns.W
     B, k = np.concatenate([fit.cols, squares.starts(term, everything)]), len(fit.cols)
@@ -123,12 +127,17 @@ def whitened(
     both = np.column_stack([W[:, columns.y[axis]], Z])
     left = both - W[:, B] @ equations.solve(W[:, B].T @ both)
     white = np.concatenate(one_step(columns.evidence.split(left), noise.gain))
+    if generalised:
+        X = np.concatenate(one_step(columns.evidence.split(W[:, B]), noise.gain))
+        white = white - X @ NormalEquations(X.T @ X, np.zeros(len(B)), 0.0).solve(X.T @ white)
     return white[:, 0], white[:, 1:]
 
 
-def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[LocalLevel]) -> tuple[float, float]:
+def fast_evidence(
+    squares: LeastSquares, base: Model, term: Term, noises: list[LocalLevel], *, generalised: bool = False
+) -> tuple[float, float]:
     """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
-    pairs = (whitened(squares, base, term, axis, noise) for axis, noise in enumerate(noises))
+    pairs = (whitened(squares, base, term, axis, noise, generalised=generalised) for axis, noise in enumerate(noises))
     return matched_on_axes(filter(None, pairs), len(term.effect.continuous) + int(term.free))
 
 

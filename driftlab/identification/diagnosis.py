@@ -25,7 +25,7 @@ from driftlab.identification.columns import EffectRegressors, Indices, NormalEqu
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.records import Evidence, Progress, Record, move_together, row_starts
 from driftlab.identification.state import Search, Trial, name_of
-from driftlab.identification.trials import AS_GOOD, as_good, contains, tried
+from driftlab.identification.trials import AS_GOOD, as_good, contains, tried, with_uncertain_map
 from driftlab.noise.local_level import LocalLevel, one_step, whitened
 from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
@@ -82,7 +82,7 @@ def judge(search: Search, error: Array, progress: Progress) -> Diagnosis:
     beside = replace(search, model=(*search.model, *(trial.term for trial in unnamed)))
     beside.noises = beside.noises_of(beside.model)
     left = (*map(_structure, unnamed), *structures(beside, error))
-    promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
+    promising = () if findings else tuple(filter(_promising, _surely(search, rejected)))[:1]
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
@@ -188,6 +188,12 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     for trial in sorted(trials, key=lambda t: (not t.passes, t.evidence.ratio)):
         best.setdefault(trial.name, trial)
     return tuple(best.values())
+
+
+def _surely(search: Search, trials: Sequence[Trial]) -> Iterator[Trial]:
+    """Yield trials, those that are likely by the evidence that they have where the map is uncertain."""
+    for trial in trials:
+        yield with_uncertain_map(search, trial) if _likely(trial) else trial
 
 
 def _promising(trial: Trial) -> bool:

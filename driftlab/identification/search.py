@@ -29,7 +29,16 @@ from driftlab.identification.cross_validation import MIN_ROWS, condition, parts
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
-from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
+from driftlab.identification.trials import (
+    AS_GOOD,
+    as_good,
+    blocks_of,
+    contains,
+    difference,
+    tried,
+    uncertainty,
+    with_uncertain_map,
+)
 from fusion_core.chunk import Flags
 from fusion_core.contracts import Basis, Effect
 from fusion_core.errors import FusionError
@@ -79,7 +88,8 @@ def _add(state: Search) -> bool:
         if not passing:
             return False
         chosen = _best(passing)
-        reason = does_not_carry_over(state, chosen)
+        surely = with_uncertain_map(state, chosen)
+        reason = does_not_carry_over(state, chosen) if surely.passes else surely.reason
         if not reason:
             break
         trials = [replace(t, passes=False, reason=reason) if t is chosen else t for t in trials]

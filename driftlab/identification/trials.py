@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from os import cpu_count
 
 import numpy as np
@@ -145,6 +146,20 @@ def _trial(
     named = {name for term in search.model for name in term.effect.requires}
     passes, reason = accept(effect, evidence, named)
     return Trial(model, evidence, blocks_of(errors, search.axes), _likelihood(search, model, noises), passes, reason)
+
+
+def with_uncertain_map(search: Search, trial: Trial) -> Trial:
+    """Return a trial judged by what it shows at fast times where the base is as uncertain as noise and walk make it.
+
+    What the walk of the recordings puts into the map of least squares is the same at each return of the temperature,
+    and a slow column finds it, as sure as it is no effect.
+    """
+    noises, old = search.noises_of(trial.model), trial.evidence
+    chance, gain = fast_evidence(search.squares, trial.base, trial.term, noises, generalised=True)
+    evidence = replace(old, chance=min(chance, old.chance), gain=min(gain - old.price, old.gain))
+    named = {name for term in search.model for name in term.effect.requires}
+    passes, reason = accept(trial.term.effect, evidence, named)
+    return replace(trial, evidence=evidence, passes=passes and trial.passes, reason=trial.reason or reason)
 
 
 def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:

@@ -10,10 +10,14 @@ from scipy.signal import lfilter
 from third_parties import registry_of
 
 from driftlab.identification import candidates
+from driftlab.identification.acceptance import CandidateEvidence, fast_evidence
 from driftlab.identification.diagnosis import innovations, judge, structures
+from driftlab.identification.least_squares import Term
 from driftlab.identification.search import search
-from driftlab.identification.trials import difference, uncertainty
+from driftlab.identification.state import Trial
+from driftlab.identification.trials import difference, uncertainty, with_uncertain_map
 from driftlab.noise.local_level import LocalLevel, fit_local_level
+from fusion_plugins.effects.drift import Drift
 from fusion_plugins.effects.relaxation import Relaxation
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
@@ -107,3 +111,36 @@ def test_a_difference_scatters_as_said_where_one_cause_moves_all_axes(common):
         seen.append((difference(one, other), uncertainty(one, other)))
     differences, said = np.array(seen).T
     assert np.isclose(np.sqrt(2) * np.std(differences), np.mean(said), rtol=0.15)
+
+
+def walking(seed):
+    """Return recordings of a curve under white noise and a walk."""
+    rng, counts = np.random.default_rng(seed), (1200, 900, 900)
+    walks = [rng.normal(0, 4e-7, (count, 3)).cumsum(axis=0) for count in counts]
+    return evidence(lambda k, chunk: walks[k], counts, seed)
+
+
+def test_a_walk_in_the_map_is_no_evidence_for_a_slow_effect():
+    """The chance of what is not there is uniform, so minus its log has mean 1, and variance 1."""
+    drift, nats = Term(Drift()), []
+    for seed in range(25):
+        found = search_of(walking(seed), ())
+        nats.append(fast_evidence(found.squares, (), drift, found.noises_of((drift,)), generalised=True)[0])
+    assert abs(np.mean(nats) - 1) < 3 / np.sqrt(len(nats))
+
+
+@pytest.mark.parametrize("size", [0.0, 2e-6])
+def test_an_effect_passes_where_it_is_seen_beside_an_uncertain_map(size):
+    """One that is there keeps what it showed; what showed as much by the map of least squares alone does not pass."""
+    late = Term(Relaxation(tau="20 min"))
+    shown = CandidateEvidence(0.86, -3.0, 9, 0.9, beside=False, left_out=20.0, chance=60.0, gain=40.0, price=5.0)
+    for seed in range(5):
+        rows = walking(seed)
+        records = []
+        for record in rows.records:
+            rate = record.chunk["gyro"] + signature(late.effect, record.chunk) @ np.full(3, size)
+            records.append(replace(record, chunk=record.chunk.having(gyro=rate)))
+        found = search_of(replace(rows, records=tuple(records)), ())
+        trial = with_uncertain_map(found, Trial((late,), shown, np.ones((3, 9)), 0.0, passes=True, reason=""))
+        assert trial.passes == (size > 0)
+        assert (trial.reason == "") == trial.passes
