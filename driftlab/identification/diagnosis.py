@@ -23,15 +23,16 @@ from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
 from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations
 from driftlab.identification.least_squares import Model, Term
-from driftlab.identification.records import Evidence, Progress, Record, move_together, row_starts
+from driftlab.identification.records import Evidence, Progress, Record, row_starts
 from driftlab.identification.state import Search, Trial, name_of
-from driftlab.identification.trials import AS_GOOD, as_good, contains, tried, with_uncertain_map
+from driftlab.identification.trials import AS_GOOD, as_good, contains, is_copy, tried, with_uncertain_map
 from driftlab.noise.local_level import LocalLevel, one_step, whitened
 from driftlab.units import duration
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import FusionError
+from fusion_core.thermal.sweeps import one_way
 
 Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous", "refuted"]
 
@@ -141,7 +142,7 @@ def _copies(search: Search, place: int, trial: Trial) -> tuple[Trial, ...]:
     Each on a grid of its own, the two differ by what lies between the points.
     """
     others, effect = tuple(term for k, term in enumerate(search.model) if k != place), search.model[place].effect
-    names = {one.name for one in search.trials if _is_copy(search, effect, one.term.effect)}
+    names = {one.name for one in search.trials if is_copy(search, effect, one.term.effect)}
     if not names:
         return ()
     view, families = replace(search, model=others), {}
@@ -149,14 +150,6 @@ def _copies(search: Search, place: int, trial: Trial) -> tuple[Trial, ...]:
         if key[0] in {trial.name, *names}:
             families[key] = [replace(term, effect=term.effect.model_copy(update=effect.hyper_parameters))]
     return (_as_good(tried(view, others, families), trial) or (trial, ()))[1]
-
-
-def _is_copy(search: Search, effect: Effect, other: Effect) -> bool:
-    """Return True if an effect is another one of channels that move with that one's."""
-    own, theirs = set(effect.requires) - set(other.requires), set(other.requires) - set(effect.requires)
-    if type(effect) is not type(other) or not own or len(own) != len(theirs):
-        return False
-    return all(any(move_together(search.evidence.chunks, a, b) for a in own) for b in theirs)
 
 
 def _more_than(search: Search, rival: Trial, trial: Trial) -> bool:
@@ -191,9 +184,10 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _surely(search: Search, trials: Sequence[Trial]) -> Iterator[Trial]:
-    """Yield trials, those that are likely by the evidence that they have where the map is uncertain."""
-    for trial in trials:
-        yield with_uncertain_map(search, trial) if _likely(trial) else trial
+    """Yield trials, likely ones as they are beside an uncertain map, where temperatures go both ways to show it."""
+    T = [chunk["temperature"] for chunk in search.evidence.chunks if "temperature" in chunk.channels]
+    apart = not (T and one_way(T))
+    yield from (with_uncertain_map(search, trial) if apart and _likely(trial) else trial for trial in trials)
 
 
 def _promising(trial: Trial) -> bool:

@@ -23,9 +23,11 @@ from driftlab.identification.acceptance import CandidateEvidence, accept, fast_e
 from driftlab.identification.candidates import Family, family_of
 from driftlab.identification.columns import EffectRegressors, left_with_starts
 from driftlab.identification.least_squares import LeastSquares, Model, Term
+from driftlab.identification.records import move_together
 from driftlab.identification.state import Errors, Search, Trial
 from driftlab.noise.local_level import LocalLevel, effective
 from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
 
 WORTH = 0.97  # of the sum of squares in the fit itself: a candidate that gains less is not cross-validated
 AS_GOOD = 3.0  # nats: less likely by less than 20 times
@@ -58,6 +60,14 @@ def contains(columns: EffectRegressors, wide: Term, term: Term) -> bool:
         return False
     pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
     return all(columns.within(inner, outer) for inner, outer in pairs)
+
+
+def is_copy(search: Search, effect: Effect, other: Effect) -> bool:
+    """Return True if an effect is another one of channels that move with that one's."""
+    own, theirs = set(effect.requires) - set(other.requires), set(other.requires) - set(effect.requires)
+    if type(effect) is not type(other) or not own or len(own) != len(theirs):
+        return False
+    return all(any(move_together(search.evidence.chunks, a, b) for a in own) for b in theirs)
 
 
 def tried(search: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
