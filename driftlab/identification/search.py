@@ -29,16 +29,7 @@ from driftlab.identification.cross_validation import MIN_ROWS, condition, parts
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
-from driftlab.identification.trials import (
-    AS_GOOD,
-    as_good,
-    blocks_of,
-    contains,
-    difference,
-    tried,
-    uncertainty,
-    with_uncertain_map,
-)
+from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
 from fusion_core.chunk import Flags
 from fusion_core.contracts import Basis, Effect
 from fusion_core.errors import FusionError
@@ -88,8 +79,7 @@ def _add(state: Search) -> bool:
         if not passing:
             return False
         chosen = _best(passing)
-        surely = with_uncertain_map(state, chosen)
-        reason = does_not_carry_over(state, chosen) if surely.passes else surely.reason
+        reason = does_not_carry_over(state, chosen)
         if not reason:
             break
         trials = [replace(t, passes=False, reason=reason) if t is chosen else t for t in trials]
