@@ -261,7 +261,7 @@ BUDGET = {
     "driftlab/evaluation": 1515,
     "driftlab/family": 3286,
     "driftlab/filtering": 1254,
-    "driftlab/identification": 2191,
+    "driftlab/identification": 2257,
     "driftlab/live": 844,
     "driftlab/maps": 1806,
     "driftlab/noise": 1270,
