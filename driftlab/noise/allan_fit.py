@@ -33,6 +33,7 @@ GOOD = 0.11  # a departure of the variance up to which a fit begins at the short
 REACH = 10  # times `a` of `Design.smoothed`: a filter of first or second order has then all but come to rest
 SHAPED = 100  # samples over which what is no filter, as vibration, may bend the curve
 SMOOTH = "neighbouring samples are alike, as those of a low-pass filter or of interpolation"
+AVERAGES = 100  # over which a correlation is looked at
 LEFT = 15  # averaging times that are left to a fit at least
 
 
@@ -127,11 +128,18 @@ def _begin(model: Design, v: Array, dt: float) -> int:
 
 
 def _smooth(curve: AllanCurve, allan: Design, hadamard: Design) -> bool:
-    """Return True if neighbouring samples are alike, and the five terms do not say so: a filter, or interpolation."""
+    """Return True if neighbouring samples are alike, and the five terms do not say so: a filter, or interpolation.
+
+    Where the terms do not fit, averages over longer say it: slow noise makes those more alike, a filter less.
+    """
     error, theta = _model_error(allan, curve.allan**2)
-    terms = WHITE_ALIKE if error > GOOD else 1 - 1.5 * (hadamard.A[0] @ theta[:RAMP]) / (allan.A[0] @ theta)
+    terms, n = 1 - 1.5 * (hadamard.A[0] @ theta[:RAMP]) / (allan.A[0] @ theta), float(np.sum(curve.lengths))
+    if error > GOOD:
+        some = curve.alike[curve.m <= n / AVERAGES]
+        k = int(np.argmin(some)) if len(some) else 0
+        terms, n = float(curve.alike[k]), n / float(curve.m[k])
     tolerance = MODEL_ERROR + GOOD * abs(terms - WHITE_ALIKE)
-    return alike(float(curve.alike[0]), int(np.sum(curve.lengths)), terms, tolerance)
+    return alike(float(curve.alike[0]), int(n), terms, tolerance)
 
 
 def _beyond(model: Design, v: Array, dt: float) -> int:
@@ -139,7 +147,8 @@ def _beyond(model: Design, v: Array, dt: float) -> int:
     found = [_model_error(model.since(j), v[j:]) for j in range(max(1, len(v) - LEFT + 1))]
     wanted = 1.5 * min(error for error, _ in found)
     first, theta = next((j, theta) for j, (error, theta) in enumerate(found) if error <= wanted)
-    reach = REACH * 2 * theta[0] / max(theta[WHITE], np.finfo(float).tiny)
+    with np.errstate(over="ignore"):  # where there is no white noise
+        reach = REACH * 2 * theta[0] / max(theta[WHITE], np.finfo(float).tiny)
     return max(first, int(np.searchsorted(model.tau, reach)))
 
 
