@@ -98,7 +98,8 @@ class FitMapResult(MapResult):
     def _certificate(self, sheet: Sheet) -> Certificate:
         verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
         soak = verdict.soak if len(set(paths)) == len(paths) else None  # parts of one recording are no power-ups
-        remarks = [*verdict.doubts, *filter(None, [verdict.used.sentence() if verdict.used else None])]
+        remarks = [f"in doubt: {text}" for text in verdict.doubts]
+        remarks += filter(None, [verdict.used.sentence() if verdict.used else None])
         return Certificate(
             COMMAND, self.config, sheet, self.limits, self.measured, self.map, soak, verdict.placements,
             self.map.record.lasted, remarks=remarks,

@@ -315,7 +315,7 @@ def certificate_of(record: UnitRecord, path: Path, config: Config, sheet: Sheet)
     in_sample = "the prediction is of the soak that the map was fitted on"
     return Certificate(
         "fleet", config, own, judged, measured, fitted, seconds=3600 * record.hours, name=record.unit,
-        remarks=[*record.doubts, *[in_sample] * record.coast_in_sample],
+        remarks=[*(f"in doubt: {text}" for text in record.doubts), *[in_sample] * record.coast_in_sample],
     )  # fmt: skip
 
 

@@ -35,6 +35,15 @@ def test_no_limit_passes_on_a_copied_axis_or_with_a_map_of_one(tmp_path, copied)
     assert ("in doubt: the soak of its map: gyro y shows" in found.verdict) is copied
 
 
+def test_a_certificate_without_limits_says_a_doubt_in_its_frame(tmp_path):
+    config = {"filter": {"gyro": GYRO | {"bias": {**GYRO["bias"], "map": {"kind": "polynomial"}}}, "accel": None}}
+    for copied in (False, True):
+        driftlab.fit_map(config, recording(0, copied=copied), out=tmp_path / f"{copied}.json", certificate=True)
+        page = (tmp_path / f"{copied}.certificate.html").read_text()
+        assert "no statement of conformity is made" in page
+        assert ("is made. In doubt: gyro y shows what gyro x shows" in page) is copied
+
+
 def test_a_limit_that_fails_fails_in_doubt_too():
     measured = {
         "swing": Measured(np.array([1.0]), ("x",), np.array([0.9]), np.array([1.1])),
