@@ -21,6 +21,11 @@ LOST = "samples lost on the way, by the device's counter"
 NO_FRAME = "bytes that came for a second or more without a frame, check baudrate and framing"
 
 
+def in_doubt(doubts: Iterable[str]) -> list[str]:
+    """Return doubts about a recording as sentences that begin with that."""
+    return [f"in doubt: {text}" for text in doubts]
+
+
 @dataclass
 class Fault:
     """A count of one fault, and the place of its first case; 0 for a note."""

@@ -32,7 +32,7 @@ from driftlab.storage.map_file import check_all
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError
-from fusion_core.faults import Faults
+from fusion_core.faults import Faults, in_doubt
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 
@@ -98,7 +98,7 @@ class FitMapResult(MapResult):
     def _certificate(self, sheet: Sheet) -> Certificate:
         verdict, paths = self.verdict, [str(one["name"]).partition("::")[0] for one in sheet.recordings]
         soak = verdict.soak if len(set(paths)) == len(paths) else None  # parts of one recording are no power-ups
-        remarks = [f"in doubt: {text}" for text in verdict.doubts]
+        remarks = in_doubt(verdict.doubts)
         remarks += filter(None, [verdict.used.sentence() if verdict.used else None])
         return Certificate(
             COMMAND, self.config, sheet, self.limits, self.measured, self.map, soak, verdict.placements,

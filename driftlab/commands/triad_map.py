@@ -39,7 +39,7 @@ from driftlab.units import tracked_unit
 from fusion_core.chunk import Flags
 from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
-from fusion_core.faults import DOUBT, Faults
+from fusion_core.faults import DOUBT, Faults, in_doubt
 from fusion_core.host.provenance import Participant
 from fusion_core.host.registry import registry
 from fusion_core.thermal.record_texts import recorded
@@ -150,7 +150,7 @@ class TriadMapResult(MapResult):
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
         self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
         self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
-            "triad": plain(words.as_json(fit, self.unit, [*self._doubts(), *words.untested_lines(fit)])),
+            "triad": plain(words.as_json(fit, self.unit, [*in_doubt(self.faults.doubts), *words.untested_lines(fit)])),
             "serial": config.serial,
             "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }  # fmt: skip
@@ -162,12 +162,9 @@ class TriadMapResult(MapResult):
     def verdict(self) -> list[str]:
         """Return doubts, frame, how far levels differ, family, what is not tested or observable, a sentence each."""
         of_family = [] if self.law is None else [words.family_line(self.fit, self.law.units)]
-        levels = words.level_lines(self.fit, self.unit)
-        untested = words.untested_lines(self.fit)
-        return [*self._doubts(), words.frame_line(self.fit), *levels, *of_family, *untested, *words.verdict(self.fit)]
-
-    def _doubts(self) -> list[str]:
-        return [f"in doubt: {text}" for text in self.faults.doubts]
+        doubts, levels = in_doubt(self.faults.doubts), words.level_lines(self.fit, self.unit)
+        untested, hidden = words.untested_lines(self.fit), words.verdict(self.fit)
+        return [*doubts, words.frame_line(self.fit), *levels, *of_family, *untested, *hidden]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit)
@@ -176,7 +173,7 @@ class TriadMapResult(MapResult):
         recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
         lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
         notes, channel = [*words.untested_lines(self.fit), *self.faults.lines(doubts=False)], self.map.record.channel
-        return [words.page_of(self.fit, self.unit, channel, lead, self._doubts(), notes, sheet)]
+        return [words.page_of(self.fit, self.unit, channel, lead, in_doubt(self.faults.doubts), notes, sheet)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
@@ -184,7 +181,7 @@ class TriadMapResult(MapResult):
         return Certificate(
             COMMAND, self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
             levelled=self.fit.has_bias,
-            remarks=[*self._doubts(), *words.untested_lines(self.fit), *words.verdict(self.fit)],
+            remarks=[*in_doubt(self.faults.doubts), *words.untested_lines(self.fit), *words.verdict(self.fit)],
         )  # fmt: skip
 
 

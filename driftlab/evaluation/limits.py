@@ -22,6 +22,7 @@ import numpy as np
 from driftlab.config import Limits
 from driftlab.units import BiasUnit, with_uncertainty
 from fusion_core.chunk import Array
+from fusion_core.faults import in_doubt
 
 Decision = Literal["pass", "fail", "undecided"]
 RISK = 0.05  # of the units beyond a limit, that may pass
@@ -163,7 +164,7 @@ def check_limits(
     rows = [_result(name, limit, measured.get(name)) for name, limit in declared.items()]
     beside = [one.beside for name, one in measured.items() if one.beside and name not in declared]
     if doubts:
-        beside.append(f"in doubt: {doubts[0]}")
+        beside += in_doubt(doubts[:1])
         why = "the recording, or its map, is in doubt"
         rows = [replace(row, decision="undecided", needs=why) if row.decision == "pass" else row for row in rows]
     return [replace(row, beside="; ".join(beside) if row is rows[0] else "") for row in rows]

@@ -49,7 +49,7 @@ from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.family.unit_information import UnitInformation
 from driftlab.units import BiasUnit, axis_name, default_unit, number
 from fusion_core.chunk import Array
-from fusion_core.faults import DOUBT
+from fusion_core.faults import DOUBT, in_doubt
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
 AT_ONCE = 1000  # units whose p-values are in memory
@@ -171,9 +171,7 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
 
 def of_doubts(record: UnitRecord) -> tuple[Outlier, ...]:
     """Return the doubts about a unit as reasons for which it stands out: nothing of it is said to be as the family."""
-    return tuple(
-        Outlier(record.unit, DOUBT, "", 0.0, float("nan"), None, f"in doubt: {text}", ()) for text in record.doubts
-    )
+    return tuple(Outlier(record.unit, DOUBT, "", 0.0, float("nan"), None, text, ()) for text in in_doubt(record.doubts))
 
 
 def describe(unit: str, odd: tuple[Outlier, ...]) -> str:

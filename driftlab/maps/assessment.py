@@ -32,7 +32,7 @@ from driftlab.soak.rest import Used
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.faults import DOUBT
+from fusion_core.faults import DOUBT, in_doubt
 
 GRID = 400
 
@@ -96,7 +96,7 @@ class MapVerdict:
         unused = "" if self.used is None else self.used.sentence()
         placements = [] if self.placements is None else sentences(self.placements, self.axes, unit)
         good, *level = self._good(unit)
-        lines = [*(f"in doubt: {text}" for text in self.doubts), *([unused] if unused else [])]
+        lines = [*in_doubt(self.doubts), *([unused] if unused else [])]
         lines += [good, memory_sentence(self.memory, self.axes, unit), *level, *placements]
         return [*lines, *self._misfits(unit), *self._coverage(unit)]
 

@@ -39,7 +39,7 @@ from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import is_as
 from driftlab.units import tracked_unit
 from fusion_core.errors import ConfigError, FusionError, MapError, UnreadableFile, describe_error
-from fusion_core.faults import Faults
+from fusion_core.faults import Faults, in_doubt
 from fusion_core.host.config import document_of
 from fusion_core.host.provenance import participants
 
@@ -315,7 +315,7 @@ def certificate_of(record: UnitRecord, path: Path, config: Config, sheet: Sheet)
     in_sample = "the prediction is of the soak that the map was fitted on"
     return Certificate(
         "fleet", config, own, judged, measured, fitted, seconds=3600 * record.hours, name=record.unit,
-        remarks=[*(f"in doubt: {text}" for text in record.doubts), *[in_sample] * record.coast_in_sample],
+        remarks=[*in_doubt(record.doubts), *[in_sample] * record.coast_in_sample],
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from driftlab.evaluation.limits import worst
 from driftlab.family.record import UnitRecord, figure_name
 from driftlab.spc.capability import share_beyond
 from fusion_core.chunk import Array
+from fusion_core.faults import in_doubt
 
 COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
     "lot": lambda record: record.lot,
@@ -173,7 +174,7 @@ def reasons(record: UnitRecord) -> list[str]:
     """
     if record.state == "failed":
         return [f"not calibrated: {_general(record.error, record.unit) or 'no reason given'}"]
-    doubts = dict.fromkeys(f"in doubt: {_general(text, record.unit)}" for text in record.doubts)
+    doubts = dict.fromkeys(in_doubt(_general(text, record.unit) for text in record.doubts))
     rows = ((figure_name(str(row["name"])).replace("_", " "), str(row["verdict"])) for row in record.limits)
     said = {verdict: text for verdict, text in SAID.items() if not doubts or verdict != UNDECIDED}
     return [*doubts, *(f"{name} {said[verdict]}" for name, verdict in rows if verdict in said)]

@@ -13,8 +13,6 @@ import numpy as np
 
 from fusion_core.chunk import Array, Integers
 
-Index = Integers
-
 TURN = 0.1  # of the whole swing: a smaller way back is no turning point
 ONE_WAY = 0.1  # of the way up (or down) that the other way must have at least
 

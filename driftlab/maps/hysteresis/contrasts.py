@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
-from fusion_core.chunk import Array
-from fusion_core.thermal.sweeps import Index
+from fusion_core.chunk import Array, Integers
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about
@@ -72,7 +71,7 @@ class FreeCurve:
         return np.asarray(BSpline.design_matrix(np.clip(T, *self.domain), self.knots, 3).toarray())
 
 
-def laws_of(blocks: SoakRows, recording: Index) -> list[Array]:
+def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
     lasted = float(np.median(blocks.span))
     whole = max(float(np.ptp(blocks.t[recording == k])) for k in np.unique(recording)) + lasted
@@ -169,7 +168,7 @@ class SoakContrasts:
         """Log-likelihood (R, d) of each noise without a memory, but for a constant."""
         return self.likelihood(self.Q)
 
-    def likelihood(self, left: Array, noises: Index | slice = slice(None)) -> Array:
+    def likelihood(self, left: Array, noises: Integers | slice = slice(None)) -> Array:
         """Return the log-likelihood (R, ...) of noises that leave such squares (R, ...), but for a constant."""
         log_w = self.log_w[noises].reshape(-1, *[1] * (left.ndim - 1))
         return np.asarray(log_w - len(self.u) / 2 * np.log(np.maximum(left, TINY)))
@@ -264,7 +263,9 @@ class SoakContrasts:
         following = FollowingCurves(coefficients, likelier, added)
         return slots, self.of(slots), np.stack([followed, part]), following
 
-    def form_variances(self, inputs: Array, curves: FollowingCurves, noises: Index, s2: Array, between: Array) -> Array:
+    def form_variances(
+        self, inputs: Array, curves: FollowingCurves, noises: Integers, s2: Array, between: Array
+    ) -> Array:
         """Return the variances of the form (J, d) of curves that follow inputs, between two of their temperatures.
 
         `between` (J, d, p): the splines at one less those at the other. Curve and size are fitted together, by

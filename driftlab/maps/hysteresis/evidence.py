@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, TINY, SoakContrasts, log_mean
-from fusion_core.chunk import Array
-from fusion_core.thermal.sweeps import Index
+from fusion_core.chunk import Array, Integers
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
@@ -92,12 +91,12 @@ class ShapeEvidence:
         return int(self.z.shape[1] - self.followed.shape[2])
 
     @cached_property
-    def _thin(self) -> Index:
+    def _thin(self) -> Integers:
         """Noises (R',) under which there are pairs."""
         return np.arange(len(self.Q)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
 
     @cached_property
-    def _both(self) -> Index:
+    def _both(self) -> Integers:
         """Shapes (2, P) of which there are pairs."""
         names = np.array(self.kinds)
         places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(self.kinds)]
@@ -152,7 +151,7 @@ class ShapeEvidence:
             gram.append((w @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(len(w), len(i), d))
         return np.concatenate(gram)
 
-    def _of(self, noises: Index | slice, t2: Array, p: int) -> Array:
+    def _of(self, noises: Integers | slice, t2: Array, p: int) -> Array:
         """Return the log evidence (J,) of t^2 (R, J, d), under some noises, of p coefficients on an axis each."""
         base, logs = log_mean(self.contrasts.without[noises]), []
         for g in SIZES:
@@ -256,7 +255,7 @@ class Pairs:
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """
 
-    which: Index
+    which: Integers
     likelihoods: Array
     mean: Array
     covariance: Array
@@ -276,7 +275,7 @@ class Pairs:
         return shares(self.power * self.likelihoods)
 
     @classmethod
-    def of(cls, shapes: ShapeEvidence, noise: Index, most: int) -> Pairs:
+    def of(cls, shapes: ShapeEvidence, noise: Integers, most: int) -> Pairs:
         """Return those of two of the shapes, the `most` likeliest, each axis (d,) under its noise."""
         J, d = shapes.z.shape[1:]
         i, k = np.triu_indices(J, 1)

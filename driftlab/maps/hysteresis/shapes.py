@@ -23,11 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.soak.blocks import SoakSummary
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Effect
 from fusion_core.errors import FusionError
 from fusion_core.host.registry import registry
-from fusion_core.thermal.sweeps import Index
 
 SUBJECT = "temperature"
 NARROWER = (4.0, 2.0)  # than the narrowest of a grid
@@ -167,7 +166,7 @@ class Sweeps:
         sides = np.stack([np.max(most, axis=0), -np.min(least, axis=0)])
         return np.asarray(np.min(sides, axis=0) > OTHER * np.max(sides, axis=0))
 
-    def opening_of(self, which: Index, coefficients: Array, axis: int) -> tuple[float, Array]:
+    def opening_of(self, which: Integers, coefficients: Array, axis: int) -> tuple[float, Array]:
         """Return the opening of some shapes (q,) together on an axis, and what each coefficient (q,) adds to it."""
         shown = self.shown[:, :, which, axis]
         above, below, g = self.widest(shown @ coefficients)
