@@ -92,19 +92,23 @@ class LevelLikelihood:
 
     def at(self, ratio: float) -> tuple[Array, Array, int]:
         """Return - 2 l and s^2 (d,) of each signal where s^2 is the likeliest, and nu."""
-        rows = self.rows(ratio)
-        N = np.sum([X.T @ X for X, _ in rows], axis=0)
-        variances = np.concatenate([S[np.isfinite(S)] for _, S in rows])
-        L, nu = np.linalg.cholesky(N[: self.q, : self.q]), max(len(variances) - self.q, 1)
-        taken = np.linalg.solve(L, N[: self.q, self.q :])
-        squares = np.diag(N)[self.q :] - np.sum(taken**2, axis=0)
-        s2 = np.maximum(squares, np.finfo(float).tiny) / nu
-        return nu * np.log(s2) + np.sum(np.log(variances)) + 2 * np.sum(np.log(np.diag(L))), s2, nu
+        costs, scales, nu = self._over([ratio])
+        return costs[0], scales[0], nu
 
     def over(self, ratios: Array) -> tuple[Array, Array]:
         """Return - 2 l and s^2 (G, d) of ratios (G,)."""
-        costs, scales, _ = zip(*map(self.at, ratios), strict=True)
-        return np.array(costs), np.array(scales)
+        return self._over(ratios)[:2]
+
+    def _over(self, ratios: Sequence[float] | Array) -> tuple[Array, Array, int]:
+        q, each = self.q, [self.rows(ratio) for ratio in ratios]
+        N = np.stack([np.sum([X.T @ X for X, _ in rows], axis=0) for rows in each])
+        variances = np.stack([np.concatenate([S[np.isfinite(S)] for _, S in rows]) for rows in each])
+        L, nu = np.linalg.cholesky(N[:, :q, :q]), max(variances.shape[1] - q, 1)
+        taken = np.linalg.solve(L, N[:, :q, q:])
+        squares = np.diagonal(N, axis1=1, axis2=2)[:, q:] - np.sum(taken**2, axis=1)
+        s2 = np.maximum(squares, np.finfo(float).tiny) / nu
+        free = 2 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)), axis=1)
+        return nu * np.log(s2) + (np.sum(np.log(variances), axis=1) + free)[:, None], s2, nu
 
 
 MIN_GAIN, MAX_GAIN = 1e-4, 0.98

@@ -91,8 +91,9 @@ class CurveError(Frozen):
     def _whole(self) -> Self:
         if len(self.T) < 2 or np.any(np.diff(self.T) <= 0):
             raise ValueError("the grid T does not rise")
-        if self.modes and np.shape(self.modes)[1:] != (len(self.T), len(self.bend)):
-            raise ValueError(f"modes have the shape {np.shape(self.modes)}, not (r, {len(self.T)}, {len(self.bend)})")
+        shape = self._arrays[1].shape
+        if self.modes and shape[1:] != (len(self.T), len(self.bend)):
+            raise ValueError(f"modes have the shape {shape}, not (r, {len(self.T)}, {len(self.bend)})")
         if any(misfit.axis >= len(self.bend) for misfit in self.misfits):
             raise ValueError(f"a misfit is of axis {max(misfit.axis for misfit in self.misfits)} of {len(self.bend)}")
         return self

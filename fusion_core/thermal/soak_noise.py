@@ -15,6 +15,7 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -176,11 +177,24 @@ class Contrasts:
 
         What the map leaves nothing of is left out.
         """
-        values, V = np.linalg.eigh((A * self.white) @ A.T)
-        free = values > TAKEN * values[-1]
-        V = V[:, free] / np.sqrt(values[free])
-        own, turn = np.linalg.eigh(V.T @ (A @ self.covariance @ A.T) @ V)
-        return np.maximum(own, 0.0), turn.T @ (V.T @ u)
+        white, walk = (A * self.white) @ A.T, A @ self.covariance @ A.T
+        root = _inverse_root(white)
+        own, turn = np.linalg.eigh(root @ walk @ root.T)
+        return np.maximum(own, 0.0), turn.T @ (root @ u)
+
+
+def _inverse_root(covariance: Array) -> Array:
+    """Return R (r, m), R covariance R' = 1, of all directions but those of less than TAKEN of the largest variance."""
+    from scipy.linalg.lapack import dtrtri
+
+    with suppress(np.linalg.LinAlgError):
+        inverse = dtrtri(np.linalg.cholesky(covariance), lower=1)[0]
+        # at least the inverse of the least variance, times at least the largest: nothing is to be left out
+        if np.sum(inverse**2) * np.trace(covariance) < 1 / TAKEN:
+            return np.asarray(inverse)
+    values, V = np.linalg.eigh(covariance)
+    free = values > TAKEN * values[-1]
+    return np.asarray((V[:, free] / np.sqrt(values[free])).T)
 
 
 def walk_covariance(blocks: Blocks) -> Array:

@@ -100,8 +100,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
         inputs[accel.channel] = gravity(site.latitude) * up
     if accel is not None and up is not None and site.latitude is not None:
         place = ["xyz".index(axis) for axis in gyro.axes]
-        omega_ie = earth_rate(up, site.latitude, site.heading)[place]
-        a_radian = _of_tilt(up, site)[place]
+        omega_ie, a_radian = (rate[place] for rate in _rate_and_tilt(up, site))
         unsure = _accel_error(f, site, accel) * a_radian
         if tracked == gyro.channel:
             notes = _of_bias(LARGE * a_radian, gyro, accel, float(np.sum(window["tau"])))
@@ -152,8 +151,8 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
     )
 
 
-def _of_tilt(up: Array, site: Site) -> Array:
-    """Return the deviation (3,) of the Earth rate about the axes a radian that the vertical is off either way."""
+def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
+    """Return the Earth rate (3,) about the axes, and its deviation a radian that the vertical is off either way."""
     assert site.latitude is not None
     (x, y, z), k = up, int(np.argmin(np.abs(up)))
     first = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])[k]
@@ -162,9 +161,9 @@ def _of_tilt(up: Array, site: Site) -> Array:
     level = np.array([first, [y * c - z * b, z * a - x * c, x * b - y * a]])  # two directions across the vertical
     moved = up + np.concatenate([1e-4 * level, -1e-4 * level])
     moved /= np.sqrt(np.sum(moved**2, axis=1, keepdims=True))
-    rates = earth_rate(moved, site.latitude, site.heading)
-    changes = (rates[:2] - rates[2:]) / 2e-4
-    return np.asarray(np.sqrt(np.sum(changes**2, axis=0)))
+    rates = earth_rate(np.concatenate([moved, up[None]]), site.latitude, site.heading)
+    changes = (rates[:2] - rates[2:4]) / 2e-4
+    return rates[4], np.asarray(np.sqrt(np.sum(changes**2, axis=0)))
 
 
 def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:

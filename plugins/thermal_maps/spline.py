@@ -35,6 +35,7 @@ from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
+    from scipy.sparse import csr_array
 
 _BINS = 8  # to an interval
 _INTERVALS = (4, 300)  # fewest and most
@@ -93,7 +94,7 @@ class _Fits:
 
     def smoother(self, blocks: Blocks, grid: Array, axis: int) -> Array:
         shares = blocks.shares(self.bins.of_sample, len(self.bins.T))
-        return np.asarray(_basis(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
+        return np.asarray(_sparse(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
 
 
 @hookimpl
@@ -188,9 +189,13 @@ def _knots(domain: tuple[float, float], count: int) -> Array:
 
 
 def _basis(domain: tuple[float, float], count: int, T: Array) -> Array:
+    return np.asarray(_sparse(domain, count, T).toarray())
+
+
+def _sparse(domain: tuple[float, float], count: int, T: Array) -> csr_array:
     from scipy.interpolate import BSpline
 
-    return np.asarray(BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3).toarray())
+    return BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3)
 
 
 def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:

@@ -92,6 +92,7 @@ class FollowingCurves:
     coefficients: Array  # (J, p, d): of the splines
     partly: NDArray[np.bool_]  # (J, d): whether a part of the curve follows, or all of it
     added: Array  # (S, J, d): the bias that each adds on the slots
+    late: Array  # (J, K, p): the splines of the blocks where the curve sees the inputs
 
 
 class SoakContrasts:
@@ -260,12 +261,10 @@ class SoakContrasts:
         likelier = log_mean(part) > log_mean(followed)
         coefficients = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
         added = np.stack([(one - here) @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
-        following = FollowingCurves(coefficients, likelier, added)
+        following = FollowingCurves(coefficients, likelier, added, late[:, :, :p])
         return slots, self.of(slots), np.stack([followed, part]), following
 
-    def form_variances(
-        self, inputs: Array, curves: FollowingCurves, noises: Integers, s2: Array, between: Array
-    ) -> Array:
+    def form_variances(self, curves: FollowingCurves, noises: Integers, s2: Array, between: Array) -> Array:
         """Return the variances of the form (J, d) of curves that follow inputs, between two of their temperatures.
 
         `between` (J, d, p): the splines at one less those at the other. Curve and size are fitted together, by
@@ -275,7 +274,7 @@ class SoakContrasts:
 
             g' (Sigma - a a' / (a' Sigma^-1 a)) g,    Sigma^-1 = S' C^-1 S / s^2 + 1
         """
-        S, variances = self.late(inputs)[1][:, :, : self.splines.shape[1]], np.zeros(curves.partly.shape)
+        S, variances = curves.late, np.zeros(curves.partly.shape)
         for axis, noise in enumerate(noises):
             inverse = np.linalg.inv(self.covariance(int(noise)))
             solved, turned = inverse @ self.X, np.swapaxes(S, 1, 2) @ inverse

@@ -267,13 +267,15 @@ class _MemoryTest:
             return forms
         inputs, noises = self.shapes.inputs, np.argmax(evidence.noises, axis=0)
         there = Sweeps(self.contrasts.soak, inputs[:, :, None]).shown[..., 0]
-        between = np.empty((inputs.shape[1], len(noises), self.curves.coefficients.shape[1]))
-        for j, axis in np.ndindex(*between.shape[:2]):
+        J, d = self.curves.partly.shape
+        ends = np.empty((2, J, d))
+        for j, axis in np.ndindex(J, d):
             above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, evidence.added + j, axis])
-            up, down = self.contrasts.curve(np.nan_to_num([there[above, g, j], there[below, g, j]]))
-            between[j, axis] = up - down
+            ends[:, j, axis] = there[[above, below], g, j]
+        up, down = self.contrasts.curve(np.nan_to_num(ends).ravel()).reshape(2, J, d, -1)
+        between = up - down
         s2 = np.nan_to_num(np.take_along_axis(evidence.left, noises[None], axis=0)[0]) / evidence.m
-        variances = self.contrasts.form_variances(inputs, self.curves, noises, np.maximum(s2, FINEST), between)
+        variances = self.contrasts.form_variances(self.curves, noises, np.maximum(s2, FINEST), between)
         wide = np.abs(self._openings[0][evidence.added :])
         some = wide > 0
         forms[evidence.added :] = np.hypot(FORMED, np.sqrt(variances) / np.where(some, wide, np.inf))

@@ -18,9 +18,11 @@ def test_the_form_of_a_curve_is_as_uncertain_as_least_squares_with_its_size_give
     inputs = np.roll(soak.T, 9)[:, None]
     p, d, noise, s2 = contrasts.splines.shape[1], 3, len(RATIOS) + 12, np.array([0.02, 0.1, 0.4])
     a, g = rng.normal(size=(2, 1, p, d))
-    made = FollowingCurves(a, np.full((1, d), partly), np.zeros((len(soak.T), 1, d)))
+    made = FollowingCurves(
+        a, np.full((1, d), partly), np.zeros((len(soak.T), 1, d)), contrasts.late(inputs)[1][:, :, :p]
+    )
     between = np.swapaxes(g, 1, 2)
-    found = contrasts.form_variances(inputs, made, np.full(d, noise), s2, between)
+    found = contrasts.form_variances(made, np.full(d, noise), s2, between)
 
     own, _ = contrasts.laws[1]
     C = RATIOS[12] / np.mean(own) * contrasts.covariances[1] + np.eye(len(contrasts.y))
