@@ -20,7 +20,6 @@ from pydantic import (
     WrapValidator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from driftlab.storage.in_memory import CopyName, InMemoryName
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, Stimulus, ThermalBias, ThermalMap
@@ -29,7 +28,7 @@ from fusion_core.escaping import is_plain
 from fusion_core.host.config import Document, override, read_document, validate
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
-from fusion_core.units import LIMITS, Quantity, Unit, bias_unit
+from fusion_core.units import LIMITS, Quantity, Unit, bias_unit, problem
 from fusion_core.units.grammar import NUMBER
 
 
@@ -98,9 +97,9 @@ class Config(Settings):
     @model_validator(mode="after")
     def _on_earth(self) -> Self:
         if self.latitude is not None and abs(self.latitude) > np.pi / 2:
-            raise _problem(f"latitude is {np.rad2deg(self.latitude):.6g} deg; write one from -90 deg to 90 deg")
+            raise problem(f"latitude is {np.rad2deg(self.latitude):.6g} deg; write one from -90 deg to 90 deg")
         if self.heading is not None and self.latitude is None:
-            raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
+            raise problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
         return self
 
     @model_validator(mode="after")
@@ -110,7 +109,7 @@ class Config(Settings):
             try:
                 self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
             except UnitError as error:
-                raise _problem(str(error)) from None
+                raise problem(str(error)) from None
         return self
 
     @property
@@ -161,10 +160,6 @@ def maps_of(sensor: Sensor) -> list[ThermalMap]:
     """Return the thermal maps of a sensor: the calibration's, then the bias model's."""
     items = [sensor.calibration, sensor.bias.map if isinstance(sensor.bias, ThermalBias) else None]
     return [item for item in items if item is not None]
-
-
-def _problem(text: str) -> PydanticCustomError:
-    return PydanticCustomError("config", "{text}", {"text": text})
 
 
 def products() -> dict[str, Path]:
@@ -280,14 +275,14 @@ def _line(longest: int, wrong: str, value: Any) -> Any:
     """Return a text in one line; a whole number is one."""
     text = str(value) if isinstance(value, int) and not isinstance(value, bool) else value
     if isinstance(text, str) and not (0 < len(text) <= longest and is_plain(text) and text == text.strip()):
-        raise _problem(f"'{quote(text)}' {wrong}; write 1 to {longest} characters in one line")
+        raise problem(f"'{quote(text)}' {wrong}; write 1 to {longest} characters in one line")
     return text
 
 
 def _serial(value: Any) -> Any:
     """Return a serial number as text; a number with a point has lost its spelling."""
     if isinstance(value, float):
-        raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
+        raise problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
     return _line(LONGEST, "is no serial number", value)
 
 

@@ -24,6 +24,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from fusion_core.errors import quote
+from fusion_core.units import problem
 
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
@@ -34,7 +35,7 @@ def _beside_config(value: Any, info: ValidationInfo) -> Any:
     elif isinstance(value, str) and not can_be_path(value):
         text = f"'{quote(value)}' cannot be a path; write a shorter one"
     if text is not None:
-        raise PydanticCustomError("path", "{text}", {"text": text})
+        raise problem(text)
     return folder / value if folder and isinstance(value, str) and value != "-" else value
 
 

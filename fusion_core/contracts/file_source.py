@@ -24,7 +24,6 @@ from typing import Annotated, Any, ClassVar, Protocol, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, field_serializer, model_validator
-from pydantic_core import PydanticCustomError
 
 from fusion_core.budget import TimeBudget, check_all, of_all
 from fusion_core.chunk import Array, Chunk
@@ -34,7 +33,7 @@ from fusion_core.contracts.table import USUAL, Block, Channel, Table, Window
 from fusion_core.errors import BadValue, ConfigError, EmptyRecording, MissingChannel, UnitError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.settings import ConfigPath, did_you_mean
-from fusion_core.units import Unit, convert
+from fusion_core.units import Unit, convert, problem
 
 Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI unit of each path of a channel
 
@@ -249,11 +248,6 @@ def _pieces(chunk: Chunk, rows: slice, size: int) -> Iterator[Chunk]:
     for start in range(rows.start, rows.stop, size):
         piece = slice(start, min(start + size, rows.stop))
         yield Chunk(chunk.t[piece], {name: values[piece] for name, values in chunk.channels.items()})
-
-
-def problem(text: str) -> PydanticCustomError:
-    """Return the error for settings that do not fit together, to be raised by a validator."""
-    return PydanticCustomError("recording", "{text}", {"text": text})
 
 
 AS_CSV = "export it as CSV and use kind: csv"

@@ -32,7 +32,7 @@ from fusion_core.errors import FusionError, PluginError, describe_error, quote
 from fusion_core.hookspecs import PROJECT
 from fusion_core.host.guard import guard
 from fusion_core.settings import did_you_mean
-from fusion_core.units import bias_unit, unsettled
+from fusion_core.units import bias_unit, problem, unsettled
 
 PLUGINS = "fusion_plugins"
 BUILT_IN = (f"{PLUGINS}.", "driftlab.")  # modules of the distribution HOME
@@ -299,7 +299,7 @@ class Installed:
             text = f"no plugin of the family {registry().family_of(source).name} is installed; install one"
 
             def refuse(value: Any) -> Any:
-                raise PydanticCustomError("no_plugin", "{text}", {"text": text})
+                raise problem(text)
 
             return core_schema.no_info_before_validator_function(refuse, core_schema.any_schema())
         if len(kinds) > 1:

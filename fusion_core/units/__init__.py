@@ -126,13 +126,13 @@ class Unit:
         if isinstance(value, int | float) and not isinstance(value, bool) and "folder" not in (info.context or {}):
             return self._of_number(float(value))
         if not isinstance(value, str):
-            raise _problem(f"{quote(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
+            raise problem(f"{quote(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
         try:
             unit = self._of_bias(value)
             number = to_si(value, unit)
         except UnitError as error:
             example = self._fitting_example()
-            raise _problem(f"{error} (here e.g. '{example}')" if example else str(error)) from None
+            raise problem(f"{error} (here e.g. '{example}')" if example else str(error)) from None
         return Quantity(self._checked(number, unit, f"'{quote(value)}'"), " ".join(value.split()), unit)
 
     def _of_number(self, number: float) -> Quantity:
@@ -141,18 +141,18 @@ class Unit:
         unit = self._of_bias("") if known else ""
         text = f"{number!r} {plain(unit)}".rstrip()
         if not np.isfinite(number):
-            raise _problem(f"{text} is not a finite number; write one")
+            raise problem(f"{text} is not a finite number; write one")
         return Quantity(self._checked(number, unit or self.unit, text), text, unit)
 
     def _checked(self, number: float, unit: str, text: str) -> float:
         """Return the number; raises where it is not of a sign and size that the field can have."""
         if self.positive and number <= 0:
-            raise _problem(f"{text} must be greater than zero")
+            raise problem(f"{text} must be greater than zero")
         if self.least is not None and number < self.least:
-            raise _problem(f"{text} must be at least {self.least:g} {unit}")
+            raise problem(f"{text} must be at least {self.least:g} {unit}")
         low, high = LIMITS.get(unit, (1e-30, 1e30))
         if number and not low <= abs(number) <= high:
-            raise _problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain(unit)} can; correct it")
+            raise problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain(unit)} can; correct it")
         return number
 
     def _of_bias(self, text: str) -> str:
@@ -185,23 +185,24 @@ class Unit:
         return float(value) if "bias" in self.unit else f"{float(value)!r} {plain(self.unit)}"
 
 
-def _problem(text: str) -> PydanticCustomError:
-    return PydanticCustomError("unit", "{text}", {"text": text})
+def problem(text: str) -> PydanticCustomError:
+    """Return the error for a value of a config, or for values that do not fit together, to be raised by a validator."""
+    return PydanticCustomError("config", "{text}", {"text": text})
 
 
 def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
     """Raise the validation error of a field that has neither one value nor one an axis."""
     if isinstance(value, tuple) and len(value) != d:
-        raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
+        raise problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
 
 
 def axis_names(axes: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of axes; raises the validation error of those that are none, or not each once."""
     for axis in axes:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,15}", axis):
-            raise _problem(f"'{quote(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
+            raise problem(f"'{quote(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
     if len(set(axes)) < len(axes):
-        raise _problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
+        raise problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
     return axes
 
 
@@ -213,7 +214,7 @@ def check_triad(axes: tuple[str, ...]) -> None:
     """Raise the validation error of a triad whose axes are not among x, y and z."""
     other = [axis for axis in axes if axis not in ("x", "y", "z")]
     if other:
-        raise _problem(f"bias.axes has '{other[0]}', a triad has x, y and z; name those that there are")
+        raise problem(f"bias.axes has '{other[0]}', a triad has x, y and z; name those that there are")
 
 
 def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:

@@ -26,10 +26,10 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from fusion_core.chunk import Array, Bytes, Chunk, Flags, Integers
 from fusion_core.contracts import Memory
-from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings, did_you_mean
+from fusion_core.units import problem
 from fusion_plugins.framings.field import VALID, DeviceCounter, channel, check_channel, counts, sent
 
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes

@@ -11,10 +11,9 @@ from pydantic import Field
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import USUAL, Channel, Counter
-from fusion_core.contracts.file_source import problem
 from fusion_core.errors import UnitError
 from fusion_core.settings import Settings
-from fusion_core.units import Unit, convert
+from fusion_core.units import Unit, convert, problem
 
 VALID = "valid"  # zero where the device says that a sample must not be used
 

@@ -25,9 +25,8 @@ from pydantic import model_validator
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Counter, Frames, Framing, Memory
-from fusion_core.contracts.file_source import problem
 from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Unit
+from fusion_core.units import Unit, problem
 from fusion_plugins.framings.binary import Binary
 from fusion_plugins.framings.field import VALID
 

@@ -22,10 +22,10 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Channel, Memory
-from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.errors import MissingChannel
 from fusion_core.hookspecs import hookimpl
+from fusion_core.units import problem
 from fusion_plugins.framings.field import DeviceCounter, channel, check_channel, counts, sent
 
 LONGEST = 4096  # bytes of a line

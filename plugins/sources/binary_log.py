@@ -23,12 +23,13 @@ from pydantic import Field
 from fusion_core import contracts
 from fusion_core.budget import TEXTS, check_all
 from fusion_core.chunk import Array, Integers
-from fusion_core.contracts.file_source import Conversions, problem
+from fusion_core.contracts.file_source import Conversions
 from fusion_core.contracts.framing import DAMAGED
 from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import LOST, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
+from fusion_core.units import problem
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 1 << 20  # bytes decoded at a time

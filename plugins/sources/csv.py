@@ -29,10 +29,10 @@ from pydantic import Field, model_validator
 from fusion_core.budget import COPIED, TEXTS, check_all, keep, size_of, unpacked_at_most
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table, foreign, recognised
-from fusion_core.contracts.file_source import problem
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_core.units import problem
 from fusion_plugins.sources.dialect import (
     JOINED,
     bare,

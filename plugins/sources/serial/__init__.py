@@ -30,12 +30,11 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Counter, Framing, Source
-from fusion_core.contracts.file_source import problem
 from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
-from fusion_core.units import Quantity, Unit
+from fusion_core.units import Quantity, Unit, problem
 from fusion_plugins.sources.binary_log import BinaryLog
 from fusion_plugins.sources.serial.clock import SampleClock
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.file_source import problem as problem
+from fusion_core.units import problem as problem
 from fusion_core.units.grammar import NUMBER
 
 d = 3  # axes of a triad

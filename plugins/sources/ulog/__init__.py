@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from fusion_core.contracts import FileSource, Table
-from fusion_core.contracts.file_source import problem
 from fusion_core.errors import ConfigError, MissingChannel, quote
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_core.units import problem
 from fusion_plugins.sources.unpacked import plain_file, unpacking
 
 if TYPE_CHECKING:
