@@ -12,7 +12,7 @@ from fusion_core.contracts.effect import Effect
 from fusion_core.contracts.thermal_map import ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.thermal.fitted_map import FittedMap
-from fusion_core.units import Unit
+from fusion_core.units import Unit, problem
 
 
 class ThermalBias(BiasModel):
@@ -70,3 +70,12 @@ class ThermalBias(BiasModel):
             If the class has no such field, or the values do not fit together.
         """
         return type(self).model_validate({**dict(self), **fields})
+
+
+def check_corrected_once(calibration: ThermalMap | None, bias: BiasModel) -> None:
+    """Raise the validation error of a sensor whose map is subtracted first, and followed by its bias model too."""
+    if calibration is not None and isinstance(bias, ThermalBias) and bias.map is not None:
+        raise problem(
+            f"a map is subtracted by `calibration` and followed again by the bias model {bias.kind}: the correction "
+            "would be applied twice; keep one of the two"
+        )

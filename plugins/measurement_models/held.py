@@ -21,6 +21,7 @@ import pydantic
 from fusion_core import contracts
 from fusion_core import units as quantities
 from fusion_core.chunk import Array, Chunk, constant
+from fusion_core.contracts.thermal_bias import check_corrected_once
 from fusion_core.errors import UnitError, quote
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -99,11 +100,7 @@ class Held(contracts.MeasurementModel):
             raise ValueError("noise has no unit, and the sensor's unit follows from it; write e.g. '0.06 ppm/sqrt(Hz)'")
         if isinstance(self.reference, tuple):
             quantities.check_axes("reference", self.reference, len(self.bias.axes))
-        if self.calibration is not None and isinstance(self.bias, contracts.ThermalBias) and self.bias.map is not None:
-            raise ValueError(
-                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
-                "correction would be applied twice; keep one of the two"
-            )
+        check_corrected_once(self.calibration, self.bias)
         return self
 
     @classmethod

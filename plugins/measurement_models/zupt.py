@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from fusion_core import contracts
 from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts.thermal_bias import check_corrected_once
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -42,17 +42,8 @@ class _Corrected(Settings):
     range: float | None = None
 
     @model_validator(mode="after")
-    def _correct_once(self) -> Self:
-        if self.calibration is not None and isinstance(self.bias, contracts.ThermalBias) and self.bias.map is not None:
-            text = (
-                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
-                "correction would be applied twice; keep one of the two"
-            )
-            raise PydanticCustomError("config", "{text}", {"text": text})
-        return self
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
+    def _fits_together(self) -> Self:
+        check_corrected_once(self.calibration, self.bias)
         check_triad(self.bias.axes)
         check_axes("noise", self.noise, len(self.bias.axes))
         return self
