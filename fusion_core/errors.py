@@ -10,6 +10,7 @@ where it counts from elsewhere: `812.0 s (t = 1760000812.0 s in the file)`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from fusion_core.escaping import line
 
@@ -50,6 +51,15 @@ def describe_error(error: BaseException, most: int = 200) -> str:
     """Return the name of an error and what it says, as it can stand in a message."""
     text = quote(error, most)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def check_installed(whose: str, package: str, use: str, extra: str, otherwise: str = "") -> None:
+    """Raise ConfigError where an optional package is not installed: what it is for, and the extra that brings it."""
+    if find_spec(package.replace("-", "_")) is None:
+        raise ConfigError(
+            f"{whose}: the package {package} is not installed, it was expected for {use}; "
+            f"pip install 'driftlab[{extra}]'{otherwise}"
+        )
 
 
 class FusionError(Exception):

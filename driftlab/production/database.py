@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from driftlab import __version__
 from driftlab.family.record import UnitRecord
 from driftlab.production.tables import all_columns
-from fusion_core.errors import ConfigError, Unwritable, quote
+from fusion_core.errors import ConfigError, Unwritable, check_installed, quote
 
 if TYPE_CHECKING:
     from sqlalchemy import URL, Connection, Engine
@@ -63,13 +63,9 @@ class Database:
     """
 
     def __init__(self, url: str) -> None:
-        try:
-            import sqlalchemy
-        except ImportError:
-            raise ConfigError(
-                "--to: the package sqlalchemy is not installed, it was expected for databases; pip install "
-                "'driftlab[sql]'"
-            ) from None
+        check_installed("--to", "sqlalchemy", "databases", "sql")
+        import sqlalchemy
+
         try:
             parsed = sqlalchemy.make_url(url)
             self.name, self._secrets = place_of(parsed), _secrets(parsed)

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from fusion_core.errors import ConfigError, FusionError, UnreadableFile, describe_error, quote
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, check_installed, describe_error, quote
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 _SPAN = re.compile(r"(?P<url>.+?)(?P<span>::[^:/]*:[^:/]*)?")
@@ -76,13 +76,9 @@ def look(url: str) -> tuple[int, str] | None:
 
 def system_of(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and the URL's name there; raises ConfigError."""
-    try:
-        from fsspec.core import url_to_fs
-    except ImportError:
-        raise ConfigError(
-            f"{quote(url, 200)}: the package fsspec is not installed, it was expected for URLs; "
-            "pip install 'driftlab[dask]'"
-        ) from None
+    check_installed(quote(url, 200), "fsspec", "URLs", "dask")
+    from fsspec.core import url_to_fs
+
     try:
         system, name = url_to_fs(url)
     except (ImportError, ValueError) as error:  # no package for it; no such kind

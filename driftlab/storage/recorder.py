@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import partial
-from importlib.util import find_spec
 from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -36,7 +35,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Framing, Source, head
 from fusion_core.contracts.file_source import RecordingWriter
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.errors import ConfigError, UnreadableFile, check_installed
 from fusion_core.escaping import comment, json_text, yaml_text
 from fusion_core.host.registry import registry
 
@@ -371,10 +370,7 @@ class XlsxWriter:
     names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path, settings: str) -> None:
-        if find_spec("openpyxl") is None:
-            raise ConfigError(
-                "--out: the package openpyxl is not installed, it was expected for .xlsx; pip install 'driftlab[excel]'"
-            )
+        check_installed("--out", "openpyxl", ".xlsx", "excel")
         from openpyxl import Workbook
 
         self._path, self._book, self._rows = path, Workbook(write_only=True), 0

@@ -15,13 +15,12 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime, time, timedelta
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from fusion_core.budget import PIECE, check_size
 from fusion_core.contracts import Table, foreign, head
-from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
+from fusion_core.errors import MissingChannel, UnreadableFile, check_installed
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.csv import Csv, CsvLines, stream_of
@@ -106,11 +105,7 @@ def _workbook(path: Path) -> tuple[Any, list[str]]:
         with translated(path, zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, ValueError,
                         LookupError, OSError):  # fmt: skip
             content = _repacked(place)
-    if find_spec("python_calamine") is None:
-        raise ConfigError(
-            "xlsx: the package python-calamine is not installed, it was expected for workbooks of Excel; "
-            "pip install 'driftlab[excel]', or export the sheet as CSV"
-        )
+    check_installed("xlsx", "python-calamine", "workbooks of Excel", "excel", ", or export the sheet as CSV")
     from python_calamine import CalamineWorkbook, SheetTypeEnum
 
     with _calamine(path):

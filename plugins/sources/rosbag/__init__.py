@@ -20,7 +20,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -31,7 +30,7 @@ from fusion_core.budget import COPIED, check_count, keep, temporary_folder, unpa
 from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import Block, FileSource, Table, foreign, head
 from fusion_core.contracts.file_source import RecordingWriter
-from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
+from fusion_core.errors import BadValue, MissingChannel, UnreadableFile, check_installed
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import did_you_mean
@@ -61,7 +60,7 @@ class Rosbag(FileSource):
     @unpacking
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""
-        _check_installed()
+        check_installed("rosbag", "rosbags", "ROS bags", "ros")
         leading = self.channels.get("time") or self.channels.get("gyro") or next(iter(self.channels.values()))
         with storages(path, self.kind, faults) as files:
             yield Topics(path, files, leading.paths[0], self.stamp, faults)
@@ -69,17 +68,10 @@ class Rosbag(FileSource):
     @classmethod
     def writer(cls, path: Path, suffix: str, note: str) -> RecordingWriter:
         """Begin a bag of ROS 1 or an MCAP file of ROS 2; raises ConfigError without rosbags."""
-        _check_installed()
+        check_installed("rosbag", "rosbags", "ROS bags", "ros")
         from fusion_plugins.sources.rosbag.writer import BagWriter
 
         return BagWriter(path, ros1=suffix == ".bag", note=note)
-
-
-def _check_installed() -> None:
-    if find_spec("rosbags") is None:
-        raise ConfigError(
-            "rosbag: the package rosbags is not installed, it was expected for ROS bags; pip install 'driftlab[ros]'"
-        )
 
 
 class Topics(Table):

@@ -20,7 +20,6 @@ from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
-from fusion_plugins.sources import rosbag
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
 
@@ -281,8 +280,7 @@ def test_a_spreadsheet_that_is_too_long_is_refused(config, tmp_path, monkeypatch
     [("xlsx", "openpyxl", "excel"), ("bag", "rosbags", "ros"), ("mcap", "rosbags", "ros")],
 )
 def test_a_package_that_is_missing_is_named(config, tmp_path, monkeypatch, ending, package, extra):
-    for module in (recorder, rosbag):
-        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr("fusion_core.errors.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=rf"package {package} is not installed, .*pip install 'driftlab\[{extra}\]'"):
         simulate(config, out=tmp_path / f"twin.{ending}")
     assert list(tmp_path.glob("twin.*")) == [tmp_path / "twin.yaml"]

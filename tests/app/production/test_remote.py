@@ -1,6 +1,5 @@
 """Recordings behind URLs: the same bytes are read, and what is wrong is said of the URL."""
 
-import builtins
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -131,14 +130,7 @@ def test_a_copy_that_was_cut_is_refused(bucket, monkeypatch):
 
 
 def test_the_extra_is_named_where_it_is_missing(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args):
-        if name.startswith("fsspec"):
-            raise ImportError(name)
-        return real(name, *args)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(ConfigError, match=r"fsspec is not installed.*; pip install 'driftlab\[dask\]'"):
         look("s3://line/soak.h5")
 

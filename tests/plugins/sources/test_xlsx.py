@@ -164,7 +164,7 @@ def test_what_is_no_workbook_is_refused(tmp_path, monkeypatch):
         path.write_bytes(data)
         with pytest.raises(UnreadableFile, match=message):
             read(Xlsx(path=path, channels=CHANNELS))
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr("fusion_core.errors.find_spec", lambda name: None)
     path.write_bytes((tmp_path / "other.zip").read_bytes())
     with pytest.raises(UnreadableFile, match="is a zip archive"):
         read(Xlsx(path=path, channels=CHANNELS))

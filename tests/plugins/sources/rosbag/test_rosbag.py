@@ -386,7 +386,7 @@ def test_a_topic_without_a_header_and_one_of_another_clock(tmp_path, kind):
 
 
 def test_without_the_package(tmp_path, monkeypatch):
-    monkeypatch.setattr("fusion_plugins.sources.rosbag.find_spec", lambda name: None)
+    monkeypatch.setattr("fusion_core.errors.find_spec", lambda name: None)
     with pytest.raises(Exception, match=r"package rosbags is not installed, .*; pip install 'driftlab\[ros\]'"):
         read(source(tmp_path / "r.bag"))
 
