@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -46,6 +47,13 @@ class Block:
 
     rows: int
     read: Callable[[str], Array]
+
+
+def blocks_of(rows: int, size: int, read: Callable[[slice, str], Array]) -> Iterator[Block]:
+    """Yield blocks of `size` rows; `read` gives some rows of a column."""
+    for start in range(0, rows, size):
+        part = slice(start, min(start + size, rows))
+        yield Block(part.stop - start, partial(read, part))
 
 
 class Table(ABC):

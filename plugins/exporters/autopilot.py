@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_core import contracts
-from fusion_core.budget import check_regular
+from fusion_core.budget import read_whole
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss, TriadMatrix
 from fusion_core.contracts.calibration import TEMPERATURES
@@ -339,7 +339,6 @@ def powers(T: Array, T_ref: float, c: Array) -> Array:
 
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
-LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -388,15 +387,9 @@ def missing(values: Mapping[str, float], names: Sequence[str]) -> tuple[str, ...
 
 def _text(path: Path) -> str:
     try:
-        check_regular(path)
-        with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+        return read_whole(path).decode("utf-8-sig")
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name a parameter file") from None
-    try:
-        if len(data) > LARGEST:
-            raise ValueError
-        return data.decode("utf-8-sig")
     except ValueError:
         raise UnreadableFile(
             f"{path}: is no text, expected a parameter file; name one that a ground station saved"

@@ -22,6 +22,7 @@ import numpy as np
 from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table, foreign, head
+from fusion_core.contracts.table import blocks_of
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
@@ -92,9 +93,7 @@ class DataSets(Table):
         row = sum(8.0 * np.prod(column.node.shape[1:]) for column in data)
         size = rows_at_once(self.path, f"the data sets {', '.join(paths)}"[:100], size, row)
         packing = {path: self._packing(path) for path in paths}
-        for start in range(0, rows, size):
-            stop = min(start + size, rows)
-            yield Block(stop - start, partial(self._read, start=start, stop=stop, packing=packing))
+        yield from blocks_of(rows, size, partial(self._read, packing))
 
     def _rows(self, paths: Sequence[str]) -> int:
         """Return the number of rows of all data sets together."""
@@ -137,9 +136,9 @@ class DataSets(Table):
             )
         return float(np.ravel(value)[0])
 
-    def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
+    def _read(self, packing: dict[str, tuple[list[Any], float, float]], rows: slice, path: str) -> Array:
         missing, factor, offset = packing[path]
-        raw = self._data[path][start:stop]
+        raw = self._data[path][rows]
         values = np.asarray(raw, dtype=np.float64)
         for value in missing:
             values = np.where(raw == value, np.nan, values)

@@ -24,6 +24,7 @@ import numpy as np
 from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table, foreign, head
+from fusion_core.contracts.table import blocks_of
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
@@ -205,9 +206,7 @@ class Variables(Table):
             check_rows(self.path, columns)
         row = sum(8.0 * shape[1 - along[path]] for path, (_, shape) in arrays.items())
         size = rows_at_once(self.path, f"the variables {', '.join(paths)}"[:100], size, row)
-        for start in range(0, rows, size):
-            stop = min(start + size, rows)
-            yield Block(stop - start, partial(self._read, slice(start, stop), arrays, along))
+        yield from blocks_of(rows, size, partial(self._read, arrays, along))
 
     def _leaves(self, path: str, node: Any, depth: int = 0) -> Iterator[str]:
         self._count += 1
@@ -278,7 +277,7 @@ class Variables(Table):
             "sampled together"
         )
 
-    def _read(self, rows: slice, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], path: str) -> Array:
+    def _read(self, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], rows: slice, path: str) -> Array:
         array, axis = arrays[path][0], along[path]
         part = array.along(axis)[rows].T if isinstance(array, Turned) else array[rows] if axis == 0 else array[:, rows]
         values = np.asarray(part, dtype=np.float64)

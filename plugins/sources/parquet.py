@@ -65,7 +65,7 @@ class Parquet(TableSource):
         first = head(path)
         if not (first.startswith(SIGNATURE) or SIGNATURE.startswith(first)):
             raise foreign(path, first, self.kind)
-        with translated(path, pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+        with translated(path, pl.exceptions.PolarsError, OSError):
             yield ParquetColumns(path)
 
 

@@ -104,12 +104,17 @@ def damaged(path: Path, reason: str) -> UnreadableFile:
 
 @contextmanager
 def translated(path: Path, *errors: type[BaseException]) -> Iterator[None]:
-    """Turn the errors of a library, while it has a file open, into the error of a damaged one."""
+    """Turn the errors of a library, while it has a file open, into the error of a damaged one.
+
+    So also the panic of one that is written in Rust, which is no exception.
+    """
     try:
         yield
     except (FusionError, MemoryError):
         raise
-    except errors as error:
+    except BaseException as error:
+        if not (isinstance(error, errors) or type(error).__name__ == "PanicException"):
+            raise
         raise damaged(path, " ".join(str(error).split()).strip("'\"")[:160]) from None
 
 

@@ -24,7 +24,7 @@ from fusion_core.errors import MissingChannel, UnreadableFile, check_installed
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.csv import Csv, CsvLines, stream_of
-from fusion_plugins.sources.unpacked import Stream, damaged, plain_file, translated
+from fusion_plugins.sources.unpacked import Stream, plain_file, translated
 
 SIGNATURE = b"PK\x03\x04"
 PARTS = re.compile(r"\[Content_Types\]\.xml|_rels/.*|xl/(?:[^/]*\.xml|_rels/.*|worksheets/[^/]*)")
@@ -108,7 +108,7 @@ def _workbook(path: Path) -> tuple[Any, list[str]]:
     check_installed("xlsx", "python-calamine", "workbooks of Excel", "excel", ", or export the sheet as CSV")
     from python_calamine import CalamineWorkbook, SheetTypeEnum
 
-    with _calamine(path):
+    with translated(path, Exception):
         book = CalamineWorkbook.from_filelike(content)
     names = [sheet.name for sheet in book.sheets_metadata if sheet.typ is SheetTypeEnum.WorkSheet]
     if not names:
@@ -116,28 +116,15 @@ def _workbook(path: Path) -> tuple[Any, list[str]]:
     return book, names
 
 
-@contextmanager
-def _calamine(path: Path) -> Iterator[None]:
-    """Turn the errors of the library, and its panics, which are no exceptions, into the error of a damaged file."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except BaseException as error:
-        if isinstance(error, Exception) or type(error).__name__ == "PanicException":
-            raise damaged(path, " ".join(str(error).split())[:160]) from None
-        raise
-
-
 def _sheet(path: Path, book: Any, name: str) -> Any:
     """Return a sheet; raises UnreadableFile where it is damaged."""
-    with _calamine(path):
+    with translated(path, Exception):
         return book.get_sheet_by_name(name)
 
 
 def _rows(path: Path, sheet: Any) -> Iterator[list[Any]]:
     """Yield the rows of a sheet; raises UnreadableFile where a cell is none."""
-    with _calamine(path):
+    with translated(path, Exception):
         yield from sheet.iter_rows()
 
 

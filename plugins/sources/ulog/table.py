@@ -17,13 +17,13 @@ accelerometer CAL_ACCn too: from the log's own parameters that is undone. TC_* a
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
+from fusion_core.contracts.table import blocks_of
 from fusion_core.errors import MissingChannel
 from fusion_core.faults import Faults
 from fusion_plugins.sources.joining import FieldPath, joined, taken_apart
@@ -148,9 +148,7 @@ class ULogTopics(Table):
                 at_rows = joined(t, times, np.column_stack([column[rows] for column in columns]))
                 values |= {path: at_rows[:, k] for k, path in enumerate(fields)}
         del data
-        for start in range(0, len(t), size):
-            stop = min(start + size, len(t))
-            yield Block(stop - start, partial(_part, values, start, stop))
+        yield from blocks_of(len(t), size, lambda rows, path: np.asarray(values[path][rows], dtype=np.float64))
 
     def _instance(self, path: str) -> Instance:
         instance = self.instance(path)
@@ -248,7 +246,3 @@ def _times(data: Mapping[str, Array]) -> Array:
         return sent
     sampled = np.asarray(data["timestamp_sample"], dtype=np.float64)
     return np.where(sampled > 0, sampled, sent)
-
-
-def _part(values: Mapping[str, Array], start: int, stop: int, path: str) -> Array:
-    return np.asarray(values[path][start:stop], dtype=np.float64)

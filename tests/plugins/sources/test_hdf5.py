@@ -189,7 +189,7 @@ def test_hdf5_reads_only_time_before_the_range(tmp_path, monkeypatch):
     monkeypatch.setattr(
         DataSets,
         "_read",
-        lambda self, path, **rows: asked.append((path, rows["start"])) or real(self, path, **rows),
+        lambda self, packing, rows, path: asked.append((path, rows.start)) or real(self, packing, rows, path),
     )
     source = h5(tmp_path / "r.h5", "deg/s", values=np.zeros((100, 3)), start="50 s", stop="60 s")
     assert len(read(source, 10)) == 10
