@@ -162,7 +162,11 @@ class FileSource(Source):
             raise ConfigError(
                 f"{self.kind}: no recording is named; write path: FILE under source, or give --input FILE"
             )
-        self._check_range()
+        for word, value in (("START", self.start), ("STOP", self.stop)):
+            if value is not None and not value >= 0:
+                raise ConfigError(
+                    f"{self.name}: {word} is {value:.12g} s, seconds from the first row were expected; write 0 or more"
+                )
         yield from TimeBudget(self.path, "what yields no row").over(self._chunks(self.path, size, faults))
 
     def _chunks(self, path: Path, size: int, faults: Faults) -> Iterator[Chunk]:
@@ -183,13 +187,6 @@ class FileSource(Source):
                     return
         if window.rows == 0:
             raise self._empty(window, rows_read, table.noun, faults)
-
-    def _check_range(self) -> None:
-        for word, value in (("START", self.start), ("STOP", self.stop)):
-            if value is not None and not value >= 0:
-                raise ConfigError(
-                    f"{self.name}: {word} is {value:.12g} s, seconds from the first row were expected; write 0 or more"
-                )
 
     def _empty(self, window: Window, rows_read: int, noun: str, faults: Faults) -> EmptyRecording:
         if rows_read == 0 and (wrong := faults.lines(notes=False)):

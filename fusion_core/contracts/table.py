@@ -21,23 +21,22 @@ from fusion_core.thermal.thermometer import READINGS
 from fusion_core.units import convert, si_unit_of
 
 
-def head(path: Path, named: Path | None = None, most: int = 4096) -> bytes:
-    """Return the first bytes of a file, `most` of them, which messages call `named` (the path by default).
+def head(path: Path, most: int = 4096) -> bytes:
+    """Return the first bytes of a file, `most` of them.
 
     Raises
     ------
     UnreadableFile
         If it is not there, not a file (a pipe or a device never ends), or empty.
     """
-    named = named or path
     try:
         check_regular(path)
         with path.open("rb") as file:
             first = file.read(most)
     except OSError as error:
-        raise UnreadableFile(f"{named}: cannot be read ({error.strerror}); name an existing file") from None
+        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
     if not first:
-        raise UnreadableFile(f"{named}: is empty (0 bytes); nothing was written to it, or a copy failed")
+        raise UnreadableFile(f"{path}: is empty (0 bytes); nothing was written to it, or a copy failed")
     return first
 
 
@@ -49,7 +48,7 @@ class Block:
     read: Callable[[str], Array]
 
 
-def blocks_of(rows: int, size: int, read: Callable[[slice, str], Array]) -> Iterator[Block]:
+def row_blocks(rows: int, size: int, read: Callable[[slice, str], Array]) -> Iterator[Block]:
     """Yield blocks of `size` rows; `read` gives some rows of a column."""
     for start in range(0, rows, size):
         part = slice(start, min(start + size, rows))

@@ -22,7 +22,7 @@ import numpy as np
 from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table, foreign, head
-from fusion_core.contracts.table import blocks_of
+from fusion_core.contracts.table import row_blocks
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
@@ -93,7 +93,7 @@ class DataSets(Table):
         row = sum(8.0 * np.prod(column.node.shape[1:]) for column in data)
         size = rows_at_once(self.path, f"the data sets {', '.join(paths)}"[:100], size, row)
         packing = {path: self._packing(path) for path in paths}
-        yield from blocks_of(rows, size, partial(self._read, packing))
+        yield from row_blocks(rows, size, partial(self._read, packing))
 
     def _rows(self, paths: Sequence[str]) -> int:
         """Return the number of rows of all data sets together."""

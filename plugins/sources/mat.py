@@ -24,7 +24,7 @@ import numpy as np
 from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table, foreign, head
-from fusion_core.contracts.table import blocks_of
+from fusion_core.contracts.table import row_blocks
 from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
@@ -206,7 +206,7 @@ class Variables(Table):
             check_rows(self.path, columns)
         row = sum(8.0 * shape[1 - along[path]] for path, (_, shape) in arrays.items())
         size = rows_at_once(self.path, f"the variables {', '.join(paths)}"[:100], size, row)
-        yield from blocks_of(rows, size, partial(self._read, arrays, along))
+        yield from row_blocks(rows, size, partial(self._read, arrays, along))
 
     def _leaves(self, path: str, node: Any, depth: int = 0) -> Iterator[str]:
         self._count += 1

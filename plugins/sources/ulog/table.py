@@ -23,7 +23,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
-from fusion_core.contracts.table import blocks_of
+from fusion_core.contracts.table import row_blocks
 from fusion_core.errors import MissingChannel
 from fusion_core.faults import Faults
 from fusion_plugins.sources.joining import FieldPath, joined, taken_apart
@@ -148,7 +148,7 @@ class ULogTopics(Table):
                 at_rows = joined(t, times, np.column_stack([column[rows] for column in columns]))
                 values |= {path: at_rows[:, k] for k, path in enumerate(fields)}
         del data
-        yield from blocks_of(len(t), size, lambda rows, path: np.asarray(values[path][rows], dtype=np.float64))
+        yield from row_blocks(len(t), size, lambda rows, path: np.asarray(values[path][rows], dtype=np.float64))
 
     def _instance(self, path: str) -> Instance:
         instance = self.instance(path)
