@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +11,7 @@ import fusion_core.contracts.table as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory
 
+E = TypeVar("E", bound=Effect)
 _NOISE = 6.0  # deviations of the thermometer: noise of thousands of samples spans about that much
 
 
@@ -46,6 +48,11 @@ def lag_of(chunk: Chunk, u: Array, tau: float, memory: Memory) -> tuple[Array, M
     before, y = (u[0], u[0]) if memory is None else memory
     output = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, tau, before, y)
     return output, (float(u[-1]), float(output[-1]))
+
+
+def varied(effect: E, name: str, values: Iterable[float]) -> Iterator[E]:
+    """Yield copies of an effect, each with another value of a hyper-parameter."""
+    return (effect.model_copy(update={name: value}) for value in values)
 
 
 def auxiliary(recordings: Sequence[Chunk]) -> list[str]:

@@ -12,7 +12,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.effects.common import OfChannel, auxiliary
+from fusion_plugins.effects.common import OfChannel, auxiliary, varied
 
 _MAX_POWERS = 3  # powers
 
@@ -47,8 +47,7 @@ class Curve(OfChannel):
 
     def candidates(self) -> Iterator[Self]:
         """Yield 1, 2 and 3 powers; of a channel other than temperature 3: one is `channel`, two `interaction`."""
-        for powers in range(1 if self.channel == "temperature" else _MAX_POWERS, _MAX_POWERS + 1):
-            yield self.model_copy(update={"powers": powers})
+        return varied(self, "powers", range(1 if self.channel == "temperature" else _MAX_POWERS, _MAX_POWERS + 1))
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the candidates for temperature and every auxiliary channel of one column that moves, over its range."""

@@ -12,7 +12,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, PlayState, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import largest_reversal, up_to
+from fusion_plugins.effects.common import largest_reversal, up_to, varied
 
 _WIDTHS, _NARROWEST, _WIDEST = 12, 0.02, 0.7  # to try: how many, and from where to where, of the swing
 
@@ -36,8 +36,7 @@ class Hysteresis(Effect):
 
     def candidates(self) -> Iterator[Self]:
         """Yield widths from 1 K to 30 K."""
-        for width in np.geomspace(1.0, 30.0, 10):
-            yield self.model_copy(update={"width": float(width)})
+        return varied(self, "width", np.geomspace(1.0, 30.0, 10).tolist())
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield widths from 2 % to 70 % of the swing, none wider than temperature reverses through.
@@ -47,8 +46,7 @@ class Hysteresis(Effect):
         swing = max(float(np.ptp(chunk["temperature"])) for chunk in recordings)
         most = max(largest_reversal(chunk["temperature"]) for chunk in recordings)
         if swing > 0:
-            for width in up_to(np.geomspace(_NARROWEST * swing, _WIDEST * swing, _WIDTHS), most):
-                yield self.model_copy(update={"width": width})
+            yield from varied(self, "width", up_to(np.geomspace(_NARROWEST * swing, _WIDEST * swing, _WIDTHS), most))
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return y - T; y starts in the middle of the loop, and is the memory."""

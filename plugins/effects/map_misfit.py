@@ -13,6 +13,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Function, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.common import varied
 
 
 @hookimpl
@@ -42,8 +43,7 @@ class MapMisfit(Effect):
 
     def candidates(self) -> Iterator[Self]:
         """Yield from 2 to 32 intervals."""
-        for intervals in (2, 4, 8, 16, 32):
-            yield self.model_copy(update={"intervals": intervals})
+        return varied(self, "intervals", (2, 4, 8, 16, 32))
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the grid over the temperatures of the recordings."""

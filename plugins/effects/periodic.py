@@ -11,6 +11,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.common import varied
 
 _LINES = 3  # highest lines that are tried
 _CYCLES = 10  # within the longest recording that a line has at least: fewer pass for a drift
@@ -38,8 +39,7 @@ class Periodic(Effect):
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the highest lines of the residual's power, summed over axes and recordings."""
-        for period in _lines(recordings):
-            yield self.model_copy(update={"period": period})
+        return varied(self, "period", _lines(recordings))
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return sine and cosine; there is no memory."""

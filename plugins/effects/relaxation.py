@@ -12,7 +12,7 @@ from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import FadingLag, OfChannel, auxiliary, lag_of, longest_span, up_to
+from fusion_plugins.effects.common import FadingLag, OfChannel, auxiliary, lag_of, longest_span, up_to, varied
 
 _SHORTEST, _LONGEST = 20.0, 36_000.0  # s
 _OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
@@ -43,8 +43,7 @@ class Relaxation(FadingLag, OfChannel):
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 20 s to 10 h."""
         count = _OF_TEMPERATURE if self.channel == "temperature" else _OF_CHANNEL
-        for tau in np.geomspace(_SHORTEST, _LONGEST, count):
-            yield self.model_copy(update={"tau": float(tau)})
+        return varied(self, "tau", np.geomspace(_SHORTEST, _LONGEST, count).tolist())
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the grid for temperature and for every auxiliary channel of one column, up to half the longest span."""
@@ -55,8 +54,8 @@ class Relaxation(FadingLag, OfChannel):
             if recordings[0][name].ndim == 1:
                 # what follows the temperature itself, late or not, is the map's
                 for form in ("relaxed",) if name == "temperature" else ("relaxed", "late"):
-                    for tau in up_to(np.geomspace(_SHORTEST, _LONGEST, count), most):
-                        yield self.model_copy(update={"channel": name, "tau": tau, "form": form})
+                    acting = self.model_copy(update={"channel": name, "form": form})
+                    yield from varied(acting, "tau", up_to(np.geomspace(_SHORTEST, _LONGEST, count), most))
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return u - lag(u), or lag(u), from equilibrium; the memory is the last u and the last output of the lag."""

@@ -13,7 +13,7 @@ from fusion_core.contracts.effect import TEMPERATURE, Behind, Reading, Signal, W
 from fusion_core.contracts.table import auxiliary
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import lag_of
+from fusion_plugins.effects.common import lag_of, varied
 
 
 @hookimpl
@@ -46,8 +46,8 @@ class ThermalGradient(Effect):
         """Yield the difference, and its rate over windows from 5 s to 320 s without and with it."""
         yield self.model_copy(update={"form": "difference"})
         for form in ("rate", "both"):
-            for window in (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0):
-                yield self.model_copy(update={"form": form, "window": window})
+            seen = self.model_copy(update={"form": form})
+            yield from varied(seen, "window", (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0))
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every channel whose name begins with `temperature_`."""

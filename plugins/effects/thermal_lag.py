@@ -12,7 +12,7 @@ from fusion_core.contracts import Memory
 from fusion_core.contracts.effect import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import FadingLag, lag_of
+from fusion_plugins.effects.common import FadingLag, lag_of, varied
 
 
 @hookimpl
@@ -35,8 +35,7 @@ class ThermalLag(FadingLag):
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 10 s to 2000 s."""
-        for tau in np.geomspace(10.0, 2000.0, 9):
-            yield self.model_copy(update={"tau": float(tau)})
+        return varied(self, "tau", np.geomspace(10.0, 2000.0, 9).tolist())
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return no regressor (N, d, 0): the effect acts on the map's input."""

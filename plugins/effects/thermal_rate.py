@@ -10,7 +10,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Behind, Signal, Weighted, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import lag_of
+from fusion_plugins.effects.common import lag_of, varied
 
 
 @hookimpl
@@ -31,8 +31,7 @@ class ThermalRate(Effect):
 
     def candidates(self) -> Iterator[Self]:
         """Yield differentiators from 5 s to 80 s: a coarse thermometer needs a slow one."""
-        for tau in (5.0, 10.0, 20.0, 40.0, 80.0):
-            yield self.model_copy(update={"tau": tau})
+        return varied(self, "tau", (5.0, 10.0, 20.0, 40.0, 80.0))
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the temperature rate; the memory is the inputs and outputs of its lags, one after the other."""

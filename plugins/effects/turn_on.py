@@ -12,7 +12,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Fading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import longest_span
+from fusion_plugins.effects.common import longest_span, varied
 
 _OF_SPAN = 1 / 3  # longest time constant to try, of the longest recording: beyond, it is a drift
 
@@ -34,8 +34,7 @@ class TurnOn(Effect):
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 2 min to 11 h."""
-        for tau in np.geomspace(120.0, 39_600.0, 18):
-            yield self.model_copy(update={"tau": float(tau)})
+        return varied(self, "tau", np.geomspace(120.0, 39_600.0, 18).tolist())
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the candidates up to a third of the longest recording."""

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Effect
+from fusion_core.contracts import Calibrated, Effect, TriadMatrix
 from fusion_core.contracts.effect import TEMPERATURE, Behind, Function, PlayState, Reading, Signal, walk
 
 if TYPE_CHECKING:
@@ -147,25 +147,21 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
     weights = np.stack(list(signals.values()), axis=1) if signals else np.zeros((len(sensor.axes), 0))
     matrix = None
     if sensor.matrix is not None:
-        matrix = fewest(TEMPERATURE, inverse_of(sensor), (low, high), _matrix_loss(sensor), floats=floats)
+        matrix = _matrix_table(sensor.matrix, (low, high), floats=floats)
         if matrix is None:
             return None
     return Program(tuple(tables), tuple(signals), weights.astype(np.float32), matrix)
 
 
-def inverse_of(sensor: Calibrated) -> Curve:
-    """Return the function of T (N,) -> (N, 9), N = (I + M)^-1 - I row by row, of a map with a matrix."""
-    matrix, one = sensor.matrix, np.eye(3)
-    assert matrix is not None
-    return lambda T: (np.linalg.inv(one + matrix.at(T)) - one).reshape(-1, 9)
+def _matrix_table(matrix: TriadMatrix, domain: tuple[float, float], *, floats: bool) -> LookupTable | None:
+    """Return the table of N = (I + M)^-1 - I, row by row, to a tenth of what the terms are known to, 0.1 to 10 ppm."""
+    one, known = np.eye(3), np.nan_to_num(matrix.sigma(np.linspace(*domain, MATRIX_PLACES)))
+    loss = np.clip(0.1 * np.sqrt(np.mean(known**2, axis=0)), 1e-7, 1e-5)
 
+    def curve(T: Array) -> Array:
+        return np.asarray((np.linalg.inv(one + matrix.at(T)) - one).reshape(-1, 9))
 
-def _matrix_loss(sensor: Calibrated) -> Array:
-    """Return a tenth (9,) of what the terms are known to, 0.1 to 10 ppm."""
-    matrix = sensor.matrix
-    assert matrix is not None
-    known = np.nan_to_num(matrix.sigma(np.linspace(*sensor.fitted.domain, MATRIX_PLACES)))
-    return np.asarray(np.clip(0.1 * np.sqrt(np.mean(known**2, axis=0)), 1e-7, 1e-5))
+    return fewest(TEMPERATURE, curve, domain, loss, floats=floats)
 
 
 def why_not(effect: Effect) -> str | None:
