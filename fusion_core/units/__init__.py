@@ -149,7 +149,7 @@ class Unit:
         if self.positive and number <= 0:
             raise problem(f"{text} must be greater than zero")
         if self.least is not None and number < self.least:
-            raise problem(f"{text} must be at least {self.least:g} {unit}")
+            raise problem(f"{text} must be at least {self.least:g} {plain(unit)}")
         low, high = LIMITS.get(unit, (1e-30, 1e30))
         if number and not low <= abs(number) <= high:
             raise problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain(unit)} can; correct it")

@@ -37,17 +37,15 @@ from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.recursions import LaggedLines, play
 from fusion_core.settings import Settings
-from fusion_core.units import Unit, along_axes
+from fusion_core.units import Unit, along_axes, problem
 from fusion_plugins.earth import earth_rate, gravity
 from fusion_plugins.sources.synthetic.chamber import Profile, Reading, body_behind
 from fusion_plugins.sources.synthetic.settings import (
     DIFFERENCE,
-    NOT_NEGATIVE,
     ONE_AN_AXIS,
     PerAxis,
     d,
     default,
-    problem,
     round_to,
 )
 
@@ -144,9 +142,9 @@ class SimulatedThermometer(Settings):
 
     at: Literal["body", "chamber"] = "body"
     """Temperature that the thermometer measures; with `chamber`, the gyros lag behind it."""
-    noise: Annotated[float, Unit("delta_degC", example="0.02 K"), DIFFERENCE, NOT_NEGATIVE, default("0.02 K")]
+    noise: Annotated[float, Unit("delta_degC", least=0, example="0.02 K"), DIFFERENCE, default("0.02 K")]
     """Deviation of a reading."""
-    resolution: Annotated[float, Unit("delta_degC", example="0.01 K"), DIFFERENCE, NOT_NEGATIVE, default("0.01 K")]
+    resolution: Annotated[float, Unit("delta_degC", least=0, example="0.01 K"), DIFFERENCE, default("0.01 K")]
     """Step to which readings are rounded."""
 
 
@@ -158,22 +156,22 @@ class SimulatedGyro(Settings):
     """
 
     noise: Annotated[
-        PerAxis, Unit("rad/s/sqrt(Hz)", example="3.18 deg/h/sqrt(Hz)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        PerAxis, Unit("rad/s/sqrt(Hz)", least=0, example="3.18 deg/h/sqrt(Hz)"), ONE_AN_AXIS,
         default("3.18 deg/h/sqrt(Hz)"),
     ]  # fmt: skip
     """Density of the white noise."""
     walk: Annotated[
-        PerAxis, Unit("rad/s/sqrt(s)", example="2.2e-5 deg/s/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        PerAxis, Unit("rad/s/sqrt(s)", least=0, example="2.2e-5 deg/s/sqrt(s)"), ONE_AN_AXIS,
         default("2.2e-5 deg/s/sqrt(s)"),
     ]  # fmt: skip
     """Density of the bias's random walk."""
-    turn_on: Annotated[PerAxis, Unit("rad/s", example="20 deg/h"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/h")]
+    turn_on: Annotated[PerAxis, Unit("rad/s", least=0, example="20 deg/h"), ONE_AN_AXIS, default("0 deg/h")]
     """Deviation of the constant that is drawn at each start, that is for each seed."""
     curve: Annotated[tuple[BiasCurve, ...], default(CURVES)]
     """Bias over temperature, a curve for each axis."""
     hysteresis: SimulatedHysteresis | None = None
     """Loop about the curves."""
-    resolution: Annotated[PerAxis, Unit("rad/s", example="0.01 deg/s"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/s")]
+    resolution: Annotated[PerAxis, Unit("rad/s", least=0, example="0.01 deg/s"), ONE_AN_AXIS, default("0 deg/s")]
     """Step to which the output is rounded."""
 
     @model_validator(mode="after")
@@ -187,17 +185,17 @@ class SimulatedAccel(Settings):
     """The accelerometer triad."""
 
     noise: Annotated[
-        PerAxis, Unit("m/s^2/sqrt(Hz)", example="0.05 m/s/sqrt(h)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        PerAxis, Unit("m/s^2/sqrt(Hz)", least=0, example="0.05 m/s/sqrt(h)"), ONE_AN_AXIS,
         default("0.05 m/s/sqrt(h)"),
     ]  # fmt: skip
     """Density of the white noise."""
     walk: Annotated[
-        PerAxis, Unit("m/s^2/sqrt(s)", example="1 ug/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE, default("1 ug/sqrt(s)")
+        PerAxis, Unit("m/s^2/sqrt(s)", least=0, example="1 ug/sqrt(s)"), ONE_AN_AXIS, default("1 ug/sqrt(s)")
     ]
     """Density of the bias's random walk."""
     bias: Annotated[PerAxis, Unit("m/s^2", example="2 mg"), ONE_AN_AXIS, default("0 mg")]
     """Constant bias."""
-    resolution: Annotated[PerAxis, Unit("m/s^2", example="1 mg"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 mg")]
+    resolution: Annotated[PerAxis, Unit("m/s^2", least=0, example="1 mg"), ONE_AN_AXIS, default("0 mg")]
     """Step to which the output is rounded."""
 
 
@@ -210,7 +208,7 @@ class Synthetic(SimulatedSource):
     """Samples a second."""
     profile: Annotated[Profile, Field(default={"kind": "ramp"}, validate_default=True, discriminator="kind")]
     """Temperature of the chamber over time."""
-    lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]
+    lag: Annotated[float, Unit("s", least=0, example="60 s"), default("0 s")]
     """Time constant with which the unit's body follows the chamber."""
     temperature: Annotated[SimulatedThermometer, default({})]
     """The unit's thermometer."""

@@ -16,8 +16,8 @@ from pydantic import Field, model_validator
 from fusion_core.chunk import Array
 from fusion_core.recursions import LaggedLines
 from fusion_core.settings import Settings
-from fusion_core.units import Unit
-from fusion_plugins.sources.synthetic.settings import DIFFERENCE, NOT_NEGATIVE, default, problem
+from fusion_core.units import Unit, problem
+from fusion_plugins.sources.synthetic.settings import DIFFERENCE, default
 
 Reading = Annotated[float, Unit("degC", example="25 degC")]
 Rate = Unit("delta_degC/s", positive=True, example="2 K/min")
@@ -82,7 +82,7 @@ class Ramp(_Profile):
     """Highest temperature."""
     rate: Annotated[float, Rate, default("2 K/min")]
     """Rate of the temperature."""
-    hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]
+    hold: Annotated[float, Unit("s", least=0, example="60 s"), default("60 s")]
     """Time at either end."""
     cycles: Annotated[int, Field(ge=1, le=10_000)] = 1
     """Number of sweeps up and down."""
@@ -103,7 +103,7 @@ class ChamberTable(_Profile):
     """Straight lines between given points; the first and the last value are held."""
 
     kind: Literal["table"] = "table"
-    time: Annotated[tuple[Annotated[float, Unit("s", example="1 h"), NOT_NEGATIVE], ...], Field(min_length=1)]
+    time: Annotated[tuple[Annotated[float, Unit("s", least=0, example="1 h")], ...], Field(min_length=1)]
     """Times, increasing."""
     temperature: Annotated[tuple[Reading, ...], Field(min_length=1)]
     """Temperatures at these times, straight in between."""

@@ -1,6 +1,6 @@
 """The common part of the settings of a simulation: defaults as a user would write them, and checks of values.
 
-To stand behind a `Unit` in an annotation, as in `Annotated[float, Unit("s"), NOT_NEGATIVE, default("0 s")]`.
+To stand behind a `Unit` in an annotation, as in `Annotated[float, Unit("delta_degC"), DIFFERENCE, default("0 K")]`.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import re
 from typing import Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
 from fusion_core.chunk import Array
-from fusion_core.units import problem as problem
+from fusion_core.units import check_axes
 from fusion_core.units.grammar import NUMBER
 
 d = 3  # axes of a triad
@@ -24,16 +24,8 @@ def default(written: Any) -> Any:
     return Field(default=written, validate_default=True)
 
 
-def _not_negative(value: Any) -> Any:
-    for item in value if isinstance(value, tuple) else (value,):
-        if item < 0:
-            raise problem(f"'{getattr(item, 'text', item)}' is negative; write zero or more")
-    return value
-
-
-def _one_an_axis(value: Any) -> Any:
-    if isinstance(value, tuple) and len(value) != d:
-        raise problem(f"{len(value)} values are given for {d} axes; write one for all, or one an axis")
+def _one_an_axis(value: PerAxis, info: ValidationInfo) -> PerAxis:
+    check_axes(str(info.field_name), value, d)
     return value
 
 
@@ -51,6 +43,5 @@ def round_to(values: Array, resolution: float | Array) -> Array:
     return np.where(np.asarray(resolution) > 0, np.round(values / step) * step, values)
 
 
-NOT_NEGATIVE = AfterValidator(_not_negative)
 ONE_AN_AXIS = AfterValidator(_one_an_axis)
 DIFFERENCE = BeforeValidator(_difference)
