@@ -134,11 +134,8 @@ def _known_header(text: bytes) -> _Header:
 
 def _array(data: bytes, what: str) -> NDArray[Any]:
     """Return an array as `np.save` writes it; raises ValueError where it is none, or declares more than there is."""
-    size = (
-        10 + int.from_bytes(data[8:10], "little")
-        if data[6:7] == b"\x01"
-        else (12 + int.from_bytes(data[8:12], "little"))
-    )
+    begin = 10 if data[6:7] == b"\x01" else 12
+    size = begin + int.from_bytes(data[8:begin], "little")
     shape, by_columns, dtype = _known_header(data[:size])
     if dtype.hasobject:
         raise ValueError(f"{what} holds objects")

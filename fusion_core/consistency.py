@@ -53,10 +53,8 @@ def gates_of(gate: float, m: int) -> Array:
 
 def nis_test(nis: Array, m: int | Integers, level: float = 0.99) -> NisTest:
     """Compare the mean of nis (N,) of m components each, or of `Estimates.dof` (N,), with its bounds at `level`."""
-    total = float(np.sum(nis))
-    return (
-        nis_test_of(total, len(nis), m, level) if isinstance(m, int) else nis_test_of(total, int(np.sum(m)), 1, level)
-    )
+    N, of_each = (len(nis), m) if isinstance(m, int) else (int(np.sum(m)), 1)
+    return nis_test_of(float(np.sum(nis)), N, of_each, level)
 
 
 def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:

@@ -123,7 +123,10 @@ class DataSetRows:
         self.path, self.node, self.axis = path, node, axis
         self.name = quote(node.name or "").strip("/")
         self._plan = node.id.get_create_plist()
-        self._check_place()
+        if self._plan.get_external_count():
+            raise self._refused("keeps its values in another file (external storage), which is not read")
+        if node.is_virtual:
+            raise self._refused("is virtual, its values are in other data sets, which are not read")
         self.written, self._largest = self._storage()
         self._kept: tuple[int, NDArray[Any]] | None = None  # the first row of what is decoded, and it
         self.step = 0 if node.chunks is None else node.chunks[axis]
@@ -160,12 +163,6 @@ class DataSetRows:
 
     def _refused(self, what: str) -> UnreadableFile:
         return UnreadableFile(f"{self.path}: data set '{self.name}' {what}; copy it with `h5repack -f GZIP=4 OLD NEW`")
-
-    def _check_place(self) -> None:
-        if self._plan.get_external_count():
-            raise self._refused("keeps its values in another file (external storage), which is not read")
-        if self.node.is_virtual:
-            raise self._refused("is virtual, its values are in other data sets, which are not read")
 
     def _storage(self) -> tuple[int, int]:
         """Return the rows that the file holds, and the bytes of the largest chunk as it is stored."""

@@ -103,7 +103,7 @@ class Unit:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         read = self._read if source is float else self.read
-        write = core_schema.plain_serializer_function_ser_schema(self._write, when_used="unless-none")
+        write = core_schema.plain_serializer_function_ser_schema(self.write, when_used="unless-none")
         self._one_an_axis = source is not float
         return core_schema.with_info_plain_validator_function(read, serialization=write)
 
@@ -176,7 +176,8 @@ class Unit:
         example = self._fitting_example() or self.example
         return f"{value} {example.partition(' ')[2]}" if type(value) in {int, float} else example
 
-    def _write(self, value: float | tuple[float, ...]) -> str | float | list[str | float]:
+    def write(self, value: float | tuple[float, ...]) -> str | float | list[str | float]:
+        """Return one quantity or several as a config has them."""
         return [self._written(item) for item in value] if isinstance(value, tuple) else self._written(value)
 
     def _written(self, value: float) -> str | float:

@@ -115,10 +115,9 @@ class ThermalDerivative(ThermalBias):
 
         Coefficients are as they were fitted. Map and effects are left out: `prior_at` has them.
         """
-        d = len(self.axes)
-        if self.repeatability is None:
-            return self._prior(np.zeros(d), self.initial_sigma, [1.0] * len(self.effects))
-        return self._prior(self._offset, along_axes(self.repeatability, d), [1.0] * len(self.effects))
+        given = self.repeatability
+        sigma = self.initial_sigma if given is None else along_axes(given, len(self.axes))
+        return self._prior(self._offset, sigma, [1.0] * len(self.effects))
 
     def prior_at(self, chunk: Chunk) -> Prior:
         """Return the prior with the level of map and effects at the first sample, where `repeatability` is given."""

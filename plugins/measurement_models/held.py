@@ -30,6 +30,7 @@ from fusion_core.units import Quantity, Unit
 from fusion_plugins.measurement_models.alignment import noise_ratios
 
 PerAxis = float | tuple[float, ...]
+OF_SENSOR = Unit("bias", example="10 V")
 LEVELS = 10.0  # times the first reading that a prior reaches which is not declared
 
 
@@ -38,19 +39,13 @@ def _read_reference(value: Any, info: pydantic.ValidationInfo) -> Any:
     if isinstance(value, str) and value and not (value[0].isdigit() or value[0] in "+-."):
         return value
     warm = unit_of(info.data.get("noise"))[0] == "K"
-    return (Unit("degC", example="25 degC") if warm else Unit("bias", example="10 V")).read(value, info)
-
-
-def _write_reference(value: Any) -> Any:
-    parts = value if isinstance(value, tuple) else (value,)
-    texts = [part.text if isinstance(part, Quantity) else part for part in parts]
-    return texts if isinstance(value, tuple) else texts[0]
+    return (Unit("degC", example="25 degC") if warm else OF_SENSOR).read(value, info)
 
 
 Reference = Annotated[
     str | PerAxis,
     pydantic.PlainValidator(_read_reference),
-    pydantic.PlainSerializer(_write_reference),
+    pydantic.PlainSerializer(lambda value: value if isinstance(value, str) else OF_SENSOR.write(value)),
     pydantic.WithJsonSchema(
         {"type": "string", "description": "a channel, or a quantity", "examples": ["set_point", "10 V"]}
     ),

@@ -126,10 +126,6 @@ class Zupt(contracts.MeasurementModel):
         optional = self.track != "accel"
         return None if self.accel is None else _sensor(self.accel, "accel", "m/s^2", "mg", optional=optional)
 
-    @property
-    def _watched(self) -> tuple[contracts.Sensor, ...]:
-        return (self._gyro,) if self._accel is None else (self._gyro, self._accel)
-
     @cached_property
     def _triads(self) -> tuple[Triad, ...]:
         named = {"gyro": ("attitude_error", "rad", self.rest.attitude)}
@@ -210,7 +206,7 @@ class Zupt(contracts.MeasurementModel):
 
     def still(self, window: Chunk) -> bool:
         """Return True if no epoch stands out, and the scatter is not far beyond the declared noise."""
-        return at_rest(window, self._watched)
+        return at_rest(window, self.sensors[::-1])
 
     def check(self, window: Chunk, site: contracts.Site) -> None:
         """Raise BadValue where the accelerometers do not show gravity."""
@@ -229,7 +225,7 @@ class Zupt(contracts.MeasurementModel):
         """Return the detector of motion."""
         from fusion_plugins.measurement_models.rest_detector import RestDetector
 
-        return RestDetector.of(self._watched, alignment, self.patience.realign_after)
+        return RestDetector.of(self.sensors[::-1], alignment, self.patience.realign_after)
 
     def simulated(self, N: int, site: contracts.Site, rng: np.random.Generator) -> Mapping[str, Array]:
         """Return noise, and gravity along the last axis."""
