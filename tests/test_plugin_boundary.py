@@ -175,7 +175,7 @@ def test_another_version_of_the_contract_is_refused_with_both_numbers(rows):
         ("memory is written", "transition: ValueError: assignment destination is read-only"),
         ("Q is indefinite", "Q is not a covariance"),
         ("F is too wide", r"F has shape \(4, 4\), its 3 labels ask for \(3, 3\)"),
-        ("u is too short", "u has shape"),
+        ("u is too short", "the drift u has shape"),
         ("u is NaN", "the drift u is not finite"),
         ("F is a list", "F is a list, an array of numbers was expected"),
         ("no memory", "transition answers a Transition, a pair"),

@@ -18,6 +18,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
+from fusion_core.contracts.effect import as_measured
 from fusion_core.fast import compiled
 
 
@@ -81,11 +82,6 @@ def with_domain(bias: BiasModel) -> Iterator[Effect]:
     """Yield the effects of a bias that have a domain."""
     if isinstance(bias, ThermalBias):
         yield from (effect for effect in bias.effects if effect.domain)
-
-
-def as_measured(chunk: Chunk) -> Chunk:
-    """Return the chunk as effects see it, its temperature not smoothed."""
-    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
 
 
 def beyond(effect: Effect, chunk: Chunk) -> Iterator[tuple[str, Flags]]:

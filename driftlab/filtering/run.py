@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.filtering.extrapolation import as_measured, beyond, with_domain
+from driftlab.filtering.extrapolation import beyond, with_domain
 from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import (
     RunSetup,
@@ -33,6 +33,7 @@ from driftlab.recordings.screening import read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
 from fusion_core.contracts import Alignment
+from fusion_core.contracts.effect import as_measured
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT

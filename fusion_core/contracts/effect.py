@@ -257,6 +257,11 @@ class Effect(Plugin):
         return tuple(limited(signal, ends) for signal in signals)
 
 
+def as_measured(chunk: Chunk) -> Chunk:
+    """Return the chunk as effects see it: an application's own smoothing of the temperature is none of theirs."""
+    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
+
+
 def _clipped(values: Array, ends: Array) -> Array:
     """Return values (N,) or (N, columns) within the ends (columns, 2): the very same where all are."""
     low, high = ends[0] if values.ndim == 1 else ends.T

@@ -230,8 +230,7 @@ class SensorLoss:
         ]
         if self.matrix is not None:
             lines.append(f"{self._whose}: loses {self.matrix} at most over {low:.4g} to {high:.4g} degC")
-        residual = self.residual
-        if residual is not None:
+        if (residual := self.residual) is not None:
             lines.append(f"{self._whose}: the map itself leaves {sensor.text(residual)} {sensor.shown} rms")
         return lines
 
@@ -282,12 +281,9 @@ def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
     `steps` are values (N, d): the first what should be given, under any name; each further one under what makes it
     differ from the one before. A step that changes nothing is left out.
     """
-    costs = {}
-    for (_, before), (what, after) in pairwise(steps.items()):
-        change = np.asarray(after, dtype=np.float64) - before
-        if np.any(change):
-            costs[what] = Deviation.of(change)
-    return costs
+    pairs = pairwise(steps.items())
+    changes = {what: np.asarray(after, dtype=np.float64) - before for (_, before), (what, after) in pairs}
+    return {what: Deviation.of(change) for what, change in changes.items() if np.any(change)}
 
 
 def seen_in_a_warm_up(sensor: Calibrated) -> Calibrated:

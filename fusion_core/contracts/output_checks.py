@@ -149,7 +149,7 @@ _STEPS = instance(
     Transition,
     F=array("F", "n n", "N n n", why=OF_STATES),
     Q=array("Q", "n n", "N n n", why=OF_STATES, covariance=True),
-    u=array("u", "n", "N n", why=OF_STATES, finite=False),
+    u=array("the drift u", "n", "N n", why=OF_STATES),
     C=array("C", "d n", "N d n", why=OF_STATES, optional=True),
 )
 _MEASUREMENT = instance(  # what is not used may be anything
@@ -172,16 +172,11 @@ def check_prior(model: BiasModel | MeasurementModel, prior: Prior, *arguments: o
 
 def check_transition(model: BiasModel, step: Transition, chunk: Chunk | int, memory: Memory = None) -> Transition:
     """Raise PluginError where N steps are not F, Q (n, n) or (N, n, n), u (n,) or (N, n) and C (d, n) or (N, d, n)."""
-    _check_steps(model, step, chunk)
+    _STEPS(model, step, chunk)
     n, d = len(model.labels), len(model.axes)
     if step.C is None and n != d:
         raise plugin_error(model, f"has {n} labels for {d} axes and no C; a C ({d}, {n}) says how the bias follows")
     return step
-
-
-def _check_steps(model: BiasModel | MeasurementModel, step: Transition, chunk: Chunk | int) -> None:
-    _STEPS(model, step, chunk)
-    expect_finite(model, "the drift u", step.u)
 
 
 def sensors(model: MeasurementModel, answer: Any) -> tuple[Sensor, ...]:
@@ -211,7 +206,7 @@ def equations(
     if built_in(model):  # held by its laws, and its bias blocks are checked; uneven epochs ask a few hundred at a time
         return answer  # type: ignore[no-any-return]
     step, measured = _pair(model, "equations", answer, "the steps and the measurement")
-    _check_steps(model, step, chunk)
+    _STEPS(model, step, chunk)
     _MEASUREMENT(model, measured, chunk)
     used, z, H, R = measured.used, measured.z, measured.H, measured.R
     if not used.all():  # what is not used is not looked at

@@ -30,6 +30,7 @@ from pydantic import model_validator
 
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import Effect, Memory, Prior, ThermalBias, ThermalMap, Transition
+from fusion_core.contracts.effect import as_measured
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -190,7 +191,7 @@ class ThermalDerivative(ThermalBias):
         d, factors = len(self.axes), []
         fadings, left = list(before.fadings), list(before.left)
         if self._starts:
-            chunk = _as_measured(chunk)
+            chunk = as_measured(chunk)
         for k in self._starts:
             factor, fadings[k] = self.effects[k].fading(chunk, before.fadings[k])
             if factor is None:  # nothing is unknown as it is configured
@@ -208,7 +209,7 @@ class ThermalDerivative(ThermalBias):
         """Return the chunk with the temperature that the map sees."""
         after = []
         if any(effect.acts_on_input for effect in self.effects):
-            chunk = _as_measured(chunk)
+            chunk = as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             if effect.acts_on_input:
                 T, memory = effect.input(chunk, memory)
@@ -220,7 +221,7 @@ class ThermalDerivative(ThermalBias):
         """Return the sum of the calibrated effects (N, d), the signatures (N, d, p) of the others, and the memories."""
         g, S, after = np.zeros((len(chunk), len(self.axes))), [], []
         if self.effects:
-            chunk = _as_measured(chunk)
+            chunk = as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             signature, memory = effect.held(chunk, memory)
             after.append(memory)
@@ -234,8 +235,3 @@ class ThermalDerivative(ThermalBias):
             else:
                 g = g + signature @ np.asarray(effect.coefficients)
         return g, S, after
-
-
-def _as_measured(chunk: Chunk) -> Chunk:
-    """Return the chunk as effects see it: an application's own smoothing of the temperature is none of theirs."""
-    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk

@@ -40,7 +40,7 @@ WRONG = {
     "indefinite Q": ("Q", np.array([[1.0, 2.0], [2.0, 1.0]]), "Q is not a covariance"),
     "lopsided Q": ("Q", np.array([[1.0, 0.5], [0.0, 1.0]]), "Q is not a covariance"),
     "infinite u": ("u", np.array([0.0, np.inf]), "the drift u is not finite"),
-    "shape of u": ("u", np.zeros(3), r"u has shape \(3,\)"),
+    "shape of u": ("u", np.zeros(3), r"the drift u has shape \(3,\)"),
     "NaN in C": ("C", np.full((2, 2), np.nan), "C is not finite"),
     "shape of C": ("C", np.eye(3), r"C has shape \(3, 3\), its 2 labels ask for \(2, 2\) or \(4, 2, 2\)"),
 }
