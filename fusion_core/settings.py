@@ -29,13 +29,10 @@ from fusion_core.units import problem
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
     folder = (info.context or {}).get("folder")
-    text = None
     if isinstance(value, int | float):
-        text = f"{value} is a number, a path is text; write it in quotes"
-    elif isinstance(value, str) and not can_be_path(value):
-        text = f"'{quote(value)}' cannot be a path; write a shorter one"
-    if text is not None:
-        raise problem(text)
+        raise problem(f"{value} is a number, a path is text; write it in quotes")
+    if isinstance(value, str) and not can_be_path(value):
+        raise problem(f"'{quote(value)}' cannot be a path; write a shorter one")
     return folder / value if folder and isinstance(value, str) and value != "-" else value
 
 

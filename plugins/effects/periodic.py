@@ -11,7 +11,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import varied
+from fusion_plugins.effects.common import longest_span, varied
 
 _LINES = 3  # highest lines that are tried
 _CYCLES = 10  # within the longest recording that a line has at least: fewer pass for a drift
@@ -77,7 +77,7 @@ def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
     """Return the period near this one at which one sine and cosine fit all recordings best: they share a clock."""
     t = np.concatenate([chunk.t for chunk in recordings])
     e = np.concatenate([np.nan_to_num(chunk["residual"]) for chunk in recordings])
-    longest = max(float(chunk.t[-1] - chunk.t[0]) for chunk in recordings)
+    longest = longest_span(recordings)
     whole = float(np.ptp(t))
     steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MAX_FREQUENCIES)
     f = 1 / period + np.linspace(-1, 1, 2 * steps + 1) / longest
