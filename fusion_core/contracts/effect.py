@@ -264,7 +264,7 @@ def as_measured(chunk: Chunk) -> Chunk:
 
 def _clipped(values: Array, ends: Array) -> Array:
     """Return values (N,) or (N, columns) within the ends (columns, 2): the very same where all are."""
-    low, high = ends[0] if values.ndim == 1 else ends.T
+    low, high = ends.T
     return values if np.all((values >= low) & (values <= high)) else np.clip(values, low, high)
 
 

@@ -110,13 +110,8 @@ def it_holds_beyond_its_domain(effect: Effect) -> None:
         low, high = np.asarray(limited.regressors).T
         assert np.all((whole == 0) | ((whole >= low) & (whole <= high))), "a regressor is beyond its ends"
     else:
-        inside = {name: np.clip(chunk[name], *_ends_of(limited, name, chunk)) for name in limited.domain or {}}
+        inside = {name: np.clip(chunk[name], *limited.ends(name).T) for name in limited.domain or {}}
         np.testing.assert_array_equal(effect.signature(chunk.having(**inside), None)[0], whole)
-
-
-def _ends_of(effect: Effect, name: str, chunk: Chunk) -> tuple[Array, Array]:
-    low, high = effect.ends(name).T
-    return (low, high) if chunk[name].ndim > 1 else (low[0], high[0])
 
 
 def _within_half(effect: Effect, chunk: Chunk) -> Effect:

@@ -21,8 +21,6 @@ def _epochs(model: MeasurementModel, site: Site = SITE, N: int = 400) -> Chunk:
     channels |= {name: np.zeros((N, d)) for name, d in columns.items()}
     channels |= model.simulated(N, site, np.random.default_rng(0))
     channels |= {"tau": np.full(N, tau), "dt": np.full(N, tau)}
-    for values in channels.values():
-        values.setflags(write=False)
     return Chunk(tau * np.arange(1.0, N + 1), channels, sensors=frozenset(s.channel for s in model.sensors))
 
 

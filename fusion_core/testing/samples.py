@@ -30,7 +30,7 @@ def recording(channels: Iterable[str], *, regular: bool, columns: Mapping[str, i
     dt = np.full(N, 0.5) if regular else rng.choice([0.1, 0.1, 0.3, 5.0, 100.0], N)
     t = np.cumsum(dt)
     made = {name: _values(name, t, rng, columns.get(name)) for name in channels if name != "dt"}
-    return _frozen(Chunk(t, {**made, "dt": dt}))
+    return Chunk(t, {**made, "dt": dt})
 
 
 def pieces(chunk: Chunk, cuts: tuple[int, ...]) -> Iterator[Chunk]:
@@ -50,12 +50,6 @@ def _values(name: str, t: Array, rng: np.random.Generator, columns: int | None) 
         return T
     axes = USUAL[name].axes if name in USUAL else 1
     return rng.normal(size=(len(t), axes)) if axes and axes > 1 else rng.normal(size=len(t))
-
-
-def _frozen(chunk: Chunk) -> Chunk:
-    for values in (chunk.t, *chunk.channels.values()):
-        values.setflags(write=False)
-    return chunk
 
 
 def joined(method: Method, chunk: Chunk, cuts: tuple[int, ...]) -> dict[str, Array]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, read_only
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import DataError, MapError, OutsideDomain
 from fusion_core.testing.samples import check_refused
@@ -25,9 +25,7 @@ def soak(d: int = 3) -> tuple[Array, Array]:
     rng = np.random.default_rng(0)
     T = np.concatenate([np.linspace(LOW, HIGH, 3000), np.linspace(HIGH, LOW, 3000)])
     bias = 1e-3 * _curves(T)[:, :d] + 1e-5 * rng.normal(size=(len(T), d))
-    T.setflags(write=False)
-    bias.setflags(write=False)
-    return T, bias
+    return read_only(T), read_only(bias)
 
 
 def _curves(T: Array) -> Array:
