@@ -22,6 +22,7 @@ Source: ArduPilot, libraries/AP_Logger/LogStructure.h and README.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from struct import calcsize
 from typing import NamedTuple
 
 import numpy as np
@@ -35,9 +36,14 @@ PIECE = 1 << 22  # bytes between two looks at the clock, and of a mapped log tha
 Into = tuple[Integers, Bytes, Integers, Integers]
 State = tuple[int, int, int, int, int, int]
 
-SIZES = {"a": 64, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "f": 4, "d": 8, "n": 4, "N": 16, "Z": 64, "c": 2,
-         "C": 2, "e": 4, "E": 4, "L": 4, "M": 1, "q": 8, "Q": 8, "g": 2}  # fmt: skip
-"""Bytes of a field by the letter of its format."""
+PACKED = {
+    "b": "b", "B": "B", "M": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "g": "e", "q": "q",
+    "Q": "Q", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "a": "64s",
+}  # fmt: skip
+"""A field by the letter of its format, as `struct` writes it."""
+
+SIZES = {letter: calcsize(f"<{code}") for letter, code in PACKED.items()}  # bytes
+CODES = {letter: f"<{code}" for letter, code in PACKED.items() if not code.endswith("s")} | {"a": "(32,)<i2"}  # numbers
 
 HEAD, SECOND, FMT, FMT_LENGTH = 0xA3, 0x95, 128, 89
 _LETTERS = np.zeros(256, dtype=np.int64)
@@ -167,9 +173,6 @@ def _format_size(data: Bytes, pos: int, letters: Integers) -> int:
     return size
 
 
-CODES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "c": "<i2", "H": "<u2", "C": "<u2", "i": "<i4", "e": "<i4",
-         "L": "<i4", "I": "<u4", "E": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8", "g": "<f2",
-         "a": "(32,)<i2"}  # fmt: skip
 DIVISORS = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "SampleUS": 1e-6}
 """Fields that are times since power-up, and their unit in s."""

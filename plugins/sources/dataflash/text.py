@@ -19,13 +19,9 @@ from pathlib import Path
 
 from fusion_core.budget import COPIED, keep, temporary_folder, unpacked_at_most
 from fusion_core.faults import Faults
-from fusion_plugins.sources.dataflash.scan import DIVISORS, FMT, FMT_LENGTH, SIZES
+from fusion_plugins.sources.dataflash.scan import DIVISORS, FMT, FMT_LENGTH, PACKED, SIZES
 
 HEAD = b"\xa3\x95"
-PACKED = {
-    "b": "b", "B": "B", "M": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "g": "e", "q": "q",
-    "Q": "Q", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "a": "64s",
-}  # fmt: skip
 
 
 @contextmanager
