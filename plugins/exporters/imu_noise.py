@@ -119,10 +119,10 @@ class ImuNoise(Exporter):
             left_out += [f"{sensor.channel}: {loss} at most" for sensor, loss in lost]
         notes = (note for sensor in noise.values() for note in sensor.notes)
         loss = Loss((), tuple(left_out), (*notes, *self.notes(what)))
-        first, *rest = self.text(what, rate, noise)
-        head = [first] if first.startswith("%") else []
-        comments = [comment(line) for line in self._comments(what, noise, loss)]
-        path.write_text("\n".join([*head, *comments, *([] if head else [first]), *rest]) + "\n", encoding="utf-8")
+        lines = self.text(what, rate, noise)
+        begin = int(lines[0].startswith("%"))  # a directive stands before all else
+        lines[begin:begin] = [comment(line) for line in self._comments(what, noise, loss)]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss
 
     def _comments(self, what: Export, noise: dict[str, SensorNoise], loss: Loss) -> Iterator[str]:
