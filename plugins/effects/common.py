@@ -60,6 +60,12 @@ def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
     return sorted(name for name in core.auxiliary(recordings) if not name.startswith("temperature"))
 
 
+def scalars(recordings: Sequence[Chunk]) -> list[str]:
+    """Return temperature, where it is recorded, and the auxiliary channels, of those that have one column."""
+    first = recordings[0].channels
+    return [name for name in ("temperature", *auxiliary(recordings)) if name in first and first[name].ndim == 1]
+
+
 def longest_span(recordings: Sequence[Chunk]) -> float:
     """Return the length of the longest recording, in s."""
     return max(float(chunk.t[-1] - chunk.t[0]) for chunk in recordings)

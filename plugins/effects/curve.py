@@ -12,7 +12,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.effects.common import OfChannel, auxiliary, varied
+from fusion_plugins.effects.common import OfChannel, scalars, varied
 
 _MAX_POWERS = 3  # powers
 
@@ -51,9 +51,7 @@ class Curve(OfChannel):
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the candidates for temperature and every auxiliary channel of one column that moves, over its range."""
-        for name in ("temperature", *auxiliary(recordings)):
-            if name not in recordings[0].channels or recordings[0][name].ndim > 1:
-                continue
+        for name in scalars(recordings):
             u = np.concatenate([chunk[name] for chunk in recordings])
             low, high = float(np.min(u)), float(np.max(u))
             if low < high:

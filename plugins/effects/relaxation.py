@@ -12,7 +12,7 @@ from fusion_core.contracts import Memory, on_each_axis
 from fusion_core.contracts.effect import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.common import FadingLag, OfChannel, auxiliary, lag_of, longest_span, up_to, varied
+from fusion_plugins.effects.common import FadingLag, OfChannel, lag_of, longest_span, scalars, up_to, varied
 
 _SHORTEST, _LONGEST = 20.0, 36_000.0  # s
 _OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
@@ -42,20 +42,16 @@ class Relaxation(FadingLag, OfChannel):
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 20 s to 10 h."""
-        count = _OF_TEMPERATURE if self.channel == "temperature" else _OF_CHANNEL
-        return varied(self, "tau", np.geomspace(_SHORTEST, _LONGEST, count).tolist())
+        return varied(self, "tau", _grid(self.channel).tolist())
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield the grid for temperature and for every auxiliary channel of one column, up to half the longest span."""
         most = _OF_SPAN * longest_span(recordings)
-        names = [name for name in ("temperature", *auxiliary(recordings)) if name in recordings[0].channels]
-        for name in names:
-            count = _OF_TEMPERATURE if name == "temperature" else _OF_CHANNEL
-            if recordings[0][name].ndim == 1:
-                # what follows the temperature itself, late or not, is the map's
-                for form in ("relaxed",) if name == "temperature" else ("relaxed", "late"):
-                    acting = self.model_copy(update={"channel": name, "form": form})
-                    yield from varied(acting, "tau", up_to(np.geomspace(_SHORTEST, _LONGEST, count), most))
+        for name in scalars(recordings):
+            # what follows the temperature itself, late or not, is the map's
+            for form in ("relaxed",) if name == "temperature" else ("relaxed", "late"):
+                acting = self.model_copy(update={"channel": name, "form": form})
+                yield from varied(acting, "tau", up_to(_grid(name), most))
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return u - lag(u), or lag(u), from equilibrium; the memory is the last u and the last output of the lag."""
@@ -78,3 +74,8 @@ class Relaxation(FadingLag, OfChannel):
         """Of the channel: kelvin, or its SI unit."""
         thermometer = self.channel.startswith("temperature")
         return ("bias/K" if thermometer else "bias per SI unit of the channel",) * len(self.labels)
+
+
+def _grid(channel: str) -> Array:
+    """Return the time constants to try, s."""
+    return np.geomspace(_SHORTEST, _LONGEST, _OF_TEMPERATURE if channel == "temperature" else _OF_CHANNEL)
