@@ -69,8 +69,7 @@ def read_document(path: Path, products: Mapping[str, Path] | None = None, chain:
         raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
     if len(chain) > LONGEST:
         raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
-    data, lines = parse(path)
-    return _extended(Document(path, data, lines), products or {}, (*chain, real))
+    return _extended(Document(path, *parse(path)), products or {}, (*chain, real))
 
 
 def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] | None = None) -> Document:
@@ -83,8 +82,7 @@ def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] |
     """
     if isinstance(content, str):
         path = Path("YAML text")
-        data, lines = parse(path, content.encode("utf-8", "surrogatepass"))
-        return _extended(Document(path, data, lines), products or {}, ())
+        return _extended(Document(path, *parse(path, content.encode("utf-8", "surrogatepass"))), products or {}, ())
     return _extended(Document(Path("config"), dict(content)), products or {}, ())
 
 
