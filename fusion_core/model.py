@@ -7,8 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from fusion_core.chunk import Array, Integers
-from fusion_core.chunk import Flags as Flags
+from fusion_core.chunk import Array, Flags, Integers
 
 
 @dataclass(frozen=True)

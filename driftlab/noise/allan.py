@@ -29,10 +29,9 @@ from functools import partial
 
 import numpy as np
 
-from driftlab.noise.allan_model import PRESENT, AllanCurve, Bridge, Index, octaves
-from fusion_core.chunk import Array
+from driftlab.noise.allan_model import PRESENT, AllanCurve, Bridge, octaves
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.fast import compiled
-from fusion_core.model import Flags
 
 PER_DECADE = 10  # averaging times; nearer ones are so correlated that they show nothing more
 COVERED = 3  # averaging times that all differences cover: a fewer-than-three-fold mean says nothing
@@ -40,10 +39,12 @@ ORDER = 3  # of the Hadamard difference: averaging times in the shortest stretch
 FINE = 64  # overlaps in one averaging time; more of them are so alike that the mean does not move
 LONG = 2**20  # samples up to which every overlap is taken all the same
 REACH = 0.45  # of an averaging time: differences nearer than that tell the same, at white noise and at walks
-Sums = tuple[Array, Index, Index, Index]
+Sums = tuple[Array, Integers, Integers, Integers]
+Sizes = tuple[int, int, int, int]  # of an average in rows and in samples, the least of these, and the reach of pairs
+Grid = tuple[Integers, Integers, Integers, Integers]  # stretches, missing, spans, and the places of these
 
 
-def factors(lengths: int | Index) -> Index:
+def factors(lengths: int | Integers) -> Integers:
     """Return the numbers m of samples to average over, evenly spread on a logarithmic scale.
 
     They go from 1 to a fifth of a single stretch; of several, `lengths` (S,), to the longest averaging time whose
@@ -61,7 +62,11 @@ def factors(lengths: int | Index) -> Index:
 
 
 def curve(
-    rate: Array, dt: float, m: Index | None = None, stretches: Index | None = None, missing: Index | None = None
+    rate: Array,
+    dt: float,
+    m: Integers | None = None,
+    stretches: Integers | None = None,
+    missing: Integers | None = None,
 ) -> AllanCurve:
     """Return the overlapping Allan and Hadamard deviations of samples `rate` (N,), dt seconds apart.
 
@@ -99,12 +104,11 @@ def curve(
     return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt)
 
 
-def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, Index, Index]) -> AllanCurve:
-    """Return the curve over spans with gaps: `grid` is stretches, missing, spans and their places."""
-    stretches, missing, parts, whole = grid
-    wanted = m is not None
+def _bridged(rate: Array, dt: float, m: Integers | None, grid: Grid) -> AllanCurve:
+    """Return the curve over spans with gaps."""
+    wanted, whole = m is not None, grid[-1]
     m, stride = _sizes(factors(whole) if m is None else m, int(np.sum(whole)))
-    squares, bridge = bridged(rate, stretches, missing, parts, m, stride)
+    squares, bridge = bridged(rate, grid, m, stride)
     second, third = bridge.differences
     # where m was rounded to the stride it may be a little longer than `factors` has it
     enough = third > 0 if wanted else (second >= 0.8 * COVERED * m) & (third >= m / 2)
@@ -113,7 +117,7 @@ def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, 
     return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[enough], whole, dt, bridge.of(enough))
 
 
-def _sizes(m: Index, N: int) -> tuple[Index, Index]:
+def _sizes(m: Integers, N: int) -> tuple[Integers, Integers]:
     """Return m as multiples of the stride over N samples, and the stride."""
     m = np.asarray(m, dtype=np.int64)
     stride = np.array([_stride(int(k), N) for k in m], dtype=np.int64)
@@ -129,7 +133,7 @@ def _stride(m: int, N: int) -> int:
 
 
 @compiled
-def _sums(rate: Array, stretches: Index, dt: float) -> tuple[Array, Index]:
+def _sums(rate: Array, stretches: Integers, dt: float) -> tuple[Array, Integers]:
     """Return x of one stretch after the other, a zero before each, and where each begins (S + 1,).
 
     Without their mean the sums do not grow with N, and their rounding stays far below the noise.
@@ -152,7 +156,7 @@ def _sums(rate: Array, stretches: Index, dt: float) -> tuple[Array, Index]:
 
 
 @compiled
-def _thinned_rows(edges: Index, stride: int) -> tuple[Index, Index]:
+def _thinned_rows(edges: Integers, stride: int) -> tuple[Integers, Integers]:
     """Return every so-manyth row between edges (S + 1,), from each on, and the edges of these rows."""
     few = np.zeros_like(edges)
     for i in range(len(edges) - 1):
@@ -165,7 +169,7 @@ def _thinned_rows(edges: Index, stride: int) -> tuple[Index, Index]:
 
 
 @partial(compiled, fastmath={"reassoc"})
-def _mean_squares(x: Array, places: Index, m: int) -> tuple[float, float]:
+def _mean_squares(x: Array, places: Integers, m: int) -> tuple[float, float]:
     """Return the mean squares of the second and of the third differences of x over m samples."""
     squares = cubes = 0.0
     seconds = thirds = 0
@@ -188,7 +192,7 @@ def _mean_squares(x: Array, places: Index, m: int) -> tuple[float, float]:
     return squares / seconds, cubes / thirds
 
 
-def spans(lengths: Index, missing: Index) -> Index:
+def spans(lengths: Integers, missing: Integers) -> Integers:
     """Return first stretch and end (P, 2) of the spans between gaps that no window can bridge.
 
     A gap is within a span where some interval around it has PRESENT of its samples. Such intervals cover a span at
@@ -203,7 +207,7 @@ def spans(lengths: Index, missing: Index) -> Index:
     return np.stack([edges[:-1], edges[1:]], axis=1).astype(np.int64)
 
 
-def places(lengths: Index, missing: Index, parts: Index) -> Index:
+def places(lengths: Integers, missing: Integers, parts: Integers) -> Integers:
     """Return the places of the time grid in each span (P,), lost samples included."""
     if not len(parts):
         return np.empty(0, dtype=np.int64)
@@ -212,24 +216,21 @@ def places(lengths: Index, missing: Index, parts: Index) -> Index:
     return np.asarray(np.add.reduceat(lengths + behind, parts[:, 0]), dtype=np.int64)
 
 
-def bridgeable(lengths: Index, missing: Index) -> tuple[Index, Index]:
+def bridgeable(lengths: Integers, missing: Integers) -> tuple[Integers, Integers]:
     """Return the spans (P, 2) that are long enough for a difference, and their places (P,)."""
     parts = spans(lengths, missing)
     whole = places(lengths, missing, parts)
     return parts[whole >= ORDER], whole[whole >= ORDER]
 
 
-def bridged(
-    rate: Array, stretches: Index, missing: Index, parts: Index, m: Index, stride: Index
-) -> tuple[Array, Bridge]:
+def bridged(rate: Array, grid: Grid, m: Integers, stride: Integers) -> tuple[Array, Bridge]:
     """Return mean squares (J, 2) of the differences of means over m places, second and third, and their basis.
 
-    Rates (N,), `stretches` (S, 2) and `missing` (S - 1,) are those of `curve`, `parts` (P, 2) those of `spans`; m (J,)
-    is a multiple of the `stride` (J,), which says which overlaps are taken.
+    Rates (N,), stretches (S, 2) and `missing` (S - 1,) are those of `curve`, spans (P, 2) those of `spans`; m (J,) is a
+    multiple of the `stride` (J,), which says which overlaps are taken.
     """
-    lengths = np.diff(stretches, axis=1)[:, 0]
-    whole = places(lengths, missing, parts)
-    group = octaves(whole)
+    stretches, missing, parts, whole = grid
+    lengths, group = np.diff(stretches, axis=1)[:, 0], octaves(whole)
     full = _bridged_sums(rate, stretches, np.append(missing, 0), parts, whole)
     thinned = {1: full}
     for s in set(stride.tolist()) - {1}:
@@ -259,7 +260,7 @@ def bridged(
 
 
 @compiled
-def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, whole: Index) -> Sums:
+def _bridged_sums(rate: Array, stretches: Integers, behind: Integers, parts: Integers, whole: Integers) -> Sums:
     """Return sums over one span after the other, a zero before each, and where each begins (P + 1,).
 
     They are of the samples less their mean, of samples that are there, and of runs of such: twice their number, and
@@ -297,13 +298,13 @@ def _bridged_sums(rate: Array, stretches: Index, behind: Index, parts: Index, wh
 
 
 @compiled
-def _number(runs: Index, a: int, b: int) -> int:
+def _number(runs: Integers, a: int, b: int) -> int:
     """Return the number of runs of samples in the window from a to b; one that began before it, too."""
     return int((runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1))
 
 
 @compiled
-def _window(grid: Sums, sizes: tuple[int, int, int, int], group: Index, sums: Array, taken: Array) -> tuple[int, int]:
+def _window(grid: Sums, sizes: Sizes, group: Integers, sums: Array, taken: Array) -> tuple[int, int]:
     """Add up the differences over m places; return the pieces that they cover without a break, and their samples.
 
     To `sums` (2, 3) go squares, and the variances of white noise and of the angle's; to `taken` (2, 4, G) how many

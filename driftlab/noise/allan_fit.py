@@ -182,7 +182,8 @@ def _limits(model: Design, v: Array, wanted: list[int]) -> NoiseLimits:
     for c in wanted:
         trial = ProfileTrial(model, v, c, error)
         chance[c] = trial.exceeds(0.0)
-        low[c], high[c] = _interval(trial, theta)
+        start = float(np.sqrt(theta[c]))
+        low[c], high[c] = _lower(trial, start), _upper(trial, max(start, 1e-3 * trial.visible))
     needed = _needed(model, v, [c for c in wanted if low[c] == 0], chance, error)
     estimate = _estimate(model, v, needed, error)
     for c in wanted:
@@ -304,12 +305,6 @@ class ProfileTrial:
         drawn = np.column_stack([self.v, model.draw(theta, self.error)])
         estimates = _nonnegative(model.A[:, free], drawn, weight)[free.index(c)]
         return estimates[1:], float(estimates[0])
-
-
-def _interval(trial: ProfileTrial, theta: Array) -> tuple[float, float]:
-    """Return the limits of the trial's coefficient; theta (p,) is the estimate, squared."""
-    value = float(np.sqrt(theta[trial.c]))
-    return _lower(trial, value), _upper(trial, max(value, 1e-3 * trial.visible))
 
 
 def _lower(trial: ProfileTrial, start: float) -> float:

@@ -16,11 +16,8 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
-
-Index = NDArray[np.int64]
+from fusion_core.chunk import Array, Flags, Integers
 
 KEYS = ("quantization", "white", "bias_instability", "rate_random_walk", "rate_ramp")
 WHITE = KEYS.index("white")
@@ -37,17 +34,17 @@ LINES = 12  # lines of the periodogram that are bands of their own, from the low
 class Bridge:
     """Basis of averaging times where gaps are bridged; of second differences, then of third ones."""
 
-    stretches: Index  # (S,) samples of each stretch without a gap
-    gaps: Index  # (B,) samples lost in each gap that is bridged
+    stretches: Integers  # (S,) samples of each stretch without a gap
+    gaps: Integers  # (B,) samples lost in each gap that is bridged
     differences: Array  # (2, J) how many differences count
     white: Array  # (2, J) factor on the variance of white noise, beside that without lost samples
     angle: Array  # (2, J) the same of quantisation
     part: Array  # (2, G, J) of the differences of G groups of spans, the part that counts
     square: Array  # (2, G, J) the same of the pairs of them that tell the same
-    pieces: Index  # (J,) pieces without a gap that is not bridged, which the differences cover
-    samples: Index  # (J,) of these pieces
+    pieces: Integers  # (J,) pieces without a gap that is not bridged, which the differences cover
+    samples: Integers  # (J,) of these pieces
 
-    def of(self, kept: NDArray[np.bool_]) -> Bridge:
+    def of(self, kept: Flags) -> Bridge:
         """Return the same for some of the averaging times, as `kept` (J,) says."""
         each = {f.name: getattr(self, f.name) for f in fields(self)}
         return Bridge(**{name: v if name in ("stretches", "gaps") else v[..., kept] for name, v in each.items()})
@@ -65,13 +62,13 @@ class AllanCurve:
     tau: Array
     allan: Array
     hadamard: Array
-    stride: Index
-    lengths: Index
+    stride: Integers
+    lengths: Integers
     dt: float
     bridge: Bridge | None = None
 
     @property
-    def m(self) -> Index:
+    def m(self) -> Integers:
         """Samples in each averaging time (J,)."""
         return np.rint(self.tau / self.dt).astype(np.int64)
 
@@ -81,7 +78,7 @@ class AllanCurve:
         return np.asarray(1 - 1.5 * (self.hadamard / self.allan) ** 2)
 
     @property
-    def stretches(self) -> Index:
+    def stretches(self) -> Integers:
         """Samples of each stretch without a gap (S,)."""
         return self.lengths if self.bridge is None else self.bridge.stretches
 
@@ -94,7 +91,7 @@ class AllanCurve:
         return np.asarray(least[least <= self.tau[-1] * (1 + 1e-9)])
 
     @property
-    def counts(self) -> Index:
+    def counts(self) -> Integers:
         """Number of stretches behind each averaging time (J,), bridged ones as one."""
         if self.bridge is not None:
             return self.bridge.pieces
@@ -147,9 +144,8 @@ class Design:
 
     tau: Array  # (J,) averaging times, s
     A: Array  # (J, p) variance of each term at coefficient one
-    classes: tuple[
-        Class, ...
-    ]  # stretches of like lengths; their W sum to A over bands and classes, where that is no loss
+    # stretches of like lengths; their W sum to A over bands and classes, where that is no loss
+    classes: tuple[Class, ...]
 
     @cached_property
     def variates(self) -> list[Array]:
@@ -227,7 +223,7 @@ def alike(correlation: float, n: int, white: float, tolerance: float) -> bool:
     return bool(correlation - white > max(tolerance, SURE / np.sqrt(n)))
 
 
-def octaves(lengths: Index) -> Index:
+def octaves(lengths: Integers) -> Integers:
     """Return by how many factors of two, rounded down, each of lengths (S,) is shorter than the longest: 0, 1, ...
 
     Numbers that none has are left out.
@@ -261,7 +257,7 @@ def _classes(curve: AllanCurve, A: Array, order: int) -> Iterator[Class]:
         yield Class(number, share, W, number * shape, power)
 
 
-def _differences(N: Index, n: Index, m: int, order: int) -> tuple[float, float]:
+def _differences(N: Integers, n: Integers, m: int, order: int) -> tuple[float, float]:
     """Return the number of differences of n stretches of N samples, and the sum of their squares, by information.
 
     The mean over one stretch has a relative variance of c / (N - ENDS m): for differences at all places, fewer than

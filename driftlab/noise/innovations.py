@@ -26,10 +26,9 @@ import numpy as np
 from scipy import special
 
 from driftlab.noise.local_level import LevelLikelihood, minimum_near
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import Factor, Inflation, Lag
 from fusion_core.errors import SingularFit
-from fusion_core.model import Flags
 
 LAGS = (10.0, 60.0, 600.0, 3600.0)  # s
 MIN_DIFFERENCES = 8  # at a lag: with fewer it says nothing

@@ -204,18 +204,12 @@ def effective(e: Array, s: Array, *, walking: bool) -> float:
 
 def falling(power: Array) -> Array:
     """Return a periodogram (m,) smoothed over wider and wider bands, and never rising with frequency."""
+    from scipy.optimize import isotonic_regression
+
     edges = np.unique(np.round(np.geomspace(1, len(power) + 1, 25)).astype(int)) - 1
-    values = np.add.reduceat(power, edges[:-1])
-    sizes = np.diff(edges).astype(float)
-    pooled: list[list[float]] = []  # adjacent violators: value, weight, count of bands
-    for value, size in zip(values / sizes, sizes, strict=True):
-        pooled.append([value, size, 1])
-        while len(pooled) > 1 and pooled[-1][0] > pooled[-2][0]:
-            high, low = pooled.pop(), pooled.pop()
-            weight = high[1] + low[1]
-            pooled.append([(high[0] * high[1] + low[0] * low[1]) / weight, weight, high[2] + low[2]])
-    bands = np.concatenate([np.full(int(count), value) for value, _, count in pooled])
-    return np.repeat(bands, sizes.astype(int))
+    sizes = np.diff(edges)
+    means = np.add.reduceat(power, edges[:-1]) / sizes
+    return np.repeat(isotonic_regression(means, weights=sizes, increasing=False).x, sizes)
 
 
 def _of_walk(power: Array) -> Array:

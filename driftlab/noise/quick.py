@@ -15,8 +15,7 @@ import numpy as np
 
 from driftlab.noise.allan import curve
 from driftlab.noise.local_level import LevelLikelihood
-from fusion_core.chunk import Array
-from fusion_core.model import Flags
+from fusion_core.chunk import Array, Flags
 
 MIN_SAMPLES = 200  # of a stretch
 WINDOWS = 20  # in which the rows are looked at

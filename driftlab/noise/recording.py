@@ -13,7 +13,6 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.config import Config
 from driftlab.noise.allan import bridgeable, curve
@@ -23,14 +22,11 @@ from driftlab.recordings.epochs import GAP, epochs
 from driftlab.recordings.plausibility import axes_in
 from driftlab.recordings.screening import read
 from driftlab.units import axis_name
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Array, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor
 from fusion_core.errors import DataError
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import Participant, participants
-from fusion_core.model import Flags
-
-Index = NDArray[np.int64]
 
 MIN_SAMPLES = 100  # in all that an Allan deviation needs
 MIN_STRETCH = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
@@ -48,7 +44,7 @@ class RestWindows:
 
     t_0: float
     length: float
-    numbers: Index
+    numbers: Integers
     still: Flags
 
     @property
@@ -94,10 +90,12 @@ def at_rest(settings: MeasurementModel, samples: Chunk) -> RestWindows:
 class Pieces:
     """The usable samples of a recording, cut at gaps and at rows that are not usable."""
 
-    rows: Index  # (S, 2) first row and end of each piece, of one row too
-    missing: Index  # (S - 1,) samples lost behind each piece but the last; NEVER: rows that are not usable lie between
-    parts: Index  # (P, 2) first piece of each span whose gaps can be bridged, and the piece after its last
-    places: Index  # (P,) samples that each span would have without a gap
+    rows: Integers  # (S, 2) first row and end of each piece, of one row too
+    missing: (
+        Integers  # (S - 1,) samples lost behind each piece but the last; NEVER: rows that are not usable lie between
+    )
+    parts: Integers  # (P, 2) first piece of each span whose gaps can be bridged, and the piece after its last
+    places: Integers  # (P,) samples that each span would have without a gap
     dt: float  # mean step of the spans, s
 
     @property
@@ -112,7 +110,7 @@ class Pieces:
         return self.samples >= MIN_SAMPLES and bool(np.max(self.places, initial=0) >= MIN_STRETCH)
 
     @property
-    def spans(self) -> Index:
+    def spans(self) -> Integers:
         """First row and end (P, 2) of each span."""
         return np.stack([self.rows[self.parts[:, 0], 0], self.rows[self.parts[:, 1] - 1, 1]], axis=1)
 
@@ -142,7 +140,7 @@ def pieces(t: Array, usable: Flags | None = None) -> Pieces:
     return replace(cut, dt=lasted / max(1, int(np.sum(cut.places - 1))))
 
 
-def _runs(t: Array, usable: Flags | None) -> Index:
+def _runs(t: Array, usable: Flags | None) -> Integers:
     if len(t) < 2:
         return np.empty((0, 2), dtype=np.int64)
     step = np.diff(t)
@@ -155,11 +153,11 @@ def _runs(t: Array, usable: Flags | None) -> Index:
     return stretches if usable is None else stretches[usable[stretches[:, 0]]]
 
 
-def limits(t: Array, stretches: Index) -> tuple[float, float]:
+def limits(t: Array, stretches: Integers) -> tuple[float, float]:
     """Return the shortest and the longest step within stretches (S, 2), s."""
     step = np.diff(t)
     stretches = stretches[np.diff(stretches, axis=1)[:, 0] > 1]
-    inside: Index = np.ravel(stretches - [0, 1]).astype(np.int64)  # steps from the first row to the last one
+    inside: Integers = np.ravel(stretches - [0, 1]).astype(np.int64)  # steps from the first row to the last one
     inside = inside[:-1] if inside[-1] == len(step) else inside
     low, high = (f.reduceat(step, inside.tolist())[::2] for f in (np.minimum, np.maximum))
     return float(low.min()), float(high.max())

@@ -21,14 +21,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Index = NDArray[np.int64]
 
 SPANS = 240  # of time, at most
 BLOCKS = 360  # about, at most
@@ -53,9 +51,9 @@ class Blocks:
     T: Array
     y: Array
     n: Array
-    of_sample: Index
+    of_sample: Integers
     fine: Array
-    nearest: Index
+    nearest: Integers
 
     @cached_property
     def over(self) -> csr_array:
@@ -69,7 +67,7 @@ class Blocks:
         stretches = min(STRETCHES, N)
         return self._spread(np.arange(N) * stretches // N, stretches)
 
-    def _spread(self, which: Index, count: int) -> csr_array:
+    def _spread(self, which: Integers, count: int) -> csr_array:
         from scipy.sparse import csr_array
 
         K = len(self.T)
@@ -77,7 +75,7 @@ class Blocks:
         of_block = places // count
         return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
 
-    def shares(self, group: Index, count: int) -> Array:
+    def shares(self, group: Integers, count: int) -> Array:
         """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
         K = len(self.T)
         table = np.bincount(group * K + self.of_sample, minlength=count * K).reshape(count, K)
@@ -88,7 +86,7 @@ Smoother = Callable[[Blocks, Array, int], Array]
 """Response of a kind of map to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
 
 
-def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
+def blocks_of(T: Array, left: Array, group: Integers | None = None) -> Blocks:
     """Return the blocks of samples T (N,) and what a curve leaves of them (N, d): spans of time, cut by temperature.
 
     A block is of one `group` (N,), where these are given, from 0 on.
@@ -111,7 +109,7 @@ def cells_of(T: Array, left: Array) -> Blocks:
     return summed(T, left, (np.cumsum(np.bincount(near) > 0) - 1)[near])
 
 
-def summed(T: Array, left: Array, of_sample: Index) -> Blocks:
+def summed(T: Array, left: Array, of_sample: Integers) -> Blocks:
     """Return samples T (N,) and (N, d) as blocks, of which `of_sample` (N,) are the numbers, from 0 on."""
     n = np.bincount(of_sample).astype(np.float64)
     y = np.stack([np.bincount(of_sample, column) / n for column in left.T], axis=1)

@@ -24,10 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import Alignment, Detector, Sensor
 from fusion_core.fast import compiled, inlined
-from fusion_core.model import Flags
 from fusion_plugins.measurement_models import alignment
 from fusion_plugins.measurement_models.alignment import steepest
 
