@@ -270,21 +270,8 @@ def _integrate(
 
 def errors_of(estimates: Mapping[str, Array], reference: Array) -> Array:
     """Return errors (N, 3 d) of bias and prediction less the reference (N, d), and the prediction's deviation."""
-    columns = (np.ascontiguousarray(estimates[n], dtype=np.float64) for n in ("bias", "coast", "coast_sigma"))
-    errors: Array = _errors(*columns, np.ascontiguousarray(reference))
-    return errors
-
-
-@compiled
-def _errors(bias: Array, coast: Array, sigma: Array, reference: Array) -> Array:
-    N, d = bias.shape  # rows of three take NumPy too long
-    errors = np.empty((N, 3 * d))
-    for k in range(N):
-        for j in range(d):
-            errors[k, j] = bias[k, j] - reference[k, j]
-            errors[k, d + j] = coast[k, j] - reference[k, j]
-            errors[k, 2 * d + j] = sigma[k, j]
-    return errors
+    bias, coast, sigma = (np.asarray(estimates[n], dtype=np.float64) for n in ("bias", "coast", "coast_sigma"))
+    return np.hstack([bias - reference, coast - reference, sigma])
 
 
 def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Scores:
