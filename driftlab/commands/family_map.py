@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from driftlab import __version__
-from driftlab.commands.console import say, terminal
+from driftlab.commands.console import say, say_lines, terminal
 from driftlab.commands.inputs import Progress
 from driftlab.commands.result import Result
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
+from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import UnitPosterior, unit_posterior
 from driftlab.family.unit_noise import soaked_of
 from driftlab.maps.fit import USUAL, fit_gathered, gather, map_settings
@@ -95,6 +96,14 @@ class FamilyMapResult(Result):
         self.written = (path,)
 
 
+def family_of(config: Config, path: Path) -> Family:
+    """Return the family of a config's tracked sensor; raises ConfigError, or MapError where it is another's."""
+    if config.filter is None:
+        raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
+    tracked = config.filter.tracked
+    return load_family(path, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
+
+
 def fit_family_map(
     config: Config, recordings: Sequence[str], family: Path, lot: str, out: Path | None, progress: Progress | None
 ) -> FamilyMapResult:
@@ -114,12 +123,9 @@ def fit_family_map(
     ConfigError, MapError, DataError
         If the family is of another sensor, a recording cannot be used, or the map's file is in the way.
     """
-    if config.filter is None:
-        raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
+    law, faults = family_of(config, family), Faults()
     if out is not None:
         check_place(out, [family, *config.files_to_fit(), *paths_of(recordings)], "fit-map")
-    tracked, faults = config.filter.tracked, Faults()
-    law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
     if lot and lot not in law.lots:
         faults.note(f"lot {lot}: is not one of the family's ({', '.join(law.lots) or 'it has none'}); taken as unknown")
     soak = gather(config, recordings, faults, progress, keep=True)
@@ -128,7 +134,7 @@ def fit_family_map(
         own = fit_gathered(config, map_settings(config, None if config.tracked_maps() else USUAL), soak)
     except DataError as error:
         faults.note(f"no map of its own: {error}")
-    information, _ = soaked_of("", tuple(tracked.axes), soak.rows(tracked.channel), law.knots.step)
+    information, _ = soaked_of("", law.axes, soak.rows(law.channel), law.knots.step)
     posterior = unit_posterior(law, information, lot)
     result = FamilyMapResult(config, recordings, family.name, posterior, own, faults)
     if out is not None:
@@ -138,9 +144,7 @@ def fit_family_map(
 
 def show_family_map(result: FamilyMapResult) -> None:
     """Print the verdict, the deviations over the range and the notes."""
-    for line in words.sentences(result):
-        say(f"{line}\n")
+    say_lines(words.sentences(result))
     terminal().print(words.table(result))
-    for line in result.faults.lines():
-        say(f"note: {line}\n")
+    say_lines(result.faults.lines(), "note: ")
     say(f"written to {', '.join(map(str, result.written))}\n")

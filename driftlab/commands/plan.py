@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from driftlab.commands.console import say, say_lines, terminal
+from driftlab.commands.family_map import family_of
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Progress, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
 from driftlab.commands.triad_map import names_of_terms
 from driftlab.config import Config, paths_of
-from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family
 from driftlab.identification.candidates import check_kinds
 from driftlab.planning.chamber import Profile
@@ -202,7 +202,7 @@ def plan(
     if family is not None:
         if after is not None or effects:
             raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
-        law = inquiry.family(Path(family))
+        law = family_of(understood, Path(family))
         return in_folder(out, "plan", [Path(family), *understood.files()], partial(inquiry.short, law))
     check_kinds(effects, "--effects")
     if after is not None:
@@ -226,13 +226,6 @@ class _Inquiry:
     def request(self, range: str | tuple[float, float] | None) -> PlanRequest:
         """Return the request over a range; None: the config's."""
         return parse_request(self.config, self.hours, range=range, **self.options)
-
-    def family(self, path: Path) -> Family:
-        """Return the family of the tracked sensor."""
-        if self.config.filter is None:
-            raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
-        tracked = self.config.filter.tracked
-        return load_family(path, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
 
     def first(self, request: PlanRequest) -> PlanResult:
         """Plan what is recorded first."""

@@ -13,12 +13,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.commands.console import print_verdict, say, say_lines, terminal
+from driftlab.commands.family_map import family_of
 from driftlab.commands.result import Result
 from driftlab.config import Config, paths_of
 from driftlab.evaluation.limits import check_limits
 from driftlab.evaluation.limits import verdict as verdict_line
 from driftlab.evaluation.measurements import of_map
-from driftlab.family.file import load_family
 from driftlab.family.terms import TermsLaw
 from driftlab.filtering.setup import check_map
 from driftlab.maps.fit import USUAL, map_settings, of_sensor, provenance
@@ -142,6 +142,7 @@ class TriadMapResult(MapResult):
     ) -> None:
         super().__init__(config, recordings, fitted, faults)
         self.law, self.fit, self.rows = law, fit, gathered.rows
+        self._doubts, self._untested = in_doubt(faults.doubts), words.untested_lines(fit)
         self.name = f"map of the {gathered.sensor.channel}, with scale factor and misalignment"
         T = np.linspace(*fitted.domain, POINTS)
         inside = np.clip(T, fit.grid[0], fit.grid[-1])
@@ -150,7 +151,7 @@ class TriadMapResult(MapResult):
         self.units = {"temperature": "degC", "terms": each, "sigma": each}
         self.labels = dict.fromkeys(("terms", "sigma"), tuple(name.replace(" ", "_") for name in fit.names))
         self.summary = fitted.record.model_dump(mode="json", exclude={"error", "matrix", "sensitivity"}) | {
-            "triad": plain(words.as_json(fit, self.unit, [*in_doubt(self.faults.doubts), *words.untested_lines(fit)])),
+            "triad": plain(words.as_json(fit, self.unit, [*self._doubts, *self._untested])),
             "serial": config.serial,
             "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }  # fmt: skip
@@ -162,9 +163,8 @@ class TriadMapResult(MapResult):
     def verdict(self) -> list[str]:
         """Return doubts, frame, how far levels differ, family, what is not tested or observable, a sentence each."""
         of_family = [] if self.law is None else [words.family_line(self.fit, self.law.units)]
-        doubts, levels = in_doubt(self.faults.doubts), words.level_lines(self.fit, self.unit)
-        untested, hidden = words.untested_lines(self.fit), words.verdict(self.fit)
-        return [*doubts, words.frame_line(self.fit), *levels, *of_family, *untested, *hidden]
+        levels, hidden = words.level_lines(self.fit, self.unit), words.verdict(self.fit)
+        return [*self._doubts, words.frame_line(self.fit), *levels, *of_family, *self._untested, *hidden]
 
     def _chart(self) -> Chart:
         return words.chart(self.fit)
@@ -172,8 +172,8 @@ class TriadMapResult(MapResult):
     def _texts(self, sheet: Sheet) -> list[str]:
         recordings = self.map.record.provenance.get("recordings", "") or "samples in memory"
         lead = f"{len(self.fit.stimulus.T)} segments or placements in {self.rows:,} samples of {recordings}"
-        notes, channel = [*words.untested_lines(self.fit), *self.faults.lines(doubts=False)], self.map.record.channel
-        return [words.page_of(self.fit, self.unit, channel, lead, in_doubt(self.faults.doubts), notes, sheet)]
+        notes, channel = [*self._untested, *self.faults.lines(doubts=False)], self.map.record.channel
+        return [words.page_of(self.fit, self.unit, channel, lead, self._doubts, notes, sheet)]
 
     def _certificate(self, sheet: Sheet) -> Certificate:
         none, T = {"residual", "hysteresis"}, self.fit.domain  # of a soak
@@ -181,7 +181,7 @@ class TriadMapResult(MapResult):
         return Certificate(
             COMMAND, self.config, sheet, self.limits, measured, self.map, domain=T, fit=self.fit,
             levelled=self.fit.has_bias,
-            remarks=[*in_doubt(self.faults.doubts), *words.untested_lines(self.fit), *words.verdict(self.fit)],
+            remarks=[*self._doubts, *self._untested, *words.verdict(self.fit)],
         )  # fmt: skip
 
 
@@ -277,8 +277,7 @@ def _law_of(family: Path, config: Config, names: Collection[str]) -> TermsLaw:
             "--family with --terms: tells scale and misalignment over its range, where a short stimulus does not tell "
             "the bias; give --terms scale,misalignment, and name a map of the bias in the config (fit-map --family)"
         )
-    tracked = config.filter.tracked
-    law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes)).terms
+    law = family_of(config, family).terms
     if law is None:
         raise ConfigError(
             f"--family {family}: has no terms of scale and misalignment; name one of which five units or more had "
