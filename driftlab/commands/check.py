@@ -79,13 +79,8 @@ def _map_remarks(config: Config) -> list[str]:
                 remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
             else:
                 remarks += map_lines(loaded_map(settings, sensor), sensor)
-    there = [settings for settings in config.tracked_maps() if settings.path is not None and settings.path.exists()]
-    if (
-        config.stimulus is not None
-        and config.filter is not None
-        and there
-        and _with_matrix(config.filter.tracked) is None
-    ):
+    fitted = [] if config.filter is None else _fitted_maps(config.filter.tracked)
+    if config.stimulus is not None and fitted and all(one.record.matrix is None for one in fitted):
         remarks.append(
             "stimulus: lies unused, since the map holds the bias alone; fit the rest with `driftlab fit-map --terms "
             "bias,scale,misalignment`"
@@ -93,15 +88,14 @@ def _map_remarks(config: Config) -> list[str]:
     return remarks
 
 
-def _with_matrix(sensor: Sensor) -> FittedMap | None:
-    """Return the map of a sensor that has scale factor and misalignment; None where there is none."""
-    there = (loaded_map(m, sensor) for m in maps_of(sensor) if m.path is not None and m.path.exists())
-    return next((fitted for fitted in there if fitted.record.matrix is not None), None)
+def _fitted_maps(sensor: Sensor) -> list[FittedMap]:
+    """Return the maps of a sensor whose files are there."""
+    return [loaded_map(m, sensor) for m in maps_of(sensor) if m.path is not None and m.path.exists()]
 
 
 def _turns(sensor: Sensor, chunk: Chunk) -> Iterator[str]:
     """Yield a remark where a map's scale factor and misalignment are of a gyro that does not turn."""
-    fitted = _with_matrix(sensor)
+    fitted = next((one for one in _fitted_maps(sensor) if one.record.matrix is not None), None)
     if fitted is None or sensor.unit != "rad/s" or not {sensor.channel, "temperature"} <= set(chunk.channels):
         return
     force = chunk[FORCE] if FORCE in chunk.channels else None

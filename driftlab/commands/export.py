@@ -114,7 +114,7 @@ def export(
     Unwritable
         If the disk is full, or the like.
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
-    exporter = exporter_of(kind, {name: str(value) for name, value in (settings or {}).items()})
+    exporter = exporter_of(kind, settings)
     file = Path(what) if is_file(what) else None  # type: ignore[arg-type]
     if isinstance(what, FitMapResult):
         calibration = of_map(what.map)
@@ -136,17 +136,21 @@ def installed(base: type, kind: str, option: str) -> Any:
     return classes[kind]
 
 
-def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
+def exporter_of(kind: str, settings: Mapping[str, Any] | None) -> Exporter:
     """Return the exporter of a kind with settings as a user writes them; raises ConfigError."""
-    document = Document(Path("--set"), {"kind": kind, **settings})
+    document = Document(Path("--set"), {"kind": kind, **{name: str(value) for name, value in (settings or {}).items()}})
     return validate(installed(Exporter, kind, "export"), document)  # type: ignore[no-any-return]
+
+
+def calibrated(name: str, fitted: FittedMap) -> Calibrated:
+    """Return the calibration of a sensor that a map has, in the units in which people read it."""
+    unit = fitted.record.unit
+    return Calibrated(name, unit, SHOWN.get(unit, unit), axes_of(fitted), fitted)
 
 
 def of_map(fitted: FittedMap) -> Export:
     """Return the calibration that a map has."""
-    record = fitted.record
-    shown = SHOWN.get(record.unit, record.unit)
-    return Export((Calibrated(record.channel, record.unit, shown, axes_of(fitted), fitted),))
+    return Export((calibrated(fitted.record.channel, fitted),))
 
 
 def of_config(config: Config) -> Export:

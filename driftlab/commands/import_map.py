@@ -81,7 +81,7 @@ def import_map(
     ConfigError, DataError
         If the file holds no calibration that is in use, or cannot be read, or `out` is in the way.
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
-    exporter = exporter_of(kind, {name: str(value) for name, value in (settings or {}).items()})
+    exporter = exporter_of(kind, settings)
     path, place = Path(file), Path(out)
     calibration = _of_channel(_read(exporter, path), channel, path)
     model = installed(ThermalMap, map_kind, "--kind")

@@ -12,12 +12,11 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.commands.console import say, say_lines
-from driftlab.commands.export import SHOWN, exporter_of
+from driftlab.commands.export import calibrated, exporter_of
 from driftlab.commands.fit_map import FitMapResult, fit_map
 from driftlab.commands.inputs import Place, Progress
 from driftlab.commands.vehicle_log import PLATFORMS, LogSensor, config_and_data, product_of, sensors_of
 from driftlab.config import paths_of
-from driftlab.maps.fit import axes_of
 from driftlab.reports import vehicle as report
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.storage.folders import output_folder
@@ -72,13 +71,6 @@ class VehicleSensor(LogSensor):
     def lines(self) -> list[str]:
         """Return its sentences, each with its name."""
         return [f"{self.title}: {sentence}" for sentence in self.sentences]
-
-    def calibrated(self) -> Calibrated:
-        """Return its map for an export."""
-        assert self.result is not None
-        fitted = self.result.map
-        unit = fitted.record.unit
-        return Calibrated(self.name, unit, SHOWN.get(unit, unit), axes_of(fitted), fitted)
 
     def drifts(self) -> str:
         """Return in words that its input may have drifted, and not its bias; empty where the soak excludes that.
@@ -218,7 +210,7 @@ def vehicle(
     form = export or PLATFORMS[product].export
     if form not in {platform.export for platform in PLATFORMS.values()}:
         raise ConfigError(f"--export {form}: is no autopilot's; write px4 or ardupilot")
-    exporter = exporter_of(form, {name: str(value) for name, value in (settings or {}).items()})
+    exporter = exporter_of(form, settings)
     site = {name: value for name, value in (("latitude", latitude), ("heading", heading)) if value is not None}
 
     found = sensors_of(product, names, site)
@@ -261,7 +253,8 @@ def _fitted(
 def _exported(product: str, exporter: Exporter, sensors: Sequence[VehicleSensor], folder: Path) -> VehicleResult:
     """Write the parameters of all sensors that the firmware can use, each alone where all together are refused."""
     sensors = tuple(replace(one, left_out=one.left_out or one.drifts()) for one in sensors)
-    of_maps = tuple(one.calibrated() for one in sensors if one.result is not None and not one.left_out)
+    kept = (one for one in sensors if not one.left_out)
+    of_maps = tuple(calibrated(one.name, one.result.map) for one in kept if one.result is not None)
     if not of_maps:
         why = "no sensor has a map" + (" that could be used" if any(one.left_out for one in sensors) else "")
         return VehicleResult(product, sensors, None, why)
