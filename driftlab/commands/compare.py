@@ -129,7 +129,7 @@ def show(result: CompareResult, given: Mapping[str, Any]) -> None:
 
     def of_the_paper(part: dict[str, Comparison]) -> list[Table]:
         tables = comparison.paper(part)
-        return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
+        return [error_table(title, list(part), unit, (sensor.axes, rows), si=True) for title, rows in tables]
 
     terminal().print(comparison.verdict(comparisons))
     say_lines([*comparison.limit_lines(comparisons), ""])

@@ -12,12 +12,11 @@ from driftlab import __version__
 from driftlab.noise.allan_fit import LEVEL, Coefficients
 from driftlab.noise.allan_model import KEYS, WALK, WHITE, AllanCurve, design
 from driftlab.noise.recording import Analysis
-from driftlab.reports.charts import Chart, Line, Panel, series
+from driftlab.reports.charts import Chart, Line, Panel, positive, series
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
 from driftlab.units import axis_name, number
-from fusion_core.chunk import Array
 from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
@@ -60,7 +59,7 @@ def _coefficients(analysis: Analysis, channel: str) -> dict[str, Any]:
             key: {"value": fit.value[k], "low": fit.low[k], "high": fit.high[k], "unit": si[key]}
             for k, key in enumerate(KEYS)
         }
-        for axis, fit in zip(analysis.axes[channel], analysis.coefficients[channel], strict=True)
+        for axis, _, fit in _each_axis(analysis, channel)
     }
 
 
@@ -212,7 +211,7 @@ def _panels(analysis: Analysis, channel: str) -> Iterator[Panel]:
 
 
 def _lines(c: AllanCurve, fit: Coefficients, scale: float, names: dict[str, str]) -> Iterator[Line]:
-    allan, hadamard = _positive(c.allan / scale), _positive(c.hadamard / scale)
+    allan, hadamard = positive(c.allan / scale), positive(c.hadamard / scale)
     floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
     A = design(c, hadamard=False).A
     if np.any(fit.best > 0):
@@ -226,11 +225,6 @@ def _lines(c: AllanCurve, fit: Coefficients, scale: float, names: dict[str, str]
     yield Line(c.tau, hadamard, "Hadamard", "data", style="points")
     spread = np.minimum(fit.spread, 0.9)
     yield Line(c.tau, allan, "Allan, 1 sigma", "estimate", allan * (1 - spread), allan * (1 + fit.spread), "points")
-
-
-def _positive(values: Array) -> Array:
-    """Return values that a logarithm can show."""
-    return np.where(values > 0, values, np.nan)
 
 
 def names_of(units: DeviationUnits) -> dict[str, str]:

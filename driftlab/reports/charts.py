@@ -182,18 +182,18 @@ def content(chart: Chart) -> dict[str, Any]:
         "label": chart.label,
         "log": chart.log,
         **({"named": chart.named} if chart.named else {}),
-        "x": [_numbers(x, 9) for x in xs],
+        "x": [numbers(x, 9) for x in xs],
         "panels": panels,
     }
 
 
 def _line_content(line: Line, x: int) -> dict[str, Any]:
     columns = {"y": line.y, "low": line.low, "high": line.high}
-    values = {name: _numbers(column) for name, column in columns.items() if column is not None}
+    values = {name: numbers(column) for name, column in columns.items() if column is not None}
     return {"name": line.name, "role": line.role, "style": line.style, "x": x, **values}
 
 
-def _numbers(values: Array, digits: int = 6) -> list[float | None]:
+def numbers(values: Array, digits: int = 6) -> list[float | None]:
     """Return values with so many digits, as `rounded` does one by one; None for one that is not finite.
 
     A whole number of at most 15 digits by a power of ten up to 22 is what the text of both is read as; what lies near
@@ -206,11 +206,11 @@ def _numbers(values: Array, digits: int = 6) -> list[float | None]:
         power = POWERS[np.where(sure, np.abs(places), 0).astype(np.int64)]
         scaled = np.where(places < 0, values / power, values * power)
         whole = np.rint(scaled)
-        numbers: list[float | None] = np.where(places < 0, whole * power, whole / power).tolist()
+        short: list[float | None] = np.where(places < 0, whole * power, whole / power).tolist()
         unsure = np.flatnonzero(~sure | (np.abs(np.abs(scaled - whole) - 0.5) < 1e-3))
     for k in unsure.tolist():
-        numbers[k] = rounded(float(values[k]), digits)
-    return numbers
+        short[k] = rounded(float(values[k]), digits)
+    return short
 
 
 def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate") -> Line:
@@ -255,6 +255,11 @@ def _beyond(lines: Iterable[Line], span: tuple[float, float] | None) -> str:
 def temperature_panel(t: Array, T: Array, shades: tuple[Shade, ...], **how: Any) -> Panel:
     """Return the temperature over time."""
     return Panel((Line(t, T, "temperature", "temperature"),), "temperature [°C]", shades, **how)
+
+
+def positive(values: Array) -> Array:
+    """Return values that a logarithm can show, NaN in place of the others."""
+    return np.where(values > 0, values, np.nan)
 
 
 def target_rule(target: float | None, factor: float) -> tuple[Rule, ...]:

@@ -5,7 +5,7 @@ A config has one colour in all of them and one entry in the legend, so that one 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,15 +127,11 @@ def bias_chart(runs: Runs) -> Chart:
             yield Line(t, np.where(begun, bias, np.nan), name, role)
             yield Line(t, coast, name, role, style="dashed")
 
-    shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
-    return Chart(
-        (*panels, *_temperature(runs, clock, shades)),
-        clock.label,
-        f"Bias of the {sensor.channel}",
+    caption = (
         "Broad and grey: the reference, the centred 30 s average of what was measured. Solid: estimates, which follow "
-        "it while they are updated. Dashed: predictions without updates, from the end of the alignment on.",
+        "it while they are updated. Dashed: predictions without updates, from the end of the alignment on."
     )
+    return _over_time(runs, lines, "bias", f"Bias of the {sensor.channel}", caption)
 
 
 def error_chart(runs: Runs) -> Chart:
@@ -149,15 +145,19 @@ def error_chart(runs: Runs) -> Chart:
             error = (curves["coast"] - curves["reference"])[:, k] * sensor.factor
             yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
 
-    shades = _shades(runs, clock)
-    panels = charts.axis_panels(sensor.axes, lines, "prediction error", sensor.shown, legibly=True, shades=shades)
-    return Chart(
-        (*panels, *_temperature(runs, clock, shades)),
-        clock.label,
-        "Error of the predictions",
+    caption = (
         "Prediction less reference. The band is two of its standard deviations about zero: 95 % of the time an honest "
-        "prediction is inside.",
+        "prediction is inside."
     )
+    return _over_time(runs, lines, "prediction error", "Error of the predictions", caption)
+
+
+def _over_time(runs: Runs, lines: Callable[[int], Iterator[Line]], quantity: str, title: str, caption: str) -> Chart:
+    """Return lines of each axis over time, with what moved or was refused, and the temperature below."""
+    sensor, clock = _sensor(runs), _clock(runs)
+    shades = _shades(runs, clock)
+    panels = charts.axis_panels(sensor.axes, lines, quantity, sensor.shown, legibly=True, shades=shades)
+    return Chart((*panels, *_temperature(runs, clock, shades)), clock.label, title, caption)
 
 
 def early_chart(runs: Runs) -> Chart:
@@ -227,9 +227,8 @@ def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
     for k, (name, run, role) in enumerate(_with_roles(runs)):
         shades += charts.span_shades(run.journal.refused.spans, clock, f"{name}: refused", role)
         if k == 0 or not alike:
-            shades += charts.span_shades(
-                run.journal.moving.spans, clock, "moved" if alike else f"{name}: moved", "moving"
-            )
+            text = "moved" if alike else f"{name}: moved"
+            shades += charts.span_shades(run.journal.moving.spans, clock, text, "moving")
     return tuple(shades)
 
 

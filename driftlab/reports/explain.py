@@ -59,7 +59,7 @@ def tables(closed: Identification) -> list[Table]:
     evidence = closed.search.columns.evidence
     sides = ["before", "after"] if closed.anything else ["declared"]  # where nothing was added both are the same
     return [
-        error_table(f"test recording {Path(o.name).name}", sides, _rows(o, len(sides)), evidence.axes, evidence.unit)
+        error_table(f"test recording {Path(o.name).name}", sides, evidence.unit, (evidence.axes, _rows(o, len(sides))))
         for o in closed.outcomes
     ]
 

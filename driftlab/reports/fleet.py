@@ -188,22 +188,12 @@ def changes(line: LineReport) -> list[dict[str, Any]]:
     result = []
     for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
         alone = f", of lot {change.of_lot} alone" if change.of_lot else ""
-        result.append({
-            "chart": chart, "change": change, "text": by_how_much(line, chart, change) + alone,
-            "where": place(line, change.at),
-            "ends": (line.units[change.low], line.units[change.high]),
-            "p": "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
-        })  # fmt: skip
+        text, where = by_how_much(line, chart, change) + alone, place(line, change.at)
+        ends, p = (line.units[change.low], line.units[change.high]), "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}"
+        result.append({"chart": chart, "change": change, "text": text, "where": where, "ends": ends, "p": p})
     for chart in line.controls:
         if (trend := chart.trend) is not None:
-            text, ends = by_how_much(line, chart, trend), (line.units[int(chart.at[0])], line.units[int(chart.at[-1])])
-            row = {
-                "chart": chart,
-                "change": trend,
-                "text": f"{text}, a trend",
-                "where": ends[0],
-                "ends": ends,
-                "p": "–",
-            }
-            result.append(row)
+            ends = line.units[int(chart.at[0])], line.units[int(chart.at[-1])]
+            text = f"{by_how_much(line, chart, trend)}, a trend"
+            result.append({"chart": chart, "change": trend, "text": text, "where": ends[0], "ends": ends, "p": "–"})
     return result

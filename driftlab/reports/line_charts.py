@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import figure_name
-from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, without_spikes
+from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, numbers, without_spikes
 from driftlab.spc.capability import D2, Capability
 from driftlab.spc.charts import D4, ControlChart, LineReport
-from driftlab.units import BiasUnit, number, rounded
+from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array, Flags
 
 NAMED = SERIES - 1  # units far off that a label names
@@ -60,7 +60,7 @@ def joint_charts(line: LineReport) -> list[Chart]:
     for joint in line.multivariate:
         place, out = (joint.at + 1).astype(np.float64), joint.beyond
         drawn = _drawn(out)
-        value, few = np.array([rounded(v, 4) for v in joint.value.tolist()]), np.unique([0, len(place) - 1])
+        value, few = _short(joint.value), np.unique([0, len(place) - 1])
         span = (0.0, 1.1 * float(max(np.percentile(joint.value, 100 * (1 - MANY)), 2 * np.max(joint.limit))))
         shown = np.minimum(value, span[1])
         lines = (
@@ -86,7 +86,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     unit = line.shown(chart.quantity)
 
     def shown(values: Array) -> Array:
-        return np.array([rounded(v, 4) for v in (np.asarray(values) * unit.factor).tolist()], dtype=np.float64)
+        return _short(values * unit.factor)
 
     drawn = _drawn(chart.beyond)
     place = (chart.at + 1).astype(np.float64)
@@ -121,7 +121,7 @@ def _ranges(chart: ControlChart) -> tuple[Panel, ...]:
         return ()
     out, top = value > D4, 2.5 * D4
     few = np.unique(np.linspace(0, len(value) - 1, MAX_RANGES).astype(np.intp))
-    shown = np.array([rounded(v, 4) for v in np.minimum(value, top).tolist()], dtype=np.float64)
+    shown = _short(np.minimum(value, top))
     ends = (chart.at[[0, -1]] + 1).astype(np.float64)  # as wide as the values above
     lines = (
         Line(place[few], shown[few], "moving range", "data"),
@@ -142,6 +142,11 @@ def _span(chart: ControlChart, ends: tuple[float, float], factor: float) -> tupl
     low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room
+
+
+def _short(values: Array) -> Array:
+    """Return values (m,) with four digits."""
+    return np.array(numbers(values, 4), dtype=np.float64)
 
 
 def _drawn(out: Flags) -> NDArray[np.intp]:
@@ -234,7 +239,7 @@ def _deviation_unit(scale: str, unit: BiasUnit) -> tuple[float, str]:
 
 
 def _points(x: Array, values: Array, out: Flags) -> tuple[Line, ...]:
-    value, low, high = np.array([[rounded(v, 4) for v in row] for row in values.tolist()])
+    value, low, high = map(_short, values)
     return (
         Line(x, value, "lot", "data"),
         Line(x, value, "lot", "data", style="points"),

@@ -95,9 +95,8 @@ def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[
     result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
     of = axis and f" of {scores.axes[unsure]}"
     verdict = "a right sigma allows" if ratio <= REFUTED else "is too much: widen walk or map"
-    trust = (
-        f"its sigma{of} there is {unit.number(sigma)} {unit.shown}, the error {ratio:.1f} times that, which {verdict}"
-    )
+    size = f"{unit.number(sigma)} {unit.shown}"
+    trust = f"its sigma{of} there is {size}, the error {ratio:.1f} times that, which {verdict}"
     angle = float(np.rad2deg(scores.heading[name])) if heading else np.nan  # without gravity no axis is known as up
     turned = f"{name} without updates turn the heading by {angle:.2g} deg; " if np.isfinite(angle) else ""
     return f"{result}.", f"{turned}{trust}."
@@ -131,9 +130,8 @@ def bias_chart(run: ScoredRun, *, errors: bool = False, domain: tuple[float, flo
         bias, sigma, coast, spread = (
             curves[name][:, k] * sensor.factor for name in ("bias", "bias_sigma", "coast", "coast_sigma")
         )
-        yield Line(
-            t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread
-        )  # wide: below all
+        # wide: below all
+        yield Line(t, None, "± 2σ of the prediction", "coast", coast - 2 * spread, coast + 2 * spread)
         yield Line(t, curves["reference"][:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
         yield Line(t, coast, "prediction", "coast", style="dashed")
@@ -189,17 +187,15 @@ def nis_chart(overview: Overview, m: int) -> Chart:
     )
     wide = overview.nis_highest > 20 * m
     level = Rule(1.0, "1: as good as it says")
-    panel = Panel(_positive(lines) if wide else lines, "NIS a component [1]", rules=(level,), log=wide)
+    drawn = tuple(map(_positive, lines)) if wide else lines
+    panel = Panel(drawn, "NIS a component [1]", rules=(level,), log=wide)
     return Chart((panel,), clock.label, "Is the filter as good as it says?")
 
 
-def _positive(lines: tuple[Line, ...]) -> tuple[Line, ...]:
-    """Return the lines for a logarithmic scale."""
-
-    def above(values: Array | None) -> Array | None:
-        return None if values is None else np.where(values > 0, values, np.nan)
-
-    return tuple(replace(line, y=above(line.y), low=above(line.low), high=above(line.high)) for line in lines)
+def _positive(line: Line) -> Line:
+    """Return a line for a logarithmic scale."""
+    y, low, high = (None if v is None else charts.positive(v) for v in (line.y, line.low, line.high))
+    return replace(line, y=y, low=low, high=high)
 
 
 def map_chart(fitted: FittedMap, overview: Overview, unit: BiasUnit, axes: tuple[str, ...]) -> Chart:

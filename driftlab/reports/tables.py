@@ -71,20 +71,13 @@ class TextTable:
 
 
 def error_table(
-    title: str, names: Sequence[str], rows: Rows, axes: Sequence[str], unit: BiasUnit, *, si: bool = False
+    title: str, names: Sequence[str], unit: BiasUnit, *sections: tuple[Sequence[str], Rows], si: bool = False
 ) -> Table:
-    """Return a table of errors: a label, and for each name the errors (d,) of one row, given in SI.
+    """Return a table of errors in sections, each of axes and rows: a label, and for each name the errors (d,), in SI.
 
     A number is never cut; a name is folded at what separates its words. With `si` in SI, where that is another unit
     than the one that is shown.
     """
-    return _table(title, names, [(axes, rows)], unit, si=si)
-
-
-def _table(
-    title: str, names: Sequence[str], sections: Sequence[tuple[Sequence[str], Rows]], unit: BiasUnit, *, si: bool
-) -> Table:
-    """Return the table of sections, each with the axes of its rows."""
     from rich.table import Table
     from rich.text import Text
 
@@ -135,7 +128,7 @@ def yardstick_table(runs: dict[str, Scores], title: str, sensor: Sensor) -> Tabl
     sections: list[tuple[Sequence[str], Rows]] = [(sensor.axes, rows)]
     if len(runs) > 1 and len(sensor.axes) > 1:
         sections = [(("rms",), coasts_over_axes(rows)), *sections]
-    table = _table(title, list(runs), sections, unit_of(sensor), si=False)
+    table = error_table(title, list(runs), unit_of(sensor), *sections)
     if sensor.integral is not None:
         for name in LONGEST_FIRST:
             headings = [formatted(np.rad2deg(run.heading[name]), ".2f", "-") for run in scores]

@@ -76,8 +76,8 @@ def test_a_name_is_folded_after_what_separates_its_words():
 
 def test_the_paper_s_unit_is_si_and_a_ratio_stays_in_its_own():
     rows = [("mean", [np.array([1e-5])])]
-    assert "1.000e-05" in printed(error_table("t", ["a"], rows, ["x"], RATE, si=True))
+    assert "1.000e-05" in printed(error_table("t", ["a"], RATE, (["x"], rows), si=True))
     ppm = BiasUnit("1", "ppm")
-    assert printed(error_table("t", ["a"], rows, ["x"], ppm, si=True)) == printed(
-        error_table("t", ["a"], rows, ["x"], ppm)
+    assert printed(error_table("t", ["a"], ppm, (["x"], rows), si=True)) == printed(
+        error_table("t", ["a"], ppm, (["x"], rows))
     )
