@@ -68,9 +68,8 @@ def declared_effects(config: Config) -> tuple[Effect, ...]:
     """Return the effects that the config has already, to be fitted anew together with the others."""
     bias = _bias(config)
     effects = bias.effects if isinstance(bias, ThermalBias) else ()
-    return tuple(
-        effect.model_copy(update={"domain": None, "regressors": None}) for effect in effects
-    )  # what is fitted anew has another
+    unknown = {"domain": None, "regressors": None}  # what is fitted anew has others
+    return tuple(effect.model_copy(update=unknown) for effect in effects)
 
 
 def with_host(config: Config, unit: BiasUnit, map_path: Path | None, **fields: Any) -> Config:

@@ -13,7 +13,7 @@ it would become.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,7 +22,7 @@ import numpy as np
 from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
 from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations
-from driftlab.identification.least_squares import Model, Term
+from driftlab.identification.least_squares import Model, Term, without_term
 from driftlab.identification.records import Evidence, Progress, Record, row_starts
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, contains, is_copy, tried, with_uncertain_map
@@ -118,7 +118,7 @@ def _findings(search: Search) -> tuple[Finding, ...]:
 
 def _beside_all(search: Search, place: int, trial: Trial, rivals: tuple[Trial, ...]) -> tuple[Trial, tuple[Trial, ...]]:
     """Return a trial and its rivals, those alone that are it still beside what was added later."""
-    others = tuple(term for k, term in enumerate(search.model) if k != place)
+    others = without_term(search.model, place)
     if not rivals or others == trial.base:
         return trial, rivals
     names = {one.name for one in (trial, *rivals)}
@@ -141,7 +141,7 @@ def _copies(search: Search, place: int, trial: Trial) -> tuple[Trial, ...]:
 
     Each on a grid of its own, the two differ by what lies between the points.
     """
-    others, effect = tuple(term for k, term in enumerate(search.model) if k != place), search.model[place].effect
+    others, effect = without_term(search.model, place), search.model[place].effect
     names = {one.name for one in search.trials if is_copy(search, effect, one.term.effect)}
     if not names:
         return ()
@@ -175,11 +175,11 @@ def _rejected(search: Search) -> tuple[Trial, ...]:
     return _best_of_each([trial for trial in (*dropped, *search.trials) if trial.name not in have])
 
 
-def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """Return the best trial of each name, best first."""
+def _best_of_each(trials: Sequence[Trial], of: Callable[[Trial], str] = lambda trial: trial.name) -> tuple[Trial, ...]:
+    """Return the best trial of each name, or what `of` returns, best first."""
     best: dict[str, Trial] = {}
     for trial in sorted(trials, key=lambda t: (not t.passes, t.evidence.ratio)):
-        best.setdefault(trial.name, trial)
+        best.setdefault(of(trial), trial)
     return tuple(best.values())
 
 
@@ -203,17 +203,14 @@ def _likely(trial: Trial) -> bool:
     return evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
 
 
-def _unnamed(search: Search) -> list[Trial]:
+def _unnamed(search: Search) -> tuple[Trial, ...]:
     """Return the best passing probe of each channel beside the final model: it is not named, nor added."""
     families: dict[Family, list[Term]] = {}
     for probe in probes(with_residual(search), search.evidence.axes):
         family = probe.channel, probe.form, search.columns.of(probe).p, False
         families.setdefault(family, []).append(Term(probe))
     passing = [trial for trial in tried(search, search.model, families) if trial.passes] if families else []
-    best: dict[str, Trial] = {}
-    for trial in sorted(passing, key=lambda t: t.evidence.ratio):
-        best.setdefault(trial.term.effect.subject, trial)
-    return list(best.values())
+    return _best_of_each(passing, lambda trial: trial.term.effect.subject)
 
 
 def _structure(trial: Trial) -> Structure:

@@ -37,6 +37,11 @@ class Term:
 Model = tuple[Term, ...]
 
 
+def without_term(model: Model, k: int) -> Model:
+    """Return the model without its k-th term."""
+    return (*model[:k], *model[k + 1 :])
+
+
 @dataclass(frozen=True)
 class AxisFit:
     """A model fitted on one axis."""

@@ -24,9 +24,8 @@ import numpy as np
 
 from driftlab.identification.acceptance import WORSE
 from driftlab.identification.candidates import candidates_of
-from driftlab.identification.columns import EffectRegressors
-from driftlab.identification.cross_validation import MIN_ROWS, condition, parts
-from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term
+from driftlab.identification.cross_validation import MIN_ROWS, condition
+from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, Term, without_term
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, blocks_of, contains, difference, tried, uncertainty
@@ -50,12 +49,8 @@ def search(
 
     Kinds `without` are not tried.
     """
-    columns = EffectRegressors(evidence, basis)
-    d = len(evidence.axes)
-    squares = LeastSquares(columns, np.full(d, 1e-4), np.ones(d))
     terms = tuple(Term(effect, any(effect.initial or ())) for effect in declared)
-    state = Search(squares, progress, terms, terms, parts(columns), without=frozenset(without))
-    state.fresh()
+    state = Search.begun(evidence, basis, progress, terms, without)
     while len(state.added) < MAX_EFFECTS and _add(state):
         _merge(state)
         _refine(state)
@@ -97,11 +92,6 @@ def _remove(state: Search, k: int) -> None:
     """Take a term out of the model, and its trial."""
     state.model = without_term(state.model, k)
     del state.added[k - len(state.declared)]
-
-
-def without_term(model: Model, k: int) -> Model:
-    """Return the model without its k-th term."""
-    return (*model[:k], *model[k + 1 :])
 
 
 def _best(passing: Sequence[Trial]) -> Trial:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from driftlab.identification.least_squares import AxisFit, LeastSquares, Model, 
 from driftlab.identification.records import Evidence, Progress
 from driftlab.noise.local_level import LocalLevel, fit_local_level
 from fusion_core.chunk import Array
-from fusion_core.contracts import Effect
+from fusion_core.contracts import Basis, Effect
 from fusion_core.errors import EmptyRecording
 
 Errors = list[list[Array]]  # of each part, of each axis
@@ -74,6 +74,17 @@ class Search:
     # names whose regressors are exactly another's, and that one's name: they are not tried
     same: dict[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def begun(
+        cls, evidence: Evidence, basis: Basis | None, progress: Progress, declared: Model, without: Collection[str] = ()
+    ) -> Search:
+        """Return a search of nothing but the declared terms, with their smoothing and noise."""
+        columns, d = EffectRegressors(evidence, basis), len(evidence.axes)
+        squares = LeastSquares(columns, np.full(d, 1e-4), np.ones(d))
+        search = cls(squares, progress, declared, declared, parts(columns), without=frozenset(without))
+        search.fresh()
+        return search
+
     @property
     def columns(self) -> EffectRegressors:
         """All that may be in a model."""
@@ -99,6 +110,11 @@ class Search:
         """The axes on which anything was measured: a constant is no evidence for any model."""
         columns = self.columns
         return [axis for axis, y in enumerate(columns.y) if np.any(columns.W[:, y])] or [0]
+
+    @property
+    def named(self) -> set[str]:
+        """The channels that the effects of the model read."""
+        return {name for term in self.model for name in term.effect.requires}
 
     def fit(self, model: Model, axis: int) -> AxisFit:
         """Fit a model on one axis over all recordings."""

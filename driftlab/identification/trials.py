@@ -153,8 +153,7 @@ def _trial(
     evidence = CandidateEvidence(
         ratio, steady, len(steps), max(whole, default=0.0), bool(base), left_out - price, chance, gain - price, price
     )
-    named = {name for term in search.model for name in term.effect.requires}
-    passes, reason = accept(effect, evidence, named)
+    passes, reason = accept(effect, evidence, search.named)
     return Trial(model, evidence, blocks_of(errors, search.axes), _likelihood(search, model, noises), passes, reason)
 
 
@@ -167,8 +166,7 @@ def with_uncertain_map(search: Search, trial: Trial) -> Trial:
     noises, old = search.noises_of(trial.model), trial.evidence
     chance, gain = fast_evidence(search.squares, trial.base, trial.term, noises, generalised=True)
     evidence = replace(old, chance=min(chance, old.chance), gain=min(gain - old.price, old.gain))
-    named = {name for term in search.model for name in term.effect.requires}
-    passes, reason = accept(trial.term.effect, evidence, named)
+    passes, reason = accept(trial.term.effect, evidence, search.named)
     return replace(trial, evidence=evidence, passes=passes and trial.passes, reason=trial.reason or reason)
 
 

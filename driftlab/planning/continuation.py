@@ -16,7 +16,16 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.maps.fit import gather
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
-from driftlab.planning.search import GRID, MIN_COVERAGE, SAMPLES, Progress, RatedProfile, SearchResult, SigmaCurve
+from driftlab.planning.search import (
+    GRID,
+    MIN_COVERAGE,
+    SAMPLES,
+    Progress,
+    RatedProfile,
+    SearchResult,
+    SigmaCurve,
+    possible,
+)
 from driftlab.planning.unit_model import UnitModel
 from driftlab.soak.blocks import means, runs
 from fusion_core.chunk import Array
@@ -172,10 +181,9 @@ def candidates(before: RecordedSoak, hours: float) -> Iterator[Profile]:
     """Yield profiles over the whole range, over its parts, and over what was not seen yet."""
     for low, high in dict.fromkeys(_parts(before)):
         chamber = replace(before.chamber, low=low, high=high)
-        tried = (*(ramps(chamber, hours, cycles) for cycles in CYCLES), staircase(chamber, hours, STEPS, down=True))
-        for profile in tried:
-            if profile is not None:
-                yield replace(profile, name=f"{low:.4g} to {high:.4g} °C: {profile.name}")
+        sweeps = (ramps(chamber, hours, cycles) for cycles in CYCLES)
+        for profile in possible(*sweeps, staircase(chamber, hours, STEPS, down=True)):
+            yield replace(profile, name=f"{low:.4g} to {high:.4g} °C: {profile.name}")
 
 
 def _parts(before: RecordedSoak) -> Iterator[tuple[float, float]]:

@@ -14,7 +14,7 @@ import numpy as np
 from driftlab.identification.state import Search, name_of
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.detectability import families
-from driftlab.planning.search import MIN_COVERAGE, SearchResult
+from driftlab.planning.search import MIN_COVERAGE, SearchResult, possible
 from driftlab.planning.simulated_search import Information, planned, swing_of
 from driftlab.planning.unit_model import UnitModel
 
@@ -27,9 +27,9 @@ class DiscriminationCriterion:
 
     def __init__(self, unit: UnitModel, chamber: Chamber, hours: float, kinds: Collection[str]) -> None:
         self.unit, self.lag = unit, chamber.lag
-        possible = [profile for cycles in (1, 2, 4, 8, 16) if (profile := ramps(chamber, hours, cycles)) is not None]
-        assert possible, "hours in which the chamber comes up and down"
-        search = self._search(unit, possible[-1])  # up and down as often as fits the hours
+        sweeps = possible(*(ramps(chamber, hours, cycles) for cycles in (1, 2, 4, 8, 16)))
+        assert sweeps, "hours in which the chamber comes up and down"
+        search = self._search(unit, sweeps[-1])  # up and down as often as fits the hours
         self._own = {name: own for name, own in families(search).items() if own[0].kind in kinds}
         self._sizes = {repr(effect): swing_of(search, unit, effect) for own in self._own.values() for effect in own}
         self.names = tuple(self._own)

@@ -50,10 +50,8 @@ def parse_request(
     subject = UnitModel.of(config, kind, None if walk is None else _walk(walk, unit.si))
     twin = twin_of(config)
     low, high = _range(config, range, twin)
-    fastest, begin = (
-        quantity("rate", RATE if rate is None else rate, "delta_degC/s"),
-        quantity("start", START if start is None else start, "degC"),
-    )
+    fastest = quantity("rate", RATE if rate is None else rate, "delta_degC/s")
+    begin = quantity("start", START if start is None else start, "degC")
     coldest, hottest, _ = RANGES["temperature"]
     if not all(coldest <= T <= hottest for T in (low, high, begin)):
         raise ConfigError(

@@ -126,7 +126,7 @@ class SearchResult:
 
 def candidates(chamber: Chamber, hours: float) -> Iterator[Profile]:
     """Yield the profiles that fill the hours and that the chamber can: staircases, ramps, and both; classic first."""
-    yield from _possible(
+    yield from possible(
         staircase(chamber, hours, CLASSIC), staircase(chamber, hours, CLASSIC, down=True),
         staircase(chamber, hours, 2 * CLASSIC, down=True), *(ramps(chamber, hours, cycles) for cycles in CYCLES),
         *(mixed(chamber, hours, cycles, MIX) for cycles in CYCLES),
@@ -135,12 +135,13 @@ def candidates(chamber: Chamber, hours: float) -> Iterator[Profile]:
 
 def leading(chamber: Chamber, hours: float) -> Iterator[Profile]:
     """Yield those of the candidates that are among the best of any hours: the classic, and few ramps and many."""
-    every = _possible(*(ramps(chamber, hours, cycles) for cycles in CYCLES))
-    steps = _possible(staircase(chamber, hours, CLASSIC), staircase(chamber, hours, 2 * CLASSIC, down=True))
+    every = possible(*(ramps(chamber, hours, cycles) for cycles in CYCLES))
+    steps = possible(staircase(chamber, hours, CLASSIC), staircase(chamber, hours, 2 * CLASSIC, down=True))
     yield from (*steps, *every[:1], *every[1:][-2:])
 
 
-def _possible(*profiles: Profile | None) -> list[Profile]:
+def possible(*profiles: Profile | None) -> list[Profile]:
+    """Return the profiles that there are."""
     return [profile for profile in profiles if profile is not None]
 
 

@@ -20,9 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.identification.columns import EffectRegressors, NormalEquations
-from driftlab.identification.cross_validation import parts
-from driftlab.identification.least_squares import LeastSquares
+from driftlab.identification.columns import NormalEquations
 from driftlab.identification.records import Evidence, Record, lengths, row_starts
 from driftlab.identification.state import Search
 from driftlab.noise.local_level import LocalLevel, one_step
@@ -88,11 +86,7 @@ def _search(unit: UnitModel, recordings: Sequence[tuple[Array, Array, Array]], i
     basis = unit.map.basis(domain)
     if basis is not None and len(basis.penalty) > MAX_CURVES:
         basis = smooth_lines(domain)
-    columns = EffectRegressors(evidence, basis)
-    d = len(unit.axes)
-    search = Search(LeastSquares(columns, np.full(d, 1e-4), np.ones(d)), lambda text: None, (), (), parts(columns))
-    search.fresh()
-    return search
+    return Search.begun(evidence, basis, lambda text: None, ())
 
 
 def noises(unit: UnitModel, interval: float) -> list[LocalLevel]:
