@@ -72,10 +72,8 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     if given.interval is not None:
         groups.pop("time", None)
     stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
-    if (
-        stream is not None and "time" not in chosen and given.interval is None
-    ):  # that the sensor is a part of: a topic stands for its time
-        groups["time"] = [stream]
+    if stream is not None and "time" not in chosen and given.interval is None:
+        groups["time"] = [stream]  # that the sensor is a part of: a topic stands for its time
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
     channels: dict[str, GuessedChannel] = {}
@@ -85,12 +83,9 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
         group, values = groups[field], _values(groups[field], columns)
         T = _between(channels["temperature"].values[:, 0]) if "temperature" in channels else None
         own = np.any(np.isfinite(values), axis=1)  # rows that are not another sensor's alone
-        if (
-            field in SENSORS
-            and t is not None
-            and (quick := noise_of(t[own], values[own], None if T is None else T[own]))
-        ):
-            noise[field] = quick
+        if field in SENSORS and t is not None:
+            quick = noise_of(t[own], values[own], None if T is None else T[own])
+            noise |= {} if quick is None else {field: quick}
         stated = _stated(field, group, columns, given.units, written)
         counts = any(name.counts for name in group) and field in ("gyro", "temperature")
         guess = stated or (OF_COUNTS if counts else _by_values(field, values, channels, noise))
@@ -187,9 +182,8 @@ def _by_values(
 
 def _group(field: str, names: list[Name], columns: FileColumns, beside: str) -> list[Name] | None:
     """Return the columns of a channel, at most three numbers a row; None where there are none."""
-    for group in sorted(
-        named(names, field, beside), key=lambda group: (-len(group), group[0].path not in columns.units)
-    ):
+    groups = named(names, field, beside)
+    for group in sorted(groups, key=lambda group: (-len(group), group[0].path not in columns.units)):
         width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
         most = USUAL[field].axes or 1
         values = _values(group, columns)

@@ -19,10 +19,7 @@ from fusion_core.escaping import line, yaml_text
 from fusion_core.units import convert, same_dimension
 
 SITE = "# latitude: 40.9 deg      # of the site: takes the Earth's rate out of the bias, at most 15 deg/h"
-DENSITIES = {
-    "gyro": ("deg/h", "deg/s", 36.0),
-    "accel": ("ug", "mg", 1000.0),
-}  # small unit, large one, and from where on
+DENSITIES = {"gyro": ("deg/h", "deg/s", 36.0), "accel": ("ug", "mg", 1000.0)}  # small, large, and from where on
 UNITS_OF = {
     "time": ("s", "ms", "us", "ns"), "gyro": ("deg/s", "rad/s", "deg/h", "mdeg/s"), "accel": ("g", "m/s^2", "mg"),
     "temperature": ("degC", "degF", "K"),
@@ -149,11 +146,9 @@ def _questions(columns: FileColumns, channels: Channels) -> Iterator[OpenQuestio
         yield _apart(columns, channels)
     for field, channel in channels.found.items():
         if channel.guessed:
-            usual = [unit for unit in UNITS_OF[field] if unit != channel.unit]
-            choices = tuple(filter(None, [channel.unit, *usual]))
-            yield OpenQuestion(
-                "units", field, f"the unit of {field} ({channel.why})", choices, needed=channel.unit is None
-            )
+            choices = tuple(dict.fromkeys(filter(None, [channel.unit, *UNITS_OF[field]])))
+            text = f"the unit of {field} ({channel.why})"
+            yield OpenQuestion("units", field, text, choices, needed=channel.unit is None)
 
 
 def _apart(columns: FileColumns, channels: Channels) -> OpenQuestion:
@@ -187,9 +182,7 @@ def of_a_sensor(columns: FileColumns) -> OpenQuestion:
     known = columns.values
     triads = [triad for path in known if len(triad := {path.translate(axis): 0 for axis in AXES}.keys() & known) == 3]
     triads.sort(
-        key=lambda triad: (
-            of_accel(np.nan_to_num(np.column_stack([known[path] for path in sorted(triad)]))).unit is not None
-        )
+        key=lambda triad: of_accel(np.nan_to_num(np.column_stack([known[p] for p in sorted(triad)]))).unit is not None
     )
     choices = (*[",".join(sorted(triad)) for triad in triads[:1]], *known)
     text = "the columns of the gyro's axes: no name says which they are"

@@ -93,9 +93,9 @@ def put(new: Path, path: Path, command: str, subject: str) -> None:
     os.replace(new, place)
 
 
-def free(path: Path) -> Path:
-    """Return a path, or one like it, under which nothing is."""
-    names = chain([path], (path.with_name(f"{path.name}.before-{k}") for k in count(1)))
+def free(path: Path, word: str = "before") -> Path:
+    """Return a path, or one like it with a word and a number behind it, under which nothing is."""
+    names = chain([path], (path.with_name(f"{path.name}.{word}-{k}") for k in count(1)))
     return next(name for name in names if not os.path.lexists(name))
 
 

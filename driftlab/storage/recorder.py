@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import partial
-from itertools import count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 from zipfile import ZipFile
@@ -29,7 +29,7 @@ from driftlab.storage import ownership
 from driftlab.storage.folders import Lock, check_writable, refusals
 from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading
 from driftlab.storage.map_file import write_text
-from driftlab.storage.ownership import check_own, digest, put, seal, seal_of
+from driftlab.storage.ownership import check_own, digest, free, put, seal, seal_of
 from driftlab.storage.system import sync
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Framing, Source, head
@@ -44,12 +44,8 @@ if TYPE_CHECKING:
 
 RECORDED_MARK = "recorded by driftlab"
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-RECORDED_UNITS = {
-    "time": "s",
-    "gyro": "rad/s",
-    "accel": "m/s^2",
-    "temperature": "degC",
-}  # of the others: SI, as converted
+RECORDED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
+"""Of the others: SI, as converted."""
 COLUMNS = {name: {"unit": unit} for name, unit in RECORDED_UNITS.items()}
 
 
@@ -121,8 +117,7 @@ class Recorder:
                 if not SIGNATURE.startswith(file.read(len(SIGNATURE))):  # neither of HDF5 and cut short, nor empty
                     raise
             # its writer was killed too early, or it is damaged: it is kept under another name
-            names = (self.path.with_name(f"{self.path.name}.unreadable-{k}") for k in count(1))
-            self.kept = next(name for name in names if not name.exists())
+            self.kept = free(self.path, "unreadable")
             os.rename(self.path, self.kept)
             return
         self._check(attributes)
@@ -229,7 +224,7 @@ def started_at(path: Path) -> float | None:
 
 SIMULATED_MARK = "driftlab simulate"
 HEAD = 1 << 16  # bytes that its comments take at most
-SIMULATED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
+SIMULATED_UNITS = {**RECORDED_UNITS, "bias_truth": "rad/s"}
 
 
 @contextmanager
