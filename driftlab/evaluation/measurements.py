@@ -95,8 +95,7 @@ def _of_matrix(matrix: TriadMatrix, axes: Sequence[str]) -> Iterator[tuple[str, 
 def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
     record, axes = fitted.record, axes_of(fitted)
     if record.averaged_residual is None:
-        none, text = np.full(record.d, np.nan), "the map's file does not say its residual in averages; fit it anew"
-        return Measured(none, axes, missing=text)
+        return unmeasured(axes, "the map's file does not say its residual in averages; fit it anew")
     averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
     residual = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
     if record.averaged_bounds is None:
@@ -113,15 +112,13 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     only warms measures none.
     """
     memory, axes = fitted.record.memory, axes_of(fitted)
-    none = np.full(len(axes), np.nan)
     if memory is None:
-        text = "the map's file does not say what its soak tells of hysteresis; fit it anew"
-        return Measured(none, axes, missing=text)
+        return unmeasured(axes, "the map's file does not say what its soak tells of hysteresis; fit it anew")
     size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
     if memory["answer"] == "undecided":
         why = memory["why"] or "it is not known from this soak"
         looked_for = memory.get("log_evidence") is not None
-        return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
+        return Measured(np.full(len(axes), np.nan), axes, otherwise=why) if looked_for else unmeasured(axes, why)
     if memory["answer"] == "none":
         high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
         return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)
@@ -131,6 +128,11 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
     difference = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
     return normal(difference, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
+
+
+def unmeasured(axes: Sequence[str], why: str) -> Measured:
+    """Return a measurement without values, and why there are none."""
+    return Measured(np.full(len(axes), np.nan), axes, missing=why)
 
 
 def normal(measured: Measured, sigma: Array, seconds: float) -> Measured:
@@ -153,7 +155,7 @@ def of_allan(
         value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
         if hidden := [axis for axis, end in zip(axes, high, strict=True) if np.isinf(end)]:
             text = f"no averaging time shows it of {', '.join(hidden)}: filtered, interpolated or constant data"
-            result[name] = Measured(np.full(len(axes), np.nan), axes, missing=text)
+            result[name] = unmeasured(axes, text)
             continue
         part = np.where(value > 0, SIDE / TWO_SIDES, 1.0)  # of a limit of 97.5 %, on a scale of logarithms
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -271,11 +273,11 @@ class Averages:
         lasted = cut.samples * self.step
         if not cut.enough:
             longest, least = np.max(cut.places, initial=0) * self.step, MIN_STRETCH * self.step
-            text = (
+            return unmeasured(
+                self.axes,
                 f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {MIN_SAMPLES * self.step:.4g} s or "
-                f"more, {least:.4g} s of it without a gap"
+                f"more, {least:.4g} s of it without a gap",
             )
-            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         fits = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
         of = "the rest less the map, " if self.less is not None else "the rest, "
         return of_allan(fits, self.axes, lasted, of=of)["bias_instability"]
@@ -291,19 +293,18 @@ class Averages:
         pairs = counts[1:] & counts[:-1] & (np.diff(rows[:, 0]) == 1)
         n, time = int(np.sum(pairs)), np.maximum(rows[:, 1:2], self.step / 2)
         if n < MIN_SAMPLES:
-            text = f"{n * self.step:.4g} s at rest in a row; record {MIN_SAMPLES * self.step:.4g} s or more"
-            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
-        steps = np.where(
-            pairs[:, None], np.diff(rows[:, 3:] / time, axis=0) / np.sqrt(1 / time[1:] + 1 / time[:-1]), 0.0
-        )
+            why = f"{n * self.step:.4g} s at rest in a row; record {MIN_SAMPLES * self.step:.4g} s or more"
+            return unmeasured(self.axes, why)
+        steps = np.diff(rows[:, 3:] / time, axis=0) / np.sqrt(1 / time[1:] + 1 / time[:-1])
+        steps[~pairs] = 0.0
         square = np.sum(steps**2, axis=0)
         near = float(np.max(np.sum(steps[1:] * steps[:-1], axis=0) / np.maximum(square, np.finfo(float).tiny)))
         if alike(near, n, WHITE_ALIKE, WALKS):
-            text = (
+            return unmeasured(
+                self.axes,
                 f"neighbouring averages of {self.step:.3g} s are alike (differences correlate by {near:.2f}, those of "
-                f"white noise by {WHITE_ALIKE}): filtered or interpolated data do not show it"
+                f"white noise by {WHITE_ALIKE}): filtered or interpolated data do not show it",
             )
-            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         measured = Measured(np.sqrt(square / n), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
         return normal(measured, measured.values * np.sqrt(0.75 / n), n * self.step)
 
