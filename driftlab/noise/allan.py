@@ -155,17 +155,11 @@ def _sums(rate: Array, stretches: Integers, dt: float) -> tuple[Array, Integers]
     return x, places
 
 
-@compiled
 def _thinned_rows(edges: Integers, stride: int) -> tuple[Integers, Integers]:
     """Return every so-manyth row between edges (S + 1,), from each on, and the edges of these rows."""
-    few = np.zeros_like(edges)
-    for i in range(len(edges) - 1):
-        few[i + 1] = few[i] + (edges[i + 1] - edges[i] + stride - 1) // stride
-    rows = np.empty(few[-1], dtype=np.int64)
-    for i in range(len(edges) - 1):
-        for k in range(few[i + 1] - few[i]):
-            rows[few[i] + k] = edges[i] + k * stride
-    return rows, few
+    sizes = -(-np.diff(edges) // stride)
+    few = np.concatenate([[0], np.cumsum(sizes)])
+    return np.arange(few[-1]) * stride + np.repeat(edges[:-1] - few[:-1] * stride, sizes), few
 
 
 @partial(compiled, fastmath={"reassoc"})

@@ -263,21 +263,16 @@ def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]
 
 
 def _load(config: Config, faults: Faults, progress: Callable[[float, int], None] | None) -> Chunk:
-    t: list[Array] = []
     sensors = [sensor.channel for sensor in config.filter.sensors] if config.filter else []
     # an inertial unit's accelerometers also where the filter does without them
-    parts: dict[str, list[Array]] = {c: [] for c in (IMU if "gyro" in (sensors or IMU) else sensors)}
-    count = 0
+    wanted, parts, count = IMU if "gyro" in (sensors or IMU) else sensors, list[Chunk](), 0
     for chunk in read(config, faults):
-        t.append(chunk.t)
-        for channel, values in parts.items():
-            if channel in chunk.channels:
-                values.append(chunk[channel])
+        channels = {c: chunk[c] for c in wanted if c in chunk.channels}
+        parts.append(Chunk(chunk.t, channels, sensors=frozenset(channels)))
         count += len(chunk)
         if progress is not None:
             progress(faults.since(float(chunk.t[-1])), count)
-    channels = {c: np.concatenate(values) for c, values in parts.items() if values}
-    return Chunk(np.concatenate(t), channels, sensors=frozenset(channels))
+    return concatenate(parts)
 
 
 def _rest(config: Config, whole: Chunk) -> RestWindows | None:

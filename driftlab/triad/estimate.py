@@ -186,20 +186,17 @@ class TriadFit:
 
     def _curve(self, part: slice) -> dict[str, object]:
         """Return the fields of the 9 terms of a matrix."""
+        from scipy.interpolate import CubicSpline
+
         (low, high), h = (self.grid[0], self.grid[-1]), 1e-3
         bent = any(curve.q > 4 for curve in self.terms.curves)
         T = np.linspace(low, high, int(np.clip(np.ceil(high - low), 4, 150)) + 1 if bent else 4)
         inside = np.clip(T, low + h, high - h)
         slopes = (self.terms.at(inside + h) - self.terms.at(inside - h))[:, part] / (2 * h)
         if not bent:  # exact for a cubic through four points
-            third = np.linalg.solve(np.vander(self._scaled(T), 4), self.terms.at(T)[:, part])
-            slopes = np.vander(self._scaled(T), 4)[:, 1:] @ (third[:3] * [[3], [2], [1]]) * 2 / (high - low)
+            slopes = CubicSpline(T, self.terms.at(T)[:, part])(T, 1)
         return {
             "T": tuple(T.tolist()), "values": tuple(map(tuple, self.terms.at(T)[:, part].tolist())),
             "slopes": tuple(map(tuple, slopes.tolist())), "told": tuple(self.observable[part].tolist()),
             "kinds": tuple(curve.name for curve in self.terms.curves[part]), "error": self.curve_error(part),
         }  # fmt: skip
-
-    def _scaled(self, T: Array) -> Array:
-        low, high = self.grid[[0, -1]]
-        return np.asarray((2 * T - low - high) / (high - low))

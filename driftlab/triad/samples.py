@@ -10,7 +10,7 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.filtering.setup import corrected, other_calibrations
 from driftlab.recordings.screening import read
-from fusion_core.chunk import Chunk
+from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Sensor, TriadInput
 from fusion_core.errors import ConfigError, MissingChannel
 from fusion_core.faults import Faults
@@ -54,17 +54,14 @@ def _samples(config: Config, faults: Faults) -> Chunk:
     """Return all samples of a recording, the other sensors calibrated; without a thermometer at room temperature."""
     model = config.filter
     assert model is not None, "stimulus_of has seen to it"
-    chunks = list(read(config, faults))
-    names = set(chunks[0].channels)
-    if model.tracked.channel not in names:
-        have = ", ".join(sorted(names))
+    whole = concatenate(read(config, faults))
+    if model.tracked.channel not in whole.channels:
+        have = ", ".join(sorted(whole.channels))
         raise MissingChannel(
             f"channel '{model.tracked.channel}' is needed and the recording has {have}; name it under source.channels"
         )
-    t = np.concatenate([chunk.t for chunk in chunks])
-    whole = Chunk(t, {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names})
-    others = {name: fitted for name, fitted in other_calibrations(model).items() if name in names}
-    if "temperature" not in names:
+    others = {name: fitted for name, fitted in other_calibrations(model).items() if name in whole.channels}
+    if "temperature" not in whole.channels:
         faults.note(f"no thermometer: all samples are taken to be at {ROOM:g} °C, and the map holds there alone")
-        whole = whole.having(temperature=np.full(len(t), ROOM))
+        whole = whole.having(temperature=np.full(len(whole), ROOM))
     return corrected(whole, others)
