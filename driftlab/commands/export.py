@@ -20,6 +20,7 @@ from driftlab.config import Config, understood
 from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import axes_of
 from driftlab.noise.innovations import SensorReadings, inflation
+from driftlab.noise.local_level import walk_of
 from driftlab.storage.folders import check_writable, refusals
 from driftlab.storage.hdf5 import columns_of, reading
 from driftlab.storage.json import plain, write_json
@@ -47,7 +48,6 @@ from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import did_you_mean
 from fusion_core.thermal.record_texts import parse_json
-from fusion_core.units import along_axes
 
 CONFIGS = (".yaml", ".yml")
 SHOWN = {"rad/s": "deg/h", "m/s^2": "mg", "T": "uT"}  # units in which people read those of a map's file
@@ -173,9 +173,8 @@ def of_config(config: Config) -> Export:
 def _calibrated(sensor: Sensor) -> Calibrated:
     bias, settings = sensor.bias, sensor.calibration
     effects: tuple[Effect, ...] = ()
-    walk = (bias.as_random_walk() or {}).get("walk")
     if isinstance(bias, ThermalBias):
-        settings, effects, walk = bias.map or settings, bias.effects, bias.walk
+        settings, effects = bias.map or settings, bias.effects
     return Calibrated(
         sensor.channel,
         sensor.unit,
@@ -184,7 +183,7 @@ def _calibrated(sensor: Sensor) -> Calibrated:
         None if settings is None else loaded_map(settings, sensor),
         effects,
         sensor.noise,
-        None if walk is None else along_axes(walk, len(sensor.axes)),
+        walk_of(sensor),
     )
 
 
@@ -293,14 +292,13 @@ def inflations(folder: Path) -> dict[str, dict[str, Inflation]]:
     still, fresh = columns["still"].astype(bool), _fresh(folder, columns["t"])
     ratios: dict[str, dict[str, Inflation]] = {}
     for sensor in model.sensors:
-        walk = getattr(sensor.bias, "walk", None)
+        walk = walk_of(sensor)
         if walk is None:
             continue
-        density = along_axes(walk, len(sensor.axes))
         ratios[sensor.channel] = {}
         for name, d in _series(model, sensor, columns).items():
             readings = SensorReadings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
-            ratios[sensor.channel][name] = inflation(readings, sensor.noise, density)
+            ratios[sensor.channel][name] = inflation(readings, sensor.noise, walk)
     return ratios
 
 

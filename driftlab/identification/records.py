@@ -10,7 +10,7 @@ that moves with it, keep recordings from distinguishing explanations.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -21,6 +21,7 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
+from driftlab.noise.local_level import walk_of
 from driftlab.recordings.epochs import epochs
 from driftlab.soak.blocks import means
 from driftlab.soak.temperature import soak_temperatures
@@ -30,7 +31,6 @@ from fusion_core.contracts import Effect
 from fusion_core.contracts.table import DERIVED
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.thermal.sweeps import one_way, ways
-from fusion_core.units import along_axes
 
 FINE = 10.0  # s: longest mean that effects are computed on
 ROWS = 3000  # of a recording, at most
@@ -167,12 +167,11 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     for name, chunk, ends in zip(names, chunks, ranges, strict=True):
         whole = _joined(epochs([_without(chunk, "tau")], fine), name)
         # means lie in the middle of what they are over, as far as the updates of a run do
-        whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous, whole.sensors)
+        whole = replace(whole, t=whole.t - (fine - least) / 2)
         starts = row_starts(whole.t, interval)
         records.append(Record(name, name in calibration, name in train, _without(whole, "tau"), starts, ends))
-    align, unit, density = float(settings.align), unit_of(tracked), getattr(tracked.bias, "walk", None)
+    align, unit, walk = float(settings.align), unit_of(tracked), walk_of(tracked)
     noise = np.asarray(tracked.noise, dtype=np.float64)
-    walk = None if density is None else along_axes(density, len(tracked.axes))
     return Evidence(tuple(records), tracked.channel, tracked.axes, unit, interval, align, noise, walk)
 
 
@@ -219,8 +218,7 @@ def _ends(values: Array) -> Array:
 
 
 def _without(chunk: Chunk, name: str) -> Chunk:
-    others = {k: v for k, v in chunk.channels.items() if k != name}
-    return Chunk(chunk.t, others, chunk.previous, chunk.sensors)
+    return replace(chunk, channels={k: v for k, v in chunk.channels.items() if k != name})
 
 
 def _joined(chunks: Iterable[Chunk], name: str) -> Chunk:

@@ -361,14 +361,11 @@ def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
 @compiled
 def _pairs(counts: Flags, reach: int) -> int:
     """Return the number of pairs of differences that count at most `reach` apart, each in both orders."""
-    n, near, pairs = len(counts), 0, 0
-    for k in range(min(reach, n)):
-        near += counts[k]
+    n, pairs = len(counts), 0
+    before = np.zeros(n + 1, dtype=np.int64)  # how many count before each
     for k in range(n):
-        if k + reach < n:
-            near += counts[k + reach]
-        if k > reach:
-            near -= counts[k - reach - 1]
+        before[k + 1] = before[k] + counts[k]
+    for k in range(n):
         if counts[k]:
-            pairs += near
+            pairs += before[min(k + reach + 1, n)] - before[max(k - reach, 0)]
     return pairs

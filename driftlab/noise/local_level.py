@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_core.chunk import Array
+from fusion_core.contracts import Sensor
 from fusion_core.fast import compiled
+from fusion_core.units import along_axes
 
 
 @compiled
@@ -109,6 +111,12 @@ class LevelLikelihood:
         s2 = np.maximum(squares, np.finfo(float).tiny) / nu
         free = 2 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)), axis=1)
         return nu * np.log(s2) + (np.sum(np.log(variances), axis=1) + free)[:, None], s2, nu
+
+
+def walk_of(sensor: Sensor) -> Array | None:
+    """Return the declared density (d,) of the random walk of a sensor's bias; None where its model has none."""
+    walk = getattr(sensor.bias, "walk", None)
+    return None if walk is None else along_axes(walk, len(sensor.axes))
 
 
 MIN_GAIN, MAX_GAIN = 1e-4, 0.98

@@ -14,11 +14,11 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import map_settings
+from driftlab.noise.local_level import walk_of
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
-from fusion_core.contracts import BiasModel, FittedMap, SimulatedSource, ThermalBias, ThermalMap, Twin
+from fusion_core.contracts import FittedMap, Sensor, SimulatedSource, ThermalMap, Twin
 from fusion_core.errors import ConfigError
-from fusion_core.units import along_axes
 
 Curve = Callable[[Array], Array]
 
@@ -108,7 +108,7 @@ class UnitModel:
         else:
             assert sensor is not None, "there is a filter or a twin"
             channel, noise, whose = sensor.channel, sensor.noise, FILTERS
-            own = walk_of(sensor.bias) if walk is None else walk
+            own = _walk_of(sensor) if walk is None else walk
         if walk is not None:
             if len(walk) not in (1, len(axes)):
                 raise ConfigError(f"--walk: has {len(walk)} values for {len(axes)} axes; write one, or one an axis")
@@ -125,16 +125,14 @@ def twin_of(config: Config) -> Twin | None:
     return config.source.twin if isinstance(config.source, SimulatedSource) else None
 
 
-def walk_of(bias: BiasModel) -> Array:
-    """Return the density (d,) of the walk that a bias model has; raises ConfigError where it has none."""
-    if isinstance(bias, ThermalBias):
-        return np.asarray(along_axes(bias.walk, len(bias.axes)))
-    settings = bias.as_random_walk()
-    if settings is None:
+def _walk_of(sensor: Sensor) -> Array:
+    """Return the density (d,) of the declared walk; raises ConfigError where there is none."""
+    if (walk := walk_of(sensor)) is None:
         raise ConfigError(
-            f"bias model {bias.kind} has no random walk to plan with; give --walk, as `driftlab allan` measures it"
+            f"bias model {sensor.bias.kind} has no random walk to plan with; give --walk, as `driftlab allan` "
+            "measures it"
         )
-    return np.asarray(along_axes(settings["walk"], len(bias.axes)))
+    return walk
 
 
 def fitted_map(config: Config) -> FittedMap | None:

@@ -24,6 +24,7 @@ from driftlab.config import CertificateTexts, Config
 from driftlab.evaluation.limits import OF_M, RULE, LimitResult, Measured, outcome, verdict
 from driftlab.evaluation.uncertainty import K, UncertaintyBudget, bias_budget, expanded, matrix_budget
 from driftlab.maps.fit import axes_of
+from driftlab.noise.local_level import walk_of
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import SoakSummary
@@ -368,7 +369,7 @@ class Certificate:
         if self.si == "m/s^2" and self.fitted is not None and self.placements is None and not self.levelled:
             yield "the level: the map's file does not keep what the placements say of it"
         sensor = None if self.config.filter is None else self.config.filter.tracked
-        walk = None if sensor is None else getattr(sensor.bias, "walk", None)
+        walk = None if sensor is None else walk_of(sensor)
         if walk is not None and (largest := float(np.max(walk))) > 0:
             yield f"what the bias wanders afterwards: {self._size(largest * 60)} in 1 h by the config's walk"
         yield "other conditions than those of the recording: motion, vibration, supply, ageing"

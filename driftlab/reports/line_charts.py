@@ -225,9 +225,8 @@ def lot_chart(line: LineReport, name: str, lots: list[str]) -> Chart:
         s = np.array([(point.deviation, point.deviation_low, point.deviation_high) for point in points]).T * factor
         uneven, known = np.array([point.uneven for point in points]), np.isfinite(s[0])
         if np.any(known):
-            panels.append(
-                Panel(_points(x[known], s[:, known], uneven[known]), f"deviation, {called} [{of}]", height=0.7)
-            )
+            drawn = _points(x[known], s[:, known], uneven[known])
+            panels.append(Panel(drawn, f"deviation, {called} [{of}]", height=0.7))
     return Chart(tuple(panels), "lot", f"{TITLES.get(name, name)}, X-bar-S by lot", named="lots-of-the-line")
 
 

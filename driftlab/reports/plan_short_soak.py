@@ -20,12 +20,8 @@ from driftlab.units import BiasUnit
 
 def page_of(plan: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> PlanPage:
     """Return the page of a plan; `noise_of` says where noise and walk are from."""
-    lines, table, chart, sigma = (
-        _lines(plan, unit, noise_of),
-        _sigmas(plan, unit),
-        _hours(plan, unit),
-        _sigma(plan, unit),
-    )
+    lines, table = _lines(plan, unit, noise_of), _sigmas(plan, unit)
+    chart, sigma = _hours(plan, unit), _sigma(plan, unit)
     parts = [
         chosen_profile(plan.chosen.profile, plan.chamber.lag),
         ("Expected sigma with the family (without), at the best place", table),
