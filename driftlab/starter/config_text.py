@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -81,11 +81,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return replace(
-        _starter(lines, asked),
-        questions=questions,
-        problems=tuple(map(line, [*unread_of(columns, channels), *_quiet(channels)])),
-    )
+    return _starter(lines, asked, questions, [*unread_of(columns, channels), *_quiet(channels)])
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
@@ -123,12 +119,14 @@ def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | N
         text = "".join(f", {key}: {json.dumps(settings[key])}" for key in known)
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
     lines += [SITE, *_filter(channels, map_name)]
-    return replace(_starter(lines, asked), questions=questions)
+    return _starter(lines, asked, questions)
 
 
-def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
+def _starter(
+    lines: list[str], asked: Sequence[str] = (), questions: tuple[OpenQuestion, ...] = (), problems: Sequence[str] = ()
+) -> Starter:
     """Return a config of lines; a name of a stranger's file begins no other."""
-    return Starter("\n".join(map(line, lines)) + "\n", tuple(map(line, asked)))
+    return Starter("\n".join(map(line, lines)) + "\n", tuple(map(line, asked)), questions, tuple(map(line, problems)))
 
 
 def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]:
