@@ -104,13 +104,15 @@ def checked_reset(reset: Flags | None, n: int) -> Flags:
 def numbers(name: str, value: object, *expected: Shape | str) -> Array:
     """Return an array of float64 of one of the expected shapes; the last of them says in words what asks for it."""
     # what is read-only would have compiled loops of its own
-    if type(value) is np.ndarray and value.dtype is FLOAT and value.shape in expected and value.flags.carray:
+    if type(value) is np.ndarray and value.dtype == FLOAT and value.shape in expected and value.flags.carray:
         return value  # nearly always, and quickly
     return np.require(_array(name, value, "f", *expected), np.float64, ["C", "W"])
 
 
 def flags(name: str, value: object, *expected: Shape | str) -> Flags:
     """Return an array of bool of one of the expected shapes."""
+    if type(value) is np.ndarray and value.dtype == np.bool_ and value.shape in expected and value.flags.carray:
+        return value
     return np.require(_array(name, value, "b", *expected), np.bool_, ["C", "W"])
 
 

@@ -76,7 +76,7 @@ class Chunk:
         if "dt" in self.channels:
             return constant(self.channels["dt"])
         before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        steps = self.t - np.concatenate([before, self.t[:-1]])
+        steps = self.t - (before if len(self.t) == 1 else np.concatenate([before, self.t[:-1]]))
         begins = 1 if self.previous is None and len(self) > 1 else 0
         if len(self) > begins:
             usual = nominal(steps[begins:], float(max(abs(self.t[0]), abs(self.t[-1]))))
@@ -86,25 +86,41 @@ class Chunk:
 
     def part(self, start: int, stop: int) -> Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
-        if start <= 0 and stop >= len(self):
+        if start <= 0 and stop >= len(self.t):
             return self
         before = self._rows(slice(start - 1, start), None) if start else self.previous
         return self._rows(slice(start, stop), before)
 
     def last(self) -> Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
-        return self._rows(slice(len(self) - 1, len(self)), None)
+        return self.following(None) if len(self.t) == 1 else self._rows(slice(len(self.t) - 1, len(self.t)), None)
 
-    def _rows(self, rows: slice | Flags, previous: Chunk | None) -> Chunk:
-        return Chunk(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
+    def following(self, previous: Chunk | None) -> Chunk:
+        """Return the same samples after another one."""
+        return self._made(self.t, self.channels, previous)
+
+    def _rows(self, rows: slice, previous: Chunk | None) -> Chunk:
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        return self._made(self.t[rows], MappingProxyType(channels), previous)
+
+    def _made(self, t: Array, channels: Mapping[str, Array], previous: Chunk | None) -> Chunk:
+        """Return a chunk of arrays that cannot be written to already, and are not looked at again."""
+        made = object.__new__(Chunk)
+        made.__dict__.update(t=t, channels=channels, previous=previous, sensors=self.sensors)
+        return made
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
-        return Chunk(self.t, {**self.channels, **channels}, self.previous, self.sensors)
+        added = {name: read_only(values) for name, values in channels.items()}
+        made = self._made(self.t, MappingProxyType({**self.channels, **added}), self.previous)
+        if "dt" in self.__dict__ and "dt" not in added:
+            made.__dict__["dt"] = self.dt
+        return made
 
     def where(self, keep: Flags) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
-        return self._rows(keep, self.previous)
+        channels = {name: values[keep] for name, values in self.channels.items()}
+        return Chunk(self.t[keep], channels, self.previous, self.sensors)
 
 
 def read_only(values: Array) -> Array:
@@ -121,6 +137,13 @@ def constant(values: Array) -> Array:
     return values[:1].reshape(()) if len(values) == 1 or (len(values) and np.all(values == values[0])) else values
 
 
+def extremes(values: Array) -> tuple[float, float]:
+    """Return the smallest and the largest of values (N,), NaN where one is."""
+    if len(values) == 1:
+        return (value := float(values[0])), value
+    return float(values.min()), float(values.max())
+
+
 def nominal(steps: Array, t: float) -> float | None:
     """Return the one step that steps (N,) of time stamps up to t in s are but for rounding, or None.
 
@@ -128,7 +151,8 @@ def nominal(steps: Array, t: float) -> float | None:
     the same whatever part of a recording is looked at.
     """
     rounding = 2 * float(np.spacing(t))  # of two time stamps, each read or multiplied
-    low, high = float(steps.max()) - rounding, float(steps.min()) + rounding
+    least, most = extremes(steps)
+    low, high = most - rounding, least + rounding
     middle = (low + high) / 2
     if not low <= high or middle <= rounding:
         return None

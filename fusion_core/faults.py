@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fusion_core.checks import FEW
 from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.errors import EmptyRecording, TimeBackwards, moment
 
@@ -112,13 +113,12 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         if len(chunk) == 0:  # a live source that has nothing to say
             continue
         faults.rows += len(chunk)
-        finite = chunk.t[np.abs(chunk.t) <= LARGEST]  # neither NaN
-        if faults.first_row is None and len(finite):
+        if faults.first_row is None and len(finite := chunk.t[np.abs(chunk.t) <= LARGEST]):  # neither NaN
             faults.first_row = float(finite[0]) - start
         rows = _forward(_finite(chunk, faults), previous, faults, name)
         if len(rows) == 0:
             continue
-        yield type(rows)(rows.t, rows.channels, previous)
+        yield rows.following(previous)
         previous = rows.last()
     if previous is None:
         wrong = faults.lines(notes=False)
@@ -130,7 +130,8 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = np.abs(chunk.t) <= LARGEST  # neither NaN
-    faults.add("rows with a time stamp that is not a number, left out", int(np.sum(~keep)), _after(chunk, keep, faults))
+    if lost := len(keep) - int(np.count_nonzero(keep)):
+        faults.add("rows with a time stamp that is not a number, left out", lost, _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
         low, high, unit = RANGES.get(channel, (-LARGEST, LARGEST, ""))
         if channel != "valid" and _all_usable(values, low, high):
@@ -146,13 +147,16 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         if np.any(bad):
             faults.add(f"{what}, left out", int(np.sum(bad)), f"at {faults.when(chunk.t[np.argmax(bad)])}")
             keep = keep & good
-    rows = chunk if np.all(keep) else chunk.where(keep)
-    channels = {name: values for name, values in rows.channels.items() if name != "valid"}
-    return type(chunk)(rows.t, channels, chunk.previous)
+    rows = chunk if np.count_nonzero(keep) == len(keep) else chunk.where(keep)
+    if "valid" not in rows.channels:
+        return rows
+    return Chunk(rows.t, {name: values for name, values in rows.channels.items() if name != "valid"}, chunk.previous)
 
 
 def _all_usable(values: Array, low: float, high: float) -> bool:
     """Return True if no value is NaN or beyond the range."""
+    if values.size < FEW and values.dtype.kind == "f" and float(np.vdot(values, values)) < min(high, -low) ** 2:
+        return True  # of few nearly always, and quickly
     flat = values.ravel()
     return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN
 
@@ -167,9 +171,10 @@ def _after(chunk: Chunk, keep: Flags, faults: Faults) -> str:
 def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
     if len(chunk) == 0 or faults.first_row is None:
         return chunk
-    step = np.diff(chunk.t, prepend=chunk.t[0] - 1 if previous is None else previous.t[-1])
-    if np.all(step > 0):
+    t, before = chunk.t, chunk.t[0] - 1 if previous is None else previous.t[-1]
+    if t[0] > before and (len(t) == 1 or np.all(t[1:] > t[:-1])):
         return chunk
+    step = np.diff(t, prepend=before)
     if np.any(step < 0):
         k = int(np.argmax(step < 0))
         # the row before it is left out, too

@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, Integers
+from fusion_core.chunk import Array, Chunk, Integers, extremes
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, Steps, noise_before, readings, sawtooth, started
 
@@ -98,9 +98,10 @@ class ThermometerError:
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Integers]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
         # a quarter of an octave is near enough; the least and the largest mostly say it of all
-        ends = np.rint(4 * np.log2(np.maximum([variance.min(), variance.max()], NOTHING)))
-        if ends[0] == ends[1] and np.ptp(steps) == 0:
-            return _sawtooth(float(steps[0]), float(ends[0]), self.known)[None], np.zeros(len(steps), dtype=np.int64)
+        least, most = (float(np.rint(4 * np.log2(max(value, NOTHING)))) for value in extremes(variance))
+        finest, coarsest = extremes(steps)
+        if least == most and finest == coarsest:
+            return _sawtooth(finest, least, self.known)[None], np.zeros(len(steps), dtype=np.int64)
         rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
         table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]

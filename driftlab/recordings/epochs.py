@@ -130,27 +130,30 @@ def _means(values: Array, weights: Array, starts: Integers, total: Array) -> Arr
 
 
 def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | None) -> Chunk:
-    if len(rows) == 0:
+    N, K = len(rows), len(starts)
+    if N == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = _owned(rows.t, before, pace)
     tau = np.add.reduceat(dt, starts)
-    ends = np.append(starts[1:], len(dt))
-    lasting = tau > 0
-    by_time = dt, np.where(lasting, tau, 1.0)
-    by_number = np.ones(len(dt)), (ends - starts).astype(np.float64)
+    counts = np.empty(K)
+    counts[:-1], counts[-1] = starts[1:] - starts[:-1], N - starts[-1]
+    last = slice(None) if K == N else starts + counts.astype(np.int64) - 1
+    lasting = np.count_nonzero(tau > 0) == K
+    by_time = dt, tau if lasting else np.where(tau > 0, tau, 1.0)
+    by_number = np.ones(N), counts
     channels = {"tau": tau}
     for name, values in rows.channels.items():
         if name in READINGS:
-            channels[name] = values[ends - 1]
+            channels[name] = values[last]
             continue
         weights, total = by_time if name in rows.sensors else by_number
-        means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
-        channels[name] = means.reshape(len(starts), *values.shape[1:])
-    done = Chunk(rows.t[ends - 1], channels, sensors=rows.sensors)
-    done = done if np.all(lasting) else done.where(lasting)
+        means = _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total)
+        channels[name] = means if values.ndim == 2 else means.reshape(K, *values.shape[1:])
+    done = Chunk(rows.t[last], channels, sensors=rows.sensors)
+    done = done if lasting else done.where(tau > 0)
     if previous is None and len(done):
         # the step to the first epoch is as long as what it integrates
         first = {name: values[:1] for name, values in done.channels.items()}
         previous = Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors)
-    return Chunk(done.t, done.channels, previous, done.sensors)
+    return done.following(previous)

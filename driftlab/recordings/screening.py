@@ -34,16 +34,15 @@ def read(
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     gaps, screen = Gaps(faults), _Screen(faults, sensors or {}, few=few)
     chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
-    empty = True
+    empty, previous = True, None
     for chunk in chunks:
-        taken = sorted(DERIVED & set(chunk.channels))
-        if taken:
-            raise ConfigError(
-                f"channel '{taken[0]}': the program uses this name itself; rename it under source.channels"
-            )
-        chunk = _with_sensors(chunk, sensors)
+        if not DERIVED.isdisjoint(chunk.channels):
+            name = min(DERIVED & set(chunk.channels))
+            raise ConfigError(f"channel '{name}': the program uses this name itself; rename it under source.channels")
+        chunk = _with_sensors(chunk, sensors, previous)
+        previous = chunk.last()
         keep = screen.keep(chunk)
-        kept = chunk if np.all(keep) else chunk.where(keep)
+        kept = chunk if keep is None else chunk.where(keep)
         if len(kept):
             empty = False
             faults.usable += len(kept)
@@ -69,9 +68,9 @@ class _Screen:
         self.rails: dict[str, Rails] = {}
         self.roundings: dict[str, Rounding] = {}
 
-    def keep(self, chunk: Chunk) -> Flags:
-        """Return the rows (N,) that can be used."""
-        keep = np.ones(len(chunk), dtype=np.bool_)
+    def keep(self, chunk: Chunk) -> Flags | None:
+        """Return the rows (N,) that can be used; None where all can."""
+        keep = None
         if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
             self.thermometer.look(chunk)
         for name in (name for name in chunk.channels if name in chunk.sensors):
@@ -88,19 +87,19 @@ class _Screen:
                 continue
             repeats = _repeats(chunk, name, before)
             for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
-                keep &= ~_report(chunk, name, sensor, what, bad, self.faults)
+                good = ~_report(chunk, name, sensor, what, bad, self.faults)
+                keep = good if keep is None else keep & good
         return keep
 
 
-def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
-    """Return the chunk with its sensors named, each of them (N, d).
+def _with_sensors(chunk: Chunk, declared: Collection[str] | None, previous: Chunk | None) -> Chunk:
+    """Return the chunk with its sensors named, each of them (N, d), as that of the sample before it are.
 
     Where no filter says which channels they are, those of several axes are taken for sensors.
     """
     several = (name for name, values in chunk.channels.items() if values.ndim == 2)
-    sensors = frozenset(several if declared is None else chunk.channels.keys() & set(declared))
+    sensors = frozenset(several if declared is None else (name for name in declared if name in chunk.channels))
     columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors}
-    previous = chunk.previous and _with_sensors(chunk.previous, sensors)
     return Chunk(chunk.t, {**chunk.channels, **columns}, previous, sensors)
 
 

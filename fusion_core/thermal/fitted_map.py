@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from fusion_core.chunk import Array
+from fusion_core.checks import FLOAT, all_finite
+from fusion_core.chunk import Array, extremes
 from fusion_core.errors import BadValue, OutsideDomain
 from fusion_core.faults import RANGES
 from fusion_core.settings import Frozen
@@ -208,6 +209,8 @@ class FittedMap(ABC):
 
     def _temperatures(self, T: Array) -> Array:
         """Return T as (N,); raises BadValue where it is not one number or (N,) numbers."""
+        if type(T) is np.ndarray and T.dtype == FLOAT and T.ndim == 1 and all_finite(T):
+            return T  # nearly always, and quickly
         T = np.atleast_1d(np.ma.filled(T.astype(np.float64), np.nan) if np.ma.is_masked(T) else T)
         if T.ndim != 1 or T.dtype.kind not in "fiu":
             raise BadValue(
@@ -220,10 +223,13 @@ class FittedMap(ABC):
 
     def _inside(self, T: Array, t: Array | None = None) -> Array:
         low, high = self.domain
-        if len(T) == 0 or (low <= T.min() and T.max() <= high):
+        if len(T) == 0:
+            return T
+        coldest, hottest = extremes(T)
+        if low <= coldest and hottest <= high:
             return T
         rounding = 1e-9 * max(abs(low), abs(high), 1.0)  # of a mean
-        if self.outside == "refuse" and not (low - rounding <= T.min() and T.max() <= high + rounding):
+        if self.outside == "refuse" and not (low - rounding <= coldest and hottest <= high + rounding):
             k = int(np.argmax((low - rounding > T) | (high + rounding < T)))
             raise OutsideDomain(
                 f"{self.record.kind}: T = {T[k]:.6g} °C",

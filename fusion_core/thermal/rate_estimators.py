@@ -6,13 +6,12 @@ handful of numbers carried from sample to sample: a run can be cut anywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, extremes
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit
 
@@ -80,8 +79,7 @@ CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 
-@dataclass(frozen=True)
-class RateMemory:
+class RateMemory(NamedTuple):
     """The memory from chunk to chunk: numbers of rate and temperature, and the range measured so far in degC."""
 
     numbers: Array
@@ -109,16 +107,18 @@ def with_rate(
     T = chunk["temperature"]
     if memory is None:  # before the first sample, that of a straight line too
         memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), np.array([T[0], *np.zeros(9)]))
-    dt, value, windows = np.full(T.shape, chunk.dt), memory.value, np.full(T.shape, estimator.memory_s)
+    dt, value = np.full(T.shape, chunk.dt), memory.value
     smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
     if isinstance(estimator, Regression):
         from fusion_core.recursions import regression_value
 
-        steps = chunk.channels.get("temperature_step", np.zeros(len(T)))
+        steps = chunk["temperature_step"] if "temperature_step" in chunk.channels else np.zeros(len(T))
         smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, float(WALK))
-    low, high = memory.range
-    if np.min(smooth) < domain[0] or np.max(smooth) > domain[1]:
+    else:
+        windows = np.full(T.shape, estimator.memory_s)
+    (low, high), (coldest, hottest), (least, largest) = memory.range, extremes(T), extremes(smooth)
+    if least < domain[0] or largest > domain[1]:
         lows, highs = np.minimum(np.minimum.accumulate(T), low), np.maximum(np.maximum.accumulate(T), high)
         smooth = np.clip(smooth, np.minimum(lows, domain[0]), np.maximum(highs, domain[1]))
     conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
-    return conditioned, RateMemory(numbers, (min(low, float(np.min(T))), max(high, float(np.max(T)))), value)
+    return conditioned, RateMemory(numbers, (min(low, coldest), max(high, hottest)), value)

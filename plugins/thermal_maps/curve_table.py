@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, extremes
 from fusion_core.fast import compiled
 
 INTERVALS = 2048
@@ -50,7 +50,8 @@ class CurveTable:
 
     def covers(self, T: Array) -> bool:
         """Return True if all of one temperature or more (N,) are within the domain."""
-        return bool(self.low <= T.min() and T.max() <= self.high)
+        coldest, hottest = extremes(T)
+        return self.low <= coldest and hottest <= self.high
 
     def at(self, T: Array) -> Array:
         """Return the curve (N, d) at temperatures (N,) within the domain."""
