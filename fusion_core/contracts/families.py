@@ -82,7 +82,7 @@ _TEXTS = dict.fromkeys(("title", "text", "html", "svg"), checks.text)
 REPORT_SECTIONS: Answers = {"section": instance("section", Section, optional=True, **_TEXTS)}
 STIMULI: Answers = {"inputs": instance("inputs", TriadInput), "simulated": several("simulated", Chunk)}
 PARTS: Mapping[type, Answers] = {  # what a plugin makes, which answers for it
-    FittedMap: dict.fromkeys(("_bias", "_slope", "sigma"), array("its curve", "N d")),
+    FittedMap: dict.fromkeys(("_bias", "_slope", "sigma"), checks.curve),
     Detector: {"look": checks.look},
     TriadInput: {"equations": instance("equations", Equations), "lacking": checks.text},
 }

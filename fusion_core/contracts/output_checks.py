@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_core.checks import Shape, all_finite
+from fusion_core.checks import FLOAT, Shape, all_finite
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
@@ -41,6 +41,11 @@ class Sizes(dict[str, Any]):
         super().__init__()
         self.plugin, self.arguments = plugin, arguments
 
+    @classmethod
+    def of(cls, plugin: Any, arguments: tuple[Any, ...]) -> Sizes:
+        """Return those of an answer to some arguments; of a part of it, those of the whole."""
+        return arguments[0] if arguments and type(arguments[0]) is Sizes else cls(plugin, arguments)
+
     def __missing__(self, letter: str) -> int | str:
         plugin, size = self.plugin, 0
         match letter:
@@ -65,13 +70,14 @@ def array(
     optional: bool = False,
 ) -> Check:  # fmt: skip
     """Return the check of an array of one of the shapes; with `optional`, None will do too."""
+    letters = [shape.split() for shape in shapes]
 
     def check(plugin: Any, values: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and values is None):
-            size = Sizes(plugin, (*arguments, *named.values()))
-            expected = tuple([tuple([size[letter] for letter in shape.split()]) for shape in shapes])
+            size = Sizes.of(plugin, (*arguments, *named.values()))
+            expected = tuple([tuple([size[letter] for letter in shape]) for shape in letters])
             reason = why if np.shape(values) in expected else why.format_map(size)
-            expect_array(plugin, name, values, expected, reason, kinds, finite=finite)
+            expect_array(plugin, name, values, expected, reason, kinds, finite=finite and not covariance)
             if covariance:
                 expect_covariance(plugin, name, values)
         return values
@@ -96,8 +102,9 @@ def instance(name: str, expected: type | None = None, *, optional: bool = False,
     def check(plugin: Any, answer: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and answer is None):
             expect_instance(plugin, name, answer, expected or type(plugin))
+            size = Sizes.of(plugin, (*arguments, *named.values()))
             for attribute, part in parts.items():
-                part(plugin, getattr(answer, attribute), *arguments, **named)
+                part(plugin, getattr(answer, attribute), size)
         return answer
 
     return check
@@ -172,11 +179,26 @@ def check_prior(model: BiasModel | MeasurementModel, prior: Prior, *arguments: o
 
 def check_transition(model: BiasModel, step: Transition, chunk: Chunk | int, memory: Memory = None) -> Transition:
     """Raise PluginError where N steps are not F, Q (n, n) or (N, n, n), u (n,) or (N, n) and C (d, n) or (N, d, n)."""
-    _STEPS(model, step, chunk)
-    n, d = len(model.labels), len(model.axes)
-    if step.C is None and n != d:
+    _check_steps(model, step, chunk)
+    if step.C is None and (n := len(model.labels)) != (d := len(model.axes)):
         raise plugin_error(model, f"has {n} labels for {d} axes and no C; a C ({d}, {n}) says how the bias follows")
     return step
+
+
+def _check_steps(model: BiasModel | MeasurementModel, step: Transition, chunk: Chunk | int) -> None:
+    if type(step) is Transition and _ordinary(step, len(model.labels), chunk if isinstance(chunk, int) else len(chunk)):
+        return
+    _STEPS(model, step, chunk)
+
+
+def _ordinary(step: Transition, n: int, N: int) -> bool:
+    """Return True if steps are sound and as nearly all are, which is seen quickly: F and Q constant, Q diagonal."""
+    F, Q, u = step.F, step.Q, step.u
+    for array in (F, Q, u):
+        if type(array) is not np.ndarray or array.dtype != FLOAT or not all_finite(array):
+            return False
+    shapes = step.C is None and F.shape == Q.shape == (n, n) and (u.shape == (N, n) or u.shape == (n,))
+    return shapes and np.count_nonzero(Q.diagonal() > 0) == np.count_nonzero(Q)
 
 
 def sensors(model: MeasurementModel, answer: Any) -> tuple[Sensor, ...]:
@@ -258,18 +280,21 @@ def simulated(model: MeasurementModel, answer: Any, N: int, *arguments: object) 
     return answer  # type: ignore[no-any-return]
 
 
-_AT_REST = array("still of its detector", "N", kinds="b")
-_STANDING_OUT = array("what stands out of its detector", "N D", kinds="b")
-
-
 def look(detector: Detector, answer: Any, chunk: Chunk, memory: Memory) -> tuple[Any, Any, Memory]:
     """Check what a detector shows of some epochs, and its memory."""
     if not (isinstance(answer, tuple) and len(answer) == 3):
         raise plugin_error(detector, f"look answers {a_type(answer)}, three were expected: still, standing out, memory")
-    _AT_REST(detector, answer[0], chunk)
-    _STANDING_OUT(detector, answer[1], chunk)
+    N, D = len(chunk), len(detector.axes)
+    expect_array(detector, "still of its detector", answer[0], ((N,),), kinds="b")
+    expect_array(detector, "what stands out of its detector", answer[1], ((N, D),), kinds="b")
     _lock(answer[2])
     return answer
+
+
+def curve(fitted: FittedMap, answer: Any, T: Array, *arguments: object) -> Array:
+    """Check a value of each axis at each temperature."""
+    expect_array(fitted, "its curve", answer, ((len(T), fitted.record.d),))
+    return answer  # type: ignore[no-any-return]
 
 
 def chunks(source: Any, answer: Any, size: int, faults: Faults) -> Iterator[Chunk]:
@@ -373,7 +398,7 @@ def _lock(memory: Memory, depth: int = 8) -> None:
     """Lock the arrays of a memory, in containers within one another up to a depth."""
     if isinstance(memory, np.ndarray):
         memory.flags.writeable = False
-    elif depth and isinstance(memory, tuple | list | dict):
+    elif depth and isinstance(memory, (tuple, list, dict)):
         for item in memory.values() if isinstance(memory, dict) else memory:
             _lock(item, depth - 1)
 
@@ -409,6 +434,8 @@ def expect_covariance(model: Any, name: str, matrices: Array) -> None:
     """Raise where any of the matrices (n, n) or (N, n, n) is not symmetric with no negative eigenvalue."""
     expect_finite(model, name, matrices)
     diagonal = np.ascontiguousarray(matrices.diagonal(axis1=-2, axis2=-1))
+    if np.count_nonzero(diagonal > 0) == np.count_nonzero(matrices):
+        return  # nearly always: variances alone
     scale, lowest = diagonal.max(initial=0.0), diagonal.min(initial=0.0)
     if matrices.ndim == 3 and len(matrices) > MAX_MATRICES:
         matrices = matrices[np.linspace(0, len(matrices) - 1, MAX_MATRICES).astype(int)]

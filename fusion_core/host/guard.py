@@ -72,7 +72,7 @@ def _call(method: Callable[..., Any], name: str, check: Check | None) -> Callabl
         named = named and {key: read_only(a) if isinstance(a, np.ndarray) else a for key, a in named.items()}
         try:
             answer = method(self, *given, **named)
-            if isinstance(answer, tuple | np.ndarray):  # nearly always; the look at a class of an ABC takes long
+            if isinstance(answer, (tuple, np.ndarray)):  # nearly always; the look at a class of an ABC takes long
                 pass
             elif isinstance(answer, Iterator):
                 answer = _one_by_one(self, name, answer)
