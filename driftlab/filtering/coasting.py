@@ -30,11 +30,11 @@ import numpy as np
 from driftlab.filtering.extrapolation import Extrapolation
 from driftlab.filtering.setup import RunSetup
 from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
+from fusion_core import recursions
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
 from fusion_core.fast import compiled
 from fusion_core.model import Estimates
-from fusion_core.recursions import drift
 from fusion_core.thermal.thermometer import NO_STEPS
 
 FINE = 2001  # temperatures of the tables
@@ -53,7 +53,8 @@ class Coast:
     def advance(self, N: int, step: Transition) -> tuple[Array, Array]:
         """Return the bias (N, d) that is predicted for the next N epochs, and its variance (N, d)."""
         F = step.F if step.F.ndim == 3 else step.F[None]
-        x = drift(self.x, F, np.ascontiguousarray(np.broadcast_to(step.u, (N, len(self.x)))))
+        u = step.u if step.u.ndim == 2 else np.broadcast_to(step.u, (N, len(self.x)))
+        x = recursions.drift(self.x, F, np.ascontiguousarray(u))
         self.x = x[-1]
         variance, self.P = spread(self.P, step, N)
         return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x), variance
@@ -357,11 +358,10 @@ class Prediction:
         else:
             coast, variance = self.coast.advance(len(done), step)
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
-            if x is not None or np.any(self.departed):
+            if x is not None or np.count_nonzero(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        bias, coast = (
-            _to_the_end(np.ascontiguousarray(values), *self._late(done, step), calibration) for values in (bias, coast)
-        )
+        late = self._late(done, step)
+        bias, coast = (_to_the_end(np.ascontiguousarray(values), *late, calibration) for values in (bias, coast))
         return BiasOutput(bias, sigma, coast, coast_sigma)
 
     def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:

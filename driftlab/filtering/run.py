@@ -89,6 +89,7 @@ class Run:
                 check_map(fitted, sensor)
                 followed[sensor.channel] = fitted
         self.maps = [*loaded.values(), *followed.values()]
+        self.limited = [effect for sensor in self.model.sensors for effect in with_domain(sensor.bias)]
         gate = gate_of(self.model.m, self.model.patience.false_alarm)
         self.plan = RunSetup(self.model, config.site, loaded, followed, gate, initial_error, keep_model)
 
@@ -141,7 +142,8 @@ class Run:
         waiting, done = FirstRest(self.plan), -np.inf if self.resume is None else self.resume["t"]
         with closing(stream), self._timed_errors():
             for chunk in stream:
-                chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
+                if chunk.t[0] <= done:
+                    chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
                 if len(chunk) and tracker is None:
                     chunk = waiting.take(chunk)
                     tracker = self._aligned(waiting, chunk)
@@ -211,7 +213,7 @@ class Run:
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
 
     def _note_beyond_effects(self, chunk: Chunk) -> None:
-        for effect in (effect for sensor in self.model.sensors for effect in with_domain(sensor.bias)):
+        for effect in self.limited:
             for name, outside in beyond(effect, as_measured(chunk)):
                 k = int(np.argmax(outside))
                 ends = " and ".join(f"({low:.5g}, {high:.5g})" for low, high in effect.ends(name))

@@ -118,7 +118,7 @@ class Stretches:
 
 def runs(flags: Flags) -> list[tuple[int, int]]:
     """Return start and stop of each run of true values."""
-    if not flags.any():
+    if not np.count_nonzero(flags):
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

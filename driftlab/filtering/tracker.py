@@ -75,6 +75,8 @@ class _Piece(NamedTuple):
 
     def rows(self, start: int, stop: int) -> tuple[Chunk, list[Transition]]:
         """Return the epochs and steps from start to stop."""
+        if start == 0 and stop >= len(self.epochs):
+            return self.corrected, self.steps
         return self.corrected.part(start, stop), [step.part(slice(start, stop)) for step in self.steps]
 
 
@@ -133,7 +135,7 @@ class Tracker:
                 began = self.state if self.fresh else None
                 estimates = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
                 N = len(estimates.x)
-                own = steps[self.tracked].part(slice(N))
+                own = steps[self.tracked] if len(part) == N else steps[self.tracked].part(slice(N))
                 equations = None
                 if self.plan.keep_model:
                     equations = replace(transition.part(slice(N)), C=own.C), measurement.part(slice(N))
@@ -148,9 +150,9 @@ class Tracker:
     def _pieces(self, chunk: Chunk) -> Iterator[_Piece]:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
         for regular in regular_pieces(chunk, self.first.dt):
-            at = int(np.searchsorted(regular.t, self.first.t, side="right"))
+            at = int(np.searchsorted(regular.t, self.first.t, side="right")) if self.aligning else 0
             for epochs in (regular.part(*ends) for ends in ((0, at), (at, len(regular))) if ends[0] < ends[1]):
-                if epochs.t[0] > self.first.t and self.aligning:
+                if self.aligning and epochs.t[0] > self.first.t:
                     self._depart(epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
@@ -158,14 +160,15 @@ class Tracker:
                 parts = {channel: epochs[channel] - part for channel, part in less.items()}
                 corrected = epochs.having(**parts) if parts else epochs
                 channel = self.model.tracked.channel
-                yield _Piece(epochs, corrected, less.get(channel, np.zeros_like(epochs[channel])), steps, before)
+                calibration = less[channel] if channel in less else np.zeros_like(epochs[channel])
+                yield _Piece(epochs, corrected, calibration, steps, before)
 
     def _filter(self, part: Chunk, transition: Transition, measurement: Measurement, *, keep_P: bool) -> Estimates:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
         gate = self.plan.gate * self.alignment.gate_scale
         N = len(part)
+        steps, measured = transition, measurement
         while True:
-            steps, measured = transition.part(slice(N)), measurement.part(slice(N))
             try:
                 estimates = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
             except (NotFinite, TooWide) as lost:
@@ -176,7 +179,7 @@ class Tracker:
             due = self.realigning.due(part.part(0, N), estimates.used)
             if due == N:
                 return estimates
-            N = due
+            N, steps, measured = due, transition.part(slice(due)), measurement.part(slice(due))
 
     def _align_anew(self, done: Chunk, estimates: Estimates, piece: _Piece, stop: int) -> None:
         """Begin with another alignment and a prior where the unit has come to rest anew."""
@@ -241,10 +244,11 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
     dt, tau = chunk.dt, chunk["tau"]
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
-    chunk = chunk.having(dt=np.where(regular, usual, dt), tau=np.where(regular, usual, tau))
-    if len(chunk) == 1:
-        yield chunk
+    if np.count_nonzero(regular) == len(regular):  # nearly always
+        lasting = np.full(len(regular), usual)
+        yield chunk.having(dt=lasting, tau=lasting)
         return
+    chunk = chunk.having(dt=np.where(regular, usual, dt), tau=np.where(regular, usual, tau))
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
@@ -266,7 +270,7 @@ class RestMonitor:
         self.journal.moving.note(done.t, ~still, out, self.axes)
         refused = still & ~estimates.used
         causes = np.zeros(estimates.white.shape, dtype=np.bool_)
-        if refused.any():
+        if np.count_nonzero(refused):
             size = estimates.white[refused] ** 2
             causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
         self.journal.refused.note(done.t, refused, causes, self.components)

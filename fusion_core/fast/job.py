@@ -18,9 +18,9 @@ from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import FLOAT, covariance
 from fusion_core.chunk import Array, Flags
-from fusion_core.fast import compiled, inlined
+from fusion_core.fast import compiled, inlined, loop
 from fusion_core.fast.groups import IndependentGroups, Size, find_groups
-from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive, single
+from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
 from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Measurement, State, Transition
 
@@ -61,17 +61,21 @@ def alone(
     """
     x, P, z, used = state.x, state.P, measurement.z, measurement.used
     given = z, x, P, transition.F, transition.Q, transition.u, measurement.H, measurement.R
-    n, m = np.size(x), np.size(z)
-    shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
-    for array, shape in zip(given, shapes, strict=True):
-        plain = type(array) is np.ndarray and array.dtype is FLOAT
-        if not plain or (array.shape != shape and array.shape != (1, *shape)):
+    for array in given:
+        if type(array) is not np.ndarray or array.dtype != FLOAT:
             return None
-        arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
-    measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and used.all()
+    n, m, arrays = x.size, z.size, []
+    shapes = (m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)
+    for array, shape in zip(given, shapes, strict=True):
+        if array.shape != shape:
+            if array.shape != (1, *shape):
+                return None
+            array = array[0]
+        arrays.append(array if array.flags.carray else array.copy())
+    measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and all(used.flat)
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
     sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None
-    if not (sound and single(*arrays, gate, of_x, of_z, sums)):
+    if not (sound and loop.single(*arrays, gate, of_x, of_z, sums)):
         return None
     after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])
     kept = after.P[None].copy() if keep_P else None

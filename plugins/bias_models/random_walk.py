@@ -45,10 +45,11 @@ class RandomWalk(BiasModel):
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I and Q = walk^2 dt."""
-        d = len(self.axes)
-        return Transition(np.eye(d), self._density * chunk.dt[..., None, None], np.zeros(d)), memory
+        F, density, u = self._second
+        return Transition(F, density * chunk.dt[..., None, None], u), memory
 
     @cached_property
-    def _density(self) -> Array:
-        """Of the walk (d, d): Q of one second."""
-        return np.diag(along_axes(self.walk, len(self.axes)) ** 2)
+    def _second(self) -> tuple[Array, Array, Array]:
+        """F, Q and u of one second."""
+        d = len(self.axes)
+        return np.eye(d), np.diag(along_axes(self.walk, d) ** 2), np.zeros(d)

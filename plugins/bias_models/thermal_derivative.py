@@ -111,6 +111,10 @@ class ThermalDerivative(ThermalBias):
         density[:d] = along_axes(self.walk, d) ** 2
         return np.diag(density)
 
+    @cached_property
+    def _identity(self) -> Array:
+        return np.eye(len(self.labels))
+
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule, or what earlier switch-ons say.
 
@@ -167,8 +171,9 @@ class ThermalDerivative(ThermalBias):
             level = g + self.fitted.bias(shifted["temperature"], chunk.t)
         if self.form == "difference":
             g = level
-        u = np.zeros((len(chunk), n))
-        u[1:, :d] = g[1:] - g[:-1]
+        u = np.zeros((len(g), n))
+        if len(g) > 1:
+            u[1:, :d] = g[1:] - g[:-1]
         u[0, :d] = 0.0 if before.g is None else g[0] - before.g
         if self.form == "slope" and self.fitted is not None:
             rate = chunk["temperature_rate"] * chunk.dt
@@ -180,18 +185,21 @@ class ThermalDerivative(ThermalBias):
 
     def _output(self, S: list[Array], N: int) -> Array | None:
         """Return C: None where the states are the bias, (d, n), or (N, d, n) with the signatures S (N, d, p)."""
+        if not (S or self._starts):
+            return None
         d = len(self.axes)
         starts = [np.eye(d)] * len(self._starts)
         if S:
             return np.concatenate([*(np.broadcast_to(a, (N, *a.shape[-2:])) for a in [np.eye(d), *S, *starts])], axis=2)
-        return np.hstack([np.eye(d), *starts]) if starts else None
+        return np.hstack([np.eye(d), *starts])
 
     def _transition_matrix(self, chunk: Chunk, before: _Memory) -> tuple[Array, list[Memory], list[float]]:
         """Return F, the effects' memories of their fading, and what is left of their starts."""
         d, factors = len(self.axes), []
         fadings, left = list(before.fadings), list(before.left)
-        if self._starts:
-            chunk = as_measured(chunk)
+        if not self._starts:
+            return self._identity, fadings, left
+        chunk = as_measured(chunk)
         for k in self._starts:
             factor, fadings[k] = self.effects[k].fading(chunk, before.fadings[k])
             if factor is None:  # nothing is unknown as it is configured
@@ -203,11 +211,13 @@ class ThermalDerivative(ThermalBias):
         for place, factor in enumerate(factors, start=1):
             at = len(self.labels) - d * (len(factors) - place + 1)
             diagonal[..., at : at + d] = factor[..., None]
-        return diagonal[..., None] * np.eye(len(self.labels)), fadings, left
+        return diagonal[..., None] * self._identity, fadings, left
 
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
         """Return the chunk with the temperature that the map sees."""
-        after = []
+        after: list[Memory] = []
+        if not self.effects:
+            return chunk, after
         if any(effect.acts_on_input for effect in self.effects):
             chunk = as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
@@ -219,7 +229,7 @@ class ThermalDerivative(ThermalBias):
 
     def _effects(self, chunk: Chunk, memories: list[Memory]) -> tuple[Array, list[Array], list[Memory]]:
         """Return the sum of the calibrated effects (N, d), the signatures (N, d, p) of the others, and the memories."""
-        g, S, after = np.zeros((len(chunk), len(self.axes))), [], []
+        g, S, after = np.zeros((len(chunk.t), len(self.axes))), [], []
         if self.effects:
             chunk = as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,16 +64,21 @@ class RestDetector(Detector):
         memory[-1] = -np.inf
         return memory
 
+    @cached_property
+    def _limits(self) -> tuple[list[str], Array]:
+        """Channels of the triads, and the squares (D,) of what stands out, times its weight."""
+        return list(dict.fromkeys(channel for channel, _ in self.axes)), (OUTLIER * self.density) ** 2
+
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
         """Return the epochs that are still (N,), the axes that stand out in each (N, D), and the memory."""
-        triads = dict.fromkeys(channel for channel, _ in self.axes)
-        x = np.ascontiguousarray(np.hstack([chunk[channel] for channel in triads]))
-        steep, T, rate = self.steepest, np.zeros(len(chunk)), np.zeros(len(chunk))
+        triads, limit = self._limits
+        x = np.ascontiguousarray(np.concatenate([chunk[channel] for channel in triads], axis=1))
+        steep, T = self.steepest, np.zeros(len(x))
+        rate = T
         if "temperature" in chunk.channels:
             T = chunk.channels.get("temperature_raw", chunk["temperature"])
             rate = chunk.channels.get("temperature_rate", rate)
         memory = memory.copy()
-        limit = (OUTLIER * self.density) ** 2
         means, rest = memory[: 7 * len(self.axes)].reshape(7, -1), memory[7 * len(self.axes) :]
         still, out = _look(chunk.t, chunk["tau"], x, T, rate, limit, steep, self.patience, means, rest)
         return still, out, memory

@@ -66,21 +66,23 @@ class ZeroVelocity:
 
     def transition(self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment) -> Transition:
         """Put the bias models' steps and the integrals of the epochs together."""
-        dt, tau = chunk.dt, constant(chunk["tau"])
-        arrays = [dt, tau, *(a for step in steps for a in (step.F, step.Q, step.C) if a is not None)]
-        if max(a.ndim for a in arrays) <= 2 and dt.ndim == tau.ndim == 0:  # nearly always, and then always the same
+        dt, lasting = chunk.dt, chunk["tau"]
+        tau = constant(lasting)
+        arrays = [dt, tau, *[a for step in steps for a in (step.F, step.Q, step.C) if a is not None]]
+        if dt.ndim == tau.ndim == 0 and max(a.ndim for a in arrays) <= 2:  # nearly always, and then always the same
             key = tuple(a.tobytes() for a in arrays)
             if self._kept is None or self._kept[0] != key:
                 self._kept = key, self._matrices(dt, tau, steps)
             F, Q = self._kept[1]
         else:
             F, Q = self._matrices(dt, tau, steps)
-        u, places = np.empty((len(chunk), self.space.n)), self.space.places
+        u, places = np.empty((len(lasting), self.space.n)), self.space.places
         for triad, step in zip(self.triads, steps, strict=True):
-            drift = np.atleast_2d(step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u))
+            drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
+            drift = read_only(np.ascontiguousarray(drift if drift.ndim == 2 else drift[None]))
             values, given = chunk[triad.sensor.channel], alignment.inputs[triad.sensor.channel]
             integral = u[:, places[triad.integral]]
-            _turned(chunk["tau"], values, given, read_only(np.ascontiguousarray(drift)), integral)
+            _turned(lasting, values, given, drift, integral)
             u[:, places[triad.sensor.block.name]] = step.u
         return Transition(F, Q, u)
 

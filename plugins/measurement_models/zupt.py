@@ -142,7 +142,7 @@ class Zupt(contracts.MeasurementModel):
     def _motion(self) -> ZeroVelocity:
         return ZeroVelocity(self._triads, self.space)
 
-    @property
+    @cached_property
     def tracked(self) -> contracts.Sensor:
         """The triad that `track` says."""
         return next(sensor for sensor in self.sensors if sensor.channel == self.track)
