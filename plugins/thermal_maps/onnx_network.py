@@ -25,7 +25,8 @@ other hands with one is taken too, where it is made of the operations of `onnx_g
 is run: where it gives the bias, `slope` needs a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any
 such graph will do.
 The last bits may depend on how many samples are asked for at once (1e-12 of the map's range): matrix products
-are summed in another order, and MANY samples are read from a table of the graph where that is as exact (`curve_table`).
+are summed in another order, and MANY samples, or one alone, are read from a table of the graph where that is as exact
+(`curve_table`).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 from fusion_plugins.thermal_maps.curve_table import CurveTable
 from fusion_plugins.thermal_maps.onnx_graph import KEY
 
-MANY = 4096  # temperatures at once from which on a table takes less time than the graph
+MANY = 4096  # temperatures at once from which on a table takes less time than the graph; for one, the call is long
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +114,7 @@ class OnnxMap(contracts.FittedMap):
     def _run(self, T: Array) -> Array:
         if len(T) == 0:
             return np.empty((0, self.record.d))
-        if len(T) >= MANY and self._table is not None and self._table.covers(T):
+        if (len(T) == 1 or len(T) >= MANY) and self._table is not None and self._table.covers(T):
             return self._table.at(T)
         return self._asked(T)
 
