@@ -7,7 +7,7 @@ A run on made-up samples, so that the first real one finds every loop compiled a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -109,15 +109,15 @@ class Run:
     def _prepared(self, stream: Iterable[Chunk]) -> Generator[Chunk]:
         """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: RateMemory | None = None
-        known: dict[str, tuple[int, ...]] = {}
+        known: Collection[str] = ()
         steps = max((fitted.record.steps for fitted in self.maps), default=NO_STEPS)
         coarse = steps.size, float(np.sum(sawtooth(*steps)))
         low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
         high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
-            if (shapes := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
+            if chunk.channels.keys() != known:
                 check_channels(self.model, chunk)
-                known = shapes
+                known = chunk.channels.keys()
             chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, coarse, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)

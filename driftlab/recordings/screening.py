@@ -99,8 +99,9 @@ def _with_sensors(chunk: Chunk, declared: Collection[str] | None, previous: Chun
     """
     several = (name for name, values in chunk.channels.items() if values.ndim == 2)
     sensors = frozenset(several if declared is None else (name for name in declared if name in chunk.channels))
-    columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors}
-    return Chunk(chunk.t, {**chunk.channels, **columns}, previous, sensors)
+    columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors if chunk[name].ndim != 2}
+    channels = {**chunk.channels, **columns} if columns else chunk.channels
+    return Chunk(chunk.t, channels, previous, sensors)
 
 
 class Gaps:

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from fusion_core import recursions
 from fusion_core.chunk import Array, Chunk, extremes
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit
@@ -40,9 +41,7 @@ class Regression(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        from fusion_core.recursions import regression_rate
-
-        return regression_rate(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
+        return recursions.regression_rate(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
 
 
 class Kalman(Settings):
@@ -68,9 +67,7 @@ class Kalman(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        from fusion_core.recursions import kalman_rate
-
-        return kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
+        return recursions.kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
 CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
@@ -110,10 +107,9 @@ def with_rate(
     dt, value = np.full(T.shape, chunk.dt), memory.value
     smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
     if isinstance(estimator, Regression):
-        from fusion_core.recursions import regression_value
-
         steps = chunk["temperature_step"] if "temperature_step" in chunk.channels else np.zeros(len(T))
-        smooth, windows, value = regression_value(dt, T, rate, steps, known, value, estimator.memory_s, float(WALK))
+        given = dt, T, rate, steps, known, value, estimator.memory_s, float(WALK)
+        smooth, windows, value = recursions.regression_value(*given)
     else:
         windows = np.full(T.shape, estimator.memory_s)
     (low, high), (coldest, hottest), (least, largest) = memory.range, extremes(T), extremes(smooth)

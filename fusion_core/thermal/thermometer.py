@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusion_core import recursions
 from fusion_core.chunk import Array
 
 READINGS = ("temperature_step", "temperature_variance")
@@ -188,9 +189,7 @@ class ThermometerReadings(NamedTuple):
 
 def readings(T: Array, memory: Array) -> ThermometerReadings:
     """Look at readings T (N,) in degC; `memory` is of those before (`started`), and is changed."""
-    from fusion_core.recursions import steps_and_variance
-
-    steps, variance = steps_and_variance(T, memory, LARGEST)
+    steps, variance = recursions.steps_and_variance(T, memory, LARGEST)
     return ThermometerReadings(steps, variance)
 
 
