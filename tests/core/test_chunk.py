@@ -42,3 +42,11 @@ def test_what_is_not_rounding_is_not_taken_for_it():
     assert Chunk(gap).part(1, 20).dt.shape == (19,)
     assert float(Chunk(np.zeros(5)).dt) == 0.0
     assert Chunk(np.empty(0)).dt.shape == (0,)
+
+
+def test_a_channel_more_leaves_the_steps_as_they_are_unless_it_is_them():
+    chunk = Chunk(np.array([0.0, 0.01, 0.02])).part(1, 3)
+    assert chunk.dt == chunk.having(gyro=np.zeros(2)).dt == 0.01
+    assert chunk.having(dt=np.full(2, 0.5)).dt == 0.5
+    with pytest.raises(ValueError, match="read-only"):
+        chunk.having(gyro=np.zeros(2))["gyro"][0] = 1.0

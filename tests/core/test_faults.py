@@ -49,6 +49,15 @@ def test_what_no_sensor_shows_is_left_out_and_counted():
         list(usable(chunks(range(3), accel=[1e150] * 3), Faults(), "r.csv"))
 
 
+@pytest.mark.parametrize("largest", [1e30, -1e30, 5.0])
+@pytest.mark.parametrize("count", [1, 3, 5000])
+def test_the_largest_that_a_sensor_shows_is_used_and_the_next_number_is_not(count, largest):
+    for value, used in ((largest, count), (np.nextafter(largest, 2 * largest), count - (abs(largest) > 5))):
+        accel = [*[0.0] * (count - 1), value]
+        got = list(usable(chunks(range(count + 1), size=count, accel=[*accel, 0.0]), Faults(), "r.csv"))
+        assert sum(map(len, got)) == used + 1
+
+
 def test_nothing_left_is_an_error():
     with pytest.raises(EmptyRecording, match=r"r\.csv: has no usable row"):
         list(usable(chunks([np.nan, np.nan]), Faults(), "r.csv"))

@@ -211,14 +211,16 @@ def test_a_graph_with_weights_that_are_not_numbers_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("target", ["bias", "slope"])
-def test_many_temperatures_are_as_the_graph_has_them(target):
+def test_many_temperatures_and_one_alone_are_as_the_graph_has_them(target):
     """They come from a table, which is tried halfway between its nodes; here it is tried anywhere."""
     fitted = OnnxNetwork(starts=1, target=target).fit(*soak(smooth), {})
     low, high = fitted.domain
     at = np.concatenate([[low, high], np.random.default_rng(0).uniform(low, high, 5000)])
     assert fitted._table is not None
     few = np.concatenate([fitted._run(part) for part in np.array_split(at, 10)])
+    alone = np.concatenate([fitted._run(T) for T in np.split(at[:100], 100)])
     np.testing.assert_allclose(fitted._run(at), few, rtol=0, atol=2e-13 * np.abs(few).max())
+    np.testing.assert_array_equal(alone, fitted._run(at)[:100])
 
 
 @pytest.mark.parametrize("curve", [
