@@ -98,31 +98,29 @@ class Chunk:
 
     def following(self, previous: Chunk | None) -> Chunk:
         """Return the same samples after another one."""
-        return self._made(self.t, self.channels, previous)
+        return self._made(self.channels, previous)
 
-    def _rows(self, rows: slice, previous: Chunk | None) -> Chunk:
-        channels = {name: values[rows] for name, values in self.channels.items()}
-        return self._made(self.t[rows], MappingProxyType(channels), previous)
-
-    def _made(self, t: Array, channels: Mapping[str, Array], previous: Chunk | None) -> Chunk:
-        """Return a chunk of arrays that cannot be written to already, and are not looked at again."""
-        made = object.__new__(Chunk)
-        made.__dict__.update(t=t, channels=channels, previous=previous, sensors=self.sensors)
-        return made
+    def _rows(self, rows: slice | Flags, previous: Chunk | None) -> Chunk:
+        return Chunk(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
-        added = {name: read_only(values) for name, values in channels.items()}
         known: Any = self.channels  # a proxy: to be unpacked it takes six times as long as its dict
-        made = self._made(self.t, MappingProxyType(known | added), self.previous)
-        if "dt" in self.__dict__ and "dt" not in added:
+        whole = known | {name: read_only(values) for name, values in channels.items()}
+        made = self._made(MappingProxyType(whole), self.previous)
+        if "dt" in self.__dict__ and "dt" not in channels:
             made.__dict__["dt"] = self.dt
+        return made
+
+    def _made(self, channels: Mapping[str, Array], previous: Chunk | None) -> Chunk:
+        """Return the same samples with channels that nobody can write to already: they are not looked at again."""
+        made = object.__new__(Chunk)
+        made.__dict__.update(t=self.t, channels=channels, previous=previous, sensors=self.sensors)
         return made
 
     def where(self, keep: Flags) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
-        channels = {name: values[keep] for name, values in self.channels.items()}
-        return Chunk(self.t[keep], channels, self.previous, self.sensors)
+        return self._rows(keep, self.previous)
 
 
 def read_only(values: Array) -> Array:
@@ -142,7 +140,7 @@ def constant(values: Array) -> Array:
 def extremes(values: Array) -> tuple[float, float]:
     """Return the smallest and the largest of values (N,), NaN where one is."""
     if len(values) == 1:
-        return (value := float(values[0])), value
+        return float(values[0]), float(values[0])
     return float(values.min()), float(values.max())
 
 

@@ -48,8 +48,6 @@ class Transition:
 
     def part(self, rows: slice) -> Transition:
         """Return the steps of some samples; what is the same for every step stays so."""
-        if self.invariant and self.u.ndim == 1:
-            return self
         F, Q = (a if a.ndim == 2 else a[rows] for a in (self.F, self.Q))
         C = self.C if self.C is None or self.C.ndim == 2 else self.C[rows]
         return Transition(F, Q, self.u if self.u.ndim == 1 else self.u[rows], C)

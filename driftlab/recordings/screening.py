@@ -37,8 +37,8 @@ def read(
     empty, previous = True, None
     for chunk in chunks:
         if not DERIVED.isdisjoint(chunk.channels):
-            name = min(DERIVED & set(chunk.channels))
-            raise ConfigError(f"channel '{name}': the program uses this name itself; rename it under source.channels")
+            taken = min(DERIVED & set(chunk.channels))
+            raise ConfigError(f"channel '{taken}': the program uses this name itself; rename it under source.channels")
         chunk = _with_sensors(chunk, sensors, previous)
         previous = chunk.last()
         keep = screen.keep(chunk)

@@ -41,11 +41,6 @@ class Sizes(dict[str, Any]):
         super().__init__()
         self.plugin, self.arguments = plugin, arguments
 
-    @classmethod
-    def of(cls, plugin: Any, arguments: tuple[Any, ...]) -> Sizes:
-        """Return those of an answer to some arguments; of a part of it, those of the whole."""
-        return arguments[0] if arguments and type(arguments[0]) is Sizes else cls(plugin, arguments)
-
     def __missing__(self, letter: str) -> int | str:
         plugin, size = self.plugin, 0
         match letter:
@@ -70,14 +65,13 @@ def array(
     optional: bool = False,
 ) -> Check:  # fmt: skip
     """Return the check of an array of one of the shapes; with `optional`, None will do too."""
-    letters = [shape.split() for shape in shapes]
 
     def check(plugin: Any, values: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and values is None):
-            size = Sizes.of(plugin, (*arguments, *named.values()))
-            expected = tuple([tuple([size[letter] for letter in shape]) for shape in letters])
+            size = Sizes(plugin, (*arguments, *named.values()))
+            expected = tuple([tuple([size[letter] for letter in shape.split()]) for shape in shapes])
             reason = why if np.shape(values) in expected else why.format_map(size)
-            expect_array(plugin, name, values, expected, reason, kinds, finite=finite and not covariance)
+            expect_array(plugin, name, values, expected, reason, kinds, finite=finite)
             if covariance:
                 expect_covariance(plugin, name, values)
         return values
@@ -102,9 +96,8 @@ def instance(name: str, expected: type | None = None, *, optional: bool = False,
     def check(plugin: Any, answer: Any, *arguments: Any, **named: Any) -> Any:
         if not (optional and answer is None):
             expect_instance(plugin, name, answer, expected or type(plugin))
-            size = Sizes.of(plugin, (*arguments, *named.values()))
             for attribute, part in parts.items():
-                part(plugin, getattr(answer, attribute), size)
+                part(plugin, getattr(answer, attribute), *arguments, **named)
         return answer
 
     return check
@@ -186,19 +179,18 @@ def check_transition(model: BiasModel, step: Transition, chunk: Chunk | int, mem
 
 
 def _check_steps(model: BiasModel | MeasurementModel, step: Transition, chunk: Chunk | int) -> None:
-    if type(step) is Transition and _ordinary(step, len(model.labels), chunk if isinstance(chunk, int) else len(chunk)):
-        return
-    _STEPS(model, step, chunk)
+    if not _ordinary(step, len(model.labels), chunk if isinstance(chunk, int) else len(chunk)):
+        _STEPS(model, step, chunk)
 
 
 def _ordinary(step: Transition, n: int, N: int) -> bool:
     """Return True if steps are sound and as nearly all are, which is seen quickly: F and Q constant, Q diagonal."""
-    F, Q, u = step.F, step.Q, step.u
-    for array in (F, Q, u):
-        if type(array) is not np.ndarray or array.dtype != FLOAT or not all_finite(array):
+    if type(step) is not Transition or step.C is not None:
+        return False
+    for array, shapes in ((step.F, ((n, n),)), (step.Q, ((n, n),)), (step.u, ((n,), (N, n)))):
+        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes or not all_finite(array):
             return False
-    shapes = step.C is None and F.shape == Q.shape == (n, n) and (u.shape == (N, n) or u.shape == (n,))
-    return shapes and np.count_nonzero(Q.diagonal() > 0) == np.count_nonzero(Q)
+    return bool(np.count_nonzero(step.Q.diagonal() > 0) == np.count_nonzero(step.Q))
 
 
 def sensors(model: MeasurementModel, answer: Any) -> tuple[Sensor, ...]:
@@ -434,8 +426,6 @@ def expect_covariance(model: Any, name: str, matrices: Array) -> None:
     """Raise where any of the matrices (n, n) or (N, n, n) is not symmetric with no negative eigenvalue."""
     expect_finite(model, name, matrices)
     diagonal = np.ascontiguousarray(matrices.diagonal(axis1=-2, axis2=-1))
-    if np.count_nonzero(diagonal > 0) == np.count_nonzero(matrices):
-        return  # nearly always: variances alone
     scale, lowest = diagonal.max(initial=0.0), diagonal.min(initial=0.0)
     if matrices.ndim == 3 and len(matrices) > MAX_MATRICES:
         matrices = matrices[np.linspace(0, len(matrices) - 1, MAX_MATRICES).astype(int)]

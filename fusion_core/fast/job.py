@@ -61,17 +61,13 @@ def alone(
     """
     x, P, z, used = state.x, state.P, measurement.z, measurement.used
     given = z, x, P, transition.F, transition.Q, transition.u, measurement.H, measurement.R
-    for array in given:
-        if type(array) is not np.ndarray or array.dtype != FLOAT:
-            return None
-    n, m, arrays = x.size, z.size, []
-    shapes = (m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)
+    n, m = np.size(x), np.size(z)
+    shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
     for array, shape in zip(given, shapes, strict=True):
-        if array.shape != shape:
-            if array.shape != (1, *shape):
-                return None
-            array = array[0]
-        arrays.append(array if array.flags.carray else array.copy())
+        plain = type(array) is np.ndarray and array.dtype == FLOAT
+        if not plain or (array.shape != shape and array.shape != (1, *shape)):
+            return None
+        arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and all(used.flat)
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
     sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None

@@ -223,9 +223,7 @@ class FittedMap(ABC):
 
     def _inside(self, T: Array, t: Array | None = None) -> Array:
         low, high = self.domain
-        if len(T) == 0:
-            return T
-        coldest, hottest = extremes(T)
+        coldest, hottest = extremes(T) if len(T) else self.domain
         if low <= coldest and hottest <= high:
             return T
         rounding = 1e-9 * max(abs(low), abs(high), 1.0)  # of a mean

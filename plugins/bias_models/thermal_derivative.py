@@ -111,10 +111,6 @@ class ThermalDerivative(ThermalBias):
         density[:d] = along_axes(self.walk, d) ** 2
         return np.diag(density)
 
-    @cached_property
-    def _identity(self) -> Array:
-        return np.eye(len(self.labels))
-
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule, or what earlier switch-ons say.
 
@@ -172,8 +168,7 @@ class ThermalDerivative(ThermalBias):
         if self.form == "difference":
             g = level
         u = np.zeros((len(g), n))
-        if len(g) > 1:
-            u[1:, :d] = g[1:] - g[:-1]
+        u[1:, :d] = g[1:] - g[:-1]
         u[0, :d] = 0.0 if before.g is None else g[0] - before.g
         if self.form == "slope" and self.fitted is not None:
             rate = chunk["temperature_rate"] * chunk.dt
@@ -185,20 +180,18 @@ class ThermalDerivative(ThermalBias):
 
     def _output(self, S: list[Array], N: int) -> Array | None:
         """Return C: None where the states are the bias, (d, n), or (N, d, n) with the signatures S (N, d, p)."""
-        if not (S or self._starts):
-            return None
         d = len(self.axes)
-        starts = [np.eye(d)] * len(self._starts)
+        starts = [np.eye(d) for _ in self._starts]
         if S:
             return np.concatenate([*(np.broadcast_to(a, (N, *a.shape[-2:])) for a in [np.eye(d), *S, *starts])], axis=2)
-        return np.hstack([np.eye(d), *starts])
+        return np.hstack([np.eye(d), *starts]) if starts else None
 
     def _transition_matrix(self, chunk: Chunk, before: _Memory) -> tuple[Array, list[Memory], list[float]]:
         """Return F, the effects' memories of their fading, and what is left of their starts."""
         d, factors = len(self.axes), []
         fadings, left = list(before.fadings), list(before.left)
         if not self._starts:
-            return self._identity, fadings, left
+            return np.eye(len(self.labels)), fadings, left
         chunk = as_measured(chunk)
         for k in self._starts:
             factor, fadings[k] = self.effects[k].fading(chunk, before.fadings[k])
@@ -211,13 +204,11 @@ class ThermalDerivative(ThermalBias):
         for place, factor in enumerate(factors, start=1):
             at = len(self.labels) - d * (len(factors) - place + 1)
             diagonal[..., at : at + d] = factor[..., None]
-        return diagonal[..., None] * self._identity, fadings, left
+        return diagonal[..., None] * np.eye(len(self.labels)), fadings, left
 
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
         """Return the chunk with the temperature that the map sees."""
-        after: list[Memory] = []
-        if not self.effects:
-            return chunk, after
+        after = []
         if any(effect.acts_on_input for effect in self.effects):
             chunk = as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -64,17 +63,12 @@ class RestDetector(Detector):
         memory[-1] = -np.inf
         return memory
 
-    @cached_property
-    def _limits(self) -> tuple[list[str], Array]:
-        """Channels of the triads, and the squares (D,) of what stands out, times its weight."""
-        return list(dict.fromkeys(channel for channel, _ in self.axes)), (OUTLIER * self.density) ** 2
-
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
         """Return the epochs that are still (N,), the axes that stand out in each (N, D), and the memory."""
-        triads, limit = self._limits
+        triads = dict.fromkeys(channel for channel, _ in self.axes)
         x = np.ascontiguousarray(np.concatenate([chunk[channel] for channel in triads], axis=1))
         steep, T = self.steepest, np.zeros(len(x))
-        rate = T
+        rate, limit = T, (OUTLIER * self.density) ** 2
         if "temperature" in chunk.channels:
             T = chunk.channels.get("temperature_raw", chunk["temperature"])
             rate = chunk.channels.get("temperature_rate", rate)
