@@ -61,7 +61,7 @@ def filtered(e, walk, noise, Q, R, at, now):
 
 def errors(case: Coarse, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return error over sigma of prediction and running bias once a minute, (n,) each, of one axis."""
-    from driftlab.filtering.coasting import _of_coast, _of_estimate
+    from driftlab.filtering.coasting import _deviations
 
     rng, law = np.random.default_rng([seed, 77]), KINDS[case.kind]
     T, error, true = temperatures(case, rng, ("chamber", "day", "warm_up", "chamber")[seed % 4])
@@ -73,18 +73,17 @@ def errors(case: Coarse, seed: int) -> tuple[np.ndarray, np.ndarray]:
     first, later = (
         type(error)(*(np.ascontiguousarray(x[part]) for x in error)) for part in (slice(cut), slice(cut, N))
     )
-    tables = (-60.0, 1.0, np.full((200, 1), b))
-    known, learnt, sigma = np.zeros((3, 2, 1)), np.array([[np.nan], [0.0], [0.0]]), np.empty((N, 1))
-    weight, white, none = np.full(N, case.interval), np.array([law.white**2]), np.zeros(1)
-    modes = np.zeros((200, 0, 1))
-    _of_estimate(T[:cut], *first, P[:cut], weight[:cut], white, none, *tables, modes, known, learnt, sigma[:cut])
-    departed, coasting = known.copy(), np.empty((N - cut, 1))
-    _of_estimate(T[cut:], *later, P[cut:], weight[cut:], white, none, *tables, modes, known, learnt, sigma[cut:])
-    walked = P[cut - 1, 0] + Q * np.arange(1, N - cut + 1)[:, None]
-    _of_coast(T[cut:], *later, walked, none, *tables, np.zeros((200, 1)), departed, coasting)
+    tables = (-60.0, 1.0, np.full((200, 1), b), np.zeros((200, 0, 1)), np.zeros((200, 1)))
+    known, learnt = np.zeros((3, 2, 1)), np.array([[np.nan], [0.0], [0.0]])
+    weight, given = np.full(N, case.interval), (np.array([law.white**2]), np.zeros(1), np.zeros(1), *tables)
+    sigma, coasting = np.empty((N, 1)), np.empty((N, 1))
+    walked = P[cut - 1, 0] + Q * np.arange(1 - cut, N - cut + 1)[:, None]  # from the departure on
+    for part, error in ((slice(cut), first), (slice(cut, N), later)):
+        variances, outputs = (P[part], walked[part]), (sigma[part], coasting[part])
+        _deviations(T[part], *error, *variances, weight[part], *given, known, known.copy(), learnt, *outputs)
     coast = off[cut - 1] + e[cut:] - e[cut - 1] - np.cumsum(walk[cut:])
     each = max(1, round(60 / case.interval))
-    return (coast / coasting[:, 0])[::each], (off[cut:] / sigma[cut:, 0])[::each]
+    return (coast / coasting[cut:, 0])[::each], (off[cut:] / sigma[cut:, 0])[::each]
 
 
 def shares(drawn: list[tuple[np.ndarray, np.ndarray]], k: int) -> str:

@@ -86,12 +86,11 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
     smooth, rate = np.empty(len(T)), np.empty(len(T))
     usual, keep = -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
-        wtt += dt[k] * (dt[k] * w - 2 * wt)
-        wt -= dt[k] * w
-        wtT -= dt[k] * wT
+        wtt, wt, wtT = wtt + dt[k] * (dt[k] * w - 2 * wt), wt - dt[k] * w, wtT - dt[k] * wT
         if dt[k] != usual:
             usual, keep = dt[k], np.exp(-dt[k] / tau)
-        w, wt, wtt, wT, wtT, pull = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT, keep * pull
+        w, wt, wtt, wT, wtT = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT
+        pull = keep * pull if pull > 1e-200 else 0.0  # a processor takes long over numbers next to zero
         spread = wtt - wt * wt / w + pull
         rate[k] = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
         smooth[k] = T_0 + (wT - rate[k] * wt) / w

@@ -19,6 +19,7 @@ from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.segment import TEMPERATURES, RunLog, RunSegment
 from driftlab.filtering.smoothing import Spool
 from driftlab.storage.hdf5 import PIECE, Columns, GrowingFile, columns_of, continued, named, reading
+from fusion_core.consistency import Whiteness
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
 from fusion_core.host.provenance import participants, upgraded
@@ -33,6 +34,7 @@ UNITS = {
 TRACKED = ("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration")  # in the unit of the tracked sensor
 # seven digits are enough for what is noise, or was measured in single precision
 SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", *TEMPERATURES)
+DETAIL = ("white", "temperature_rate")  # looked at seldom: of whole innovations, and of `temperature`
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
@@ -43,9 +45,10 @@ def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
     return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | sized
 
 
-def at_file_precision(columns: Columns) -> dict[str, NDArray[Any]]:
-    """Return the columns of a run as precise as `estimates.h5` keeps them."""
-    return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
+def at_file_precision(columns: Columns, *, detail: bool = True) -> dict[str, NDArray[Any]]:
+    """Return the columns of a run as precise as `estimates.h5` keeps them; those of DETAIL only where it is wanted."""
+    kept = {name: values for name, values in columns.items() if detail or name not in DETAIL}
+    return {n: values.astype(np.float32, copy=False) if n in SINGLE else values for n, values in kept.items()}
 
 
 def write_smoothed(
@@ -141,6 +144,8 @@ class EstimatesWriter:
         Whether they are a device's.
     smooth : bool
         Whether they are to be smoothed when all are there.
+    detail : bool
+        Whether all columns are kept; a run that goes on keeps those that it began with.
     more : callable
         What else belongs into a checkpoint.
     """
@@ -151,9 +156,11 @@ class EstimatesWriter:
     recording: Path | None = None
     live: bool = False
     smooth: bool = False
+    detail: bool = True
     more: Callable[[], dict[str, Any]] = dict
     checkpoint: dict[str, Any] | None = None  # of an earlier run
     spool: Spool | None = None
+    whiteness: Whiteness | None = None  # of the innovations, where they are not kept
     observed: OverviewAccumulator | None = None  # of all rows, where they were looked at as they came
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
@@ -189,13 +196,21 @@ class EstimatesWriter:
         recording = os.path.realpath(self.recording) if self.recording is not None else ""
         attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
         keep = self.checkpoint["rows"] if self.checkpoint else 0
+        known = self.checkpoint["whiteness"] if self.checkpoint else None if self.detail else {}
+        if known is not None:
+            self.whiteness = Whiteness(model.m)
+            vars(self.whiteness).update(known)
         if self.smooth:
             self.spool = Spool(self.folder / SPOOL, keep)
         self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
 
     def append(self, stretch: RunSegment) -> Columns:
         """Add the estimates of a stretch, and return them as they are kept."""
-        columns = at_file_precision(stretch.columns())
+        columns: Columns = stretch.columns()
+        if self.whiteness is not None:
+            after = columns["used"] & (columns["t"] > self.journal.alignments[0].t)
+            self.whiteness.add(columns["white"][slice(None) if np.all(after) else after].astype(np.float32))
+        columns = at_file_precision(columns, detail=self.whiteness is None)
         self.add(columns)
         if self.spool is not None:
             self.spool.add(stretch)
@@ -214,7 +229,8 @@ class EstimatesWriter:
         self.file.flush()
         if self.possible:
             content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
-                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
+                       "rows": self.file.rows, "run": snapshot(),
+                       "whiteness": None if self.whiteness is None else vars(self.whiteness)}  # fmt: skip
             try:
                 write_checkpoint(self.folder / CHECKPOINT, content | self.more())
             except PluginError as error:

@@ -166,6 +166,7 @@ def run(
     channel: str | None = None,
     smooth: bool = False,
     certificate: bool = False,
+    detail: bool = False,
     resume: bool = False,
     force: bool = False,
     progress: Progress | None = None,
@@ -195,6 +196,9 @@ def run(
     certificate : bool
         Write a certificate too: one sheet with results, uncertainty and limits.
         As certificate.html and certificate.json into `out`, which it needs.
+    detail : bool
+        Keep more of each update: the innovations made white, and the temperature's rate.
+        They are `white` (N, m) and `temperature_rate` (N,).
     resume : bool
         Go on where the same run was broken off.
         It needs `out`, in which that run left a checkpoint.
@@ -220,9 +224,9 @@ def run(
         _check_in_memory(smooth, certificate)
         running = Run(understood, journal)
         columns = at_file_precision(joined(_segments(running, journal, progress)))
-        return RunResult(scored(running, columns), columns)
+        return RunResult(scored(running, columns), at_file_precision(columns, detail=detail))
     with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
-        estimates = EstimatesWriter(folder, understood, journal, smooth=smooth)
+        estimates = EstimatesWriter(folder, understood, journal, smooth=smooth, detail=detail)
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
@@ -232,7 +236,7 @@ def run(
                 hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                 kept = estimates.append(segment)
                 if before is None and not smooth:  # else what the file has by its end is looked at
-                    estimates.observed = estimates.observed or accumulator_of(running)
+                    estimates.observed = estimates.observed or accumulator_of(running, estimates.whiteness)
                     do(estimates.observed.add, kept)
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
@@ -277,7 +281,7 @@ def finish(
     note_first_row(path, run.journal.faults.first_row)
     if estimates.observed is None:
         with reading(path) as file:
-            estimates.observed = accumulator_of(run).read(file)
+            estimates.observed = accumulator_of(run, estimates.whiteness).read(file)
     result = RunResult(scored(run, estimates.observed), Stored(out / "estimates.h5"), recorded)
     result._write(folder, certificate=certificate)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more

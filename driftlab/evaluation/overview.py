@@ -32,7 +32,7 @@ from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor
 from fusion_core.fast import compiled
 from fusion_core.faults import DOUBT
 
-ROWS = 65_536  # of a block
+ROWS = 32_768  # of a block
 POINTS = 2000  # rows kept for the figures at most, and half of them at least where there are as many
 STRETCHES = 400  # of which the figures show errors, two points each, and mean nis; up to twice as many
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
@@ -71,17 +71,20 @@ class Overview:
 class OverviewAccumulator:
     """The sums and rows behind an overview, taken while a run goes by: any split of it gives the same.
 
-    The alignment is the run's first; `averages` are given every block, which is gathered up to so many rows.
+    The alignment is the run's first; `averages` are given every block, which is gathered up to so many rows. Where the
+    rows have no innovations, made white, `whiteness` has them.
     """
 
     def __init__(
-        self, model: MeasurementModel, alignment: Alignment, averages: Averages | None = None, rows: int = ROWS
-    ) -> None:
+        self, model: MeasurementModel, alignment: Alignment, averages: Averages | None = None, rows: int = ROWS,
+        whiteness: Whiteness | None = None,
+    ) -> None:  # fmt: skip
         self.model, self.alignment, self.rows, d = model, alignment, rows, len(model.tracked.axes)
         self.averages, self.names = averages, NAMES if averages is None else (*NAMES, "calibration")
         self.count = self.used = self._pending = 0
         self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
-        self._scores, self._whiteness, self._envelope = ScoreAccumulator(d), Whiteness(model.m), Envelope(d)
+        self._scores, self._envelope = ScoreAccumulator(d), Envelope(d)
+        self._whiteness = whiteness or Whiteness(model.m)
         self._curves, self._last = _Thinned(), Columns()
         self._parts: list[Mapping[str, Array]] = []  # of the next block
         self._waiting: list[Columns] = []  # blocks whose reference is not known yet
@@ -103,7 +106,7 @@ class OverviewAccumulator:
     def _gather(self) -> None:
         """Look at the block that has come together, and at those that waited for it."""
         names = [name for name in self.names if self._parts and name in self._parts[0]]
-        block = {n: np.concatenate([part[n] for part in self._parts], dtype=np.float64) for n in names}
+        block = {n: rows.astype(np.float64, copy=False) for n, rows in _joined(self._parts, names).items()}
         self._parts, self._pending = [], 0
         if block:
             self._waiting.append(block)
@@ -123,7 +126,8 @@ class OverviewAccumulator:
         self._last = _rows(block, len(used) - 1, None)
         errors = errors_of(block, block["reference"])
         self._scores.add(block, errors)
-        self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
+        if "white" in block:
+            self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
         self._envelope.add(block, errors, after)
         self._curves.add(block)
         if self.averages is not None:
@@ -216,8 +220,8 @@ def _every(block: Columns, start: int, step: int) -> Columns:
     return {name: values[start::step].copy() for name, values in block.items()}
 
 
-def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+def _joined(parts: Sequence[Mapping[str, Array]], names: Iterable[str]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) if parts[1:] else parts[0][name] for name in names}
 
 
 class Envelope:
@@ -377,10 +381,10 @@ class ScoredRun:
         return check_limits(self.config.limits, self.measured, doubts)
 
 
-def accumulator_of(run: Run) -> OverviewAccumulator:
+def accumulator_of(run: Run, whiteness: Whiteness | None = None) -> OverviewAccumulator:
     """Return the accumulator of a run's overview, and of the averages that the config's limits need."""
     first = run.journal.alignments[0]
-    return OverviewAccumulator(run.model, first, averages_of(run.config, first))
+    return OverviewAccumulator(run.model, first, averages_of(run.config, first), whiteness=whiteness)
 
 
 def scored(run: Run, rows: OverviewAccumulator | Mapping[str, Array]) -> ScoredRun:

@@ -243,29 +243,30 @@ def _integrate(
     t: Array, tau: Array, error: Array, known: Flags, start: float, end: float,
     last: Array, squares: Array, total: Array, times: Array,
 ) -> None:  # fmt: skip
-    d = error.shape[1]
+    d, before = error.shape[1], -1
     for k in range(len(t)):
         if not known[k]:
             continue
-        begin = max(t[k] - tau[k], start)
-        gap = begin - last[0]  # NaN at the first
-        if gap > 1e-9 and last[0] < end:
-            part = min(gap, end - last[0])
+        begin, then = max(t[k] - tau[k], start), last[0] if before < 0 else t[before]
+        gap = begin - then  # NaN at the first
+        if gap > 1e-9 and then < end:
+            part = min(gap, end - then)
             times[0] += part
             for j in range(d):
-                a = last[1 + j]
+                a = last[1 + j] if before < 0 else error[before, j]
                 b = a + (error[k, j] - a) * part / gap
                 squares[j] += part * (a * a + a * b + b * b) / 3
                 total[j] += part * (a + b) / 2
-        lasted = min(t[k], end) - begin
+        lasted, before = min(t[k], end) - begin, k
         if lasted > 0:
-            times += lasted
+            times[0], times[1] = times[0] + lasted, times[1] + lasted
             for j in range(d):
                 squares[j] += lasted * error[k, j] ** 2
                 total[j] += lasted * error[k, j]
-        last[0] = t[k]
+    if before >= 0:
+        last[0] = t[before]
         for j in range(d):
-            last[1 + j] = error[k, j]
+            last[1 + j] = error[before, j]
 
 
 def errors_of(estimates: Mapping[str, Array], reference: Array) -> Array:

@@ -33,7 +33,7 @@ from driftlab.filtering.thermometer import ReadingError, ThermometerError, copie
 from fusion_core import recursions
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
-from fusion_core.fast import compiled
+from fusion_core.fast import compiled, inlined
 from fusion_core.model import Estimates
 from fusion_core.thermal.thermometer import NO_STEPS
 
@@ -77,14 +77,14 @@ def _alone(P: Array, F: Array, Q: Array, variance: Array) -> bool:
     """Go on from P, state by state; return whether all of them are alone (P, F and Q diagonal), else nothing counts."""
     n = len(P)
     for k in range(len(variance)):
-        F_k, Q_k = F[min(k, len(F) - 1)], Q[min(k, len(Q) - 1)]
+        k_F, k_Q = min(k, len(F) - 1), min(k, len(Q) - 1)
         if k < max(len(F), len(Q)):  # else the same as before
             for i in range(n):
                 for j in range(n):
-                    if i != j and (F_k[i, j] != 0 or Q_k[i, j] != 0 or P[i, j] != 0):
+                    if i != j and (F[k_F, i, j] != 0 or Q[k_Q, i, j] != 0 or P[i, j] != 0):
                         return False
         for i in range(n):
-            P[i, i] = variance[k, i] = F_k[i, i] ** 2 * P[i, i] + Q_k[i, i]
+            P[i, i] = variance[k, i] = F[k_F, i, i] ** 2 * P[i, i] + Q[k_Q, i, i]
     return True
 
 
@@ -115,9 +115,8 @@ class Uncertainty:
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
         self.fitted, self.noise, d = fitted, noise, len(noise)
         # c, h and the imaginary c of both parts of the thermometer's error: of the running estimate, and of the coast
-        self.following = self.departing = np.zeros((3, 2, d))
-        self.learnt: Array = np.zeros((0, d))
-        self._between: Array | None = None
+        self.following, self.departing = np.zeros((3, 2, d)), np.zeros((3, 2, d))
+        self.learnt, self._between = np.zeros((0, d)), np.zeros((FINE, d))
         if fitted is None:
             return
         low, high = fitted.domain
@@ -151,27 +150,24 @@ class Uncertainty:
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
 
-    def of_estimate(self, P: Array, weight: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
-        """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states.
+    def deviations(
+        self, variances: tuple[Array, Array], weight: Array, T: Array | None, error: ReadingError | None,
+        tilts: tuple[Array, Array],
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return the deviations (N, d) of running estimate and prediction, from the variances (N, d) of their states.
 
-        `weight` (N,) is how long each epoch was measured for, s.
+        Each has a vertical (d,) of its own. `weight` (N,) is how long each epoch was measured for, s.
         """
+        squares = tilts[0] ** 2, tilts[1] ** 2
         if self.fitted is None or T is None or error is None:
-            return np.asarray(np.sqrt(P + tilt**2))
-        self.following, self.learnt, sigma = self.following.copy(), self.learnt.copy(), np.empty(P.shape)
-        tables = (self.low, self.step, self.slope, self.modes)
-        variances = (np.ascontiguousarray(P), weight, self.noise**2, tilt**2)
-        _of_estimate(T, *error, *variances, *tables, self.following, self.learnt, sigma)
-        return sigma
-
-    def of_coast(self, P: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
-        """Return the deviation (N, d) of the prediction from the variance P (N, d) of its states."""
-        if self._between is None or T is None or error is None:
-            return np.asarray(np.sqrt(P + tilt**2))
-        self.departing, sigma = self.departing.copy(), np.empty(P.shape)
-        tables = (self.low, self.step, self.slope, self._between)
-        _of_coast(T, *error, np.ascontiguousarray(P), tilt**2, *tables, self.departing, sigma)
-        return sigma
+            return np.sqrt(variances[0] + squares[0]), np.sqrt(variances[1] + squares[1])
+        sigmas = np.empty_like(variances[1]), np.empty_like(variances[1])
+        tables = self.low, self.step, self.slope, self.modes, self._between
+        memory = self.following, self.departing, self.learnt
+        _deviations(
+            T, *error, *map(np.ascontiguousarray, variances), weight, self.noise**2, *squares, *tables, *memory, *sigmas
+        )
+        return sigmas
 
 
 @compiled
@@ -183,9 +179,10 @@ def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
 
 
 @compiled
-def _of_estimate(
-    T: Array, error: Array, left: Array, P: Array, weight: Array, noise: Array, tilt: Array,
-    low: float, step: float, slope: Array, modes: Array, following: Array, learnt: Array, sigma: Array,
+def _deviations(
+    T: Array, error: Array, left: Array, P: Array, P_coast: Array, weight: Array, noise: Array, tilt: Array,
+    tilt_coast: Array, low: float, step: float, slope: Array, modes: Array, between: Array, following: Array,
+    departing: Array, learnt: Array, sigma: Array, sigma_coast: Array,
 ) -> None:  # fmt: skip
     r, d = modes.shape[1], modes.shape[2]
     known, passed, last = np.zeros((3, d)), np.empty((3, d)), -1.0  # variance, gain and its logarithm worked out last
@@ -198,29 +195,51 @@ def _of_estimate(
         for j in range(d):
             if P[k, j] != known[0, j]:
                 _gain(P[k, j], last, noise[j], j, known)
-            g, b = known[1, j], (1 - share) * slope[i, j] + share * slope[i + 1, j]
+                g = known[1, j]
+                passed[0, j], passed[1, j], passed[2, j] = (1 - g) ** 2, 2 * g * (1 - g), g * g
             learnt[r + 1, j] += known[2, j]
             since = max(since, learnt[r + 1, j])
-            passed[0, j], passed[1, j], passed[2, j] = (1 - g) ** 2, 2 * g * (1 - g), g * g
-            sigma[k, j] = b
-        root = np.sqrt(error[k, 0]), np.sqrt(error[k, 1])
-        for j in range(d):
-            b, total, g = sigma[k, j], 0.0, known[1, j]
-            for m in range(2):
-                y, kept = b * root[m], left[k, m] * following[0, m, j]
-                if m == 0:
-                    kept -= left[k, 2] * following[2, 0, j]
-                    turned = left[k, 0] * following[2, 0, j] + left[k, 2] * following[0, 0, j]
-                    following[2, 0, j] = _unless_tiny((1 - g) * turned)
-                h = passed[0, j] * following[1, m, j] + passed[1, j] * kept * y + passed[2, j] * y * y
-                c = _unless_tiny((1 - g) * kept + g * y)
-                following[0, m, j], following[1, m, j] = c, _unless_tiny(h)
-                total += max(y * y - 2 * y * c + h, 0.0)
-            sigma[k, j] = P[k, j] + tilt[j] + total
         if learnt[r, 0] != learnt[r, 0] or abs(T[k] - learnt[r, 0]) > NEAR or since > LITTLE:
             _learn(T[k], i, share, modes, learnt)
+        root = np.sqrt(error[k, 0]), np.sqrt(error[k, 1])
         for j in range(d):
-            sigma[k, j] = np.sqrt(sigma[k, j] + learnt[r + 2, j])
+            b = (1 - share) * slope[i, j] + share * slope[i + 1, j]
+            total, total_coast = _reading_errors(b, root, left, k, known[1, j], passed, j, following, departing)
+            apart = (1 - share) * between[i, j] + share * between[i + 1, j]
+            sigma[k, j] = np.sqrt(P[k, j] + tilt[j] + total + learnt[r + 2, j])
+            sigma_coast[k, j] = np.sqrt(P_coast[k, j] + tilt_coast[j] + apart + total_coast)
+
+
+@inlined
+def _reading_errors(
+    b: float,
+    root: tuple[float, float],
+    left: Array,
+    k: int,
+    g: float,
+    passed: Array,
+    j: int,
+    following: Array,
+    departing: Array,
+) -> tuple[float, float]:
+    """Go on to epoch k with both parts of the thermometer's error in axis j, y; return what is left of their variance.
+
+    That is in the running estimate, of gain g, and in the prediction.
+    """
+    total = total_coast = 0.0
+    for m in range(2):
+        y, kept, kept_coast = b * root[m], left[k, m] * following[0, m, j], left[k, m] * departing[0, m, j]
+        if m == 0:
+            turned = left[k, 0] * following[2, 0, j] + left[k, 2] * following[0, 0, j]
+            turned_coast = left[k, 0] * departing[2, 0, j] + left[k, 2] * departing[0, 0, j]
+            kept, kept_coast = kept - left[k, 2] * following[2, 0, j], kept_coast - left[k, 2] * departing[2, 0, j]
+            following[2, 0, j], departing[2, 0, j] = _unless_tiny((1 - g) * turned), _unless_tiny(turned_coast)
+        h = passed[0, j] * following[1, m, j] + passed[1, j] * kept * y + passed[2, j] * y * y
+        c, c_coast = _unless_tiny((1 - g) * kept + g * y), _unless_tiny(kept_coast)
+        following[0, m, j], following[1, m, j], departing[0, m, j] = c, _unless_tiny(h), c_coast
+        total += max(y * y - 2 * y * c + h, 0.0)
+        total_coast += max(y * y - 2 * y * c_coast + departing[1, m, j], 0.0)
+    return total, total_coast
 
 
 @compiled
@@ -255,28 +274,6 @@ def _learn(T: float, i: int, share: float, modes: Array, learnt: Array) -> None:
             learnt[m, j] = here if new else here + (learnt[m, j] - here) * kept
             total += (here - learnt[m, j]) ** 2
         learnt[r, j], learnt[r + 1, j], learnt[r + 2, j] = T, 0.0, total
-
-
-@compiled
-def _of_coast(
-    T: Array, error: Array, left: Array, P: Array, tilt: Array,
-    low: float, step: float, slope: Array, between: Array, departing: Array, sigma: Array,
-) -> None:  # fmt: skip
-    for k in range(len(T)):
-        i, share = _place(T[k], low, step, len(slope))
-        root = np.sqrt(error[k, 0]), np.sqrt(error[k, 1])
-        for j in range(P.shape[1]):
-            b, total = (1 - share) * slope[i, j] + share * slope[i + 1, j], 0.0
-            for m in range(2):
-                y, c = b * root[m], left[k, m] * departing[0, m, j]
-                if m == 0:
-                    c -= left[k, 2] * departing[2, 0, j]
-                    turned = left[k, 0] * departing[2, 0, j] + left[k, 2] * departing[0, 0, j]
-                    departing[2, 0, j] = _unless_tiny(turned)
-                departing[0, m, j] = c = _unless_tiny(c)
-                total += max(y * y - 2 * y * c + departing[1, m, j], 0.0)
-            apart = (1 - share) * between[i, j] + share * between[i + 1, j]
-            sigma[k, j] = np.sqrt(P[k, j] + tilt[j] + apart + total)
 
 
 class BiasOutput(NamedTuple):
@@ -348,20 +345,19 @@ class Prediction:
         """
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
-        bias, variance = _output(estimates, self.block, step.C)
-        sigma = self.uncertainty.of_estimate(variance, done["tau"] * estimates.used, T, error, tilt)
+        states, at, variance = _output(estimates, self.block, step.C)
         x = self.extrapolation.look(done)
         left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
-        sigma = sigma if left is None else np.hypot(sigma, left)
         if self.coast is None:
-            coast = coast_sigma = np.full_like(bias, np.nan)
+            coast = ahead = np.full(variance.shape, np.nan)
         else:
-            coast, variance = self.coast.advance(len(done), step)
-            coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
-            if x is not None or np.count_nonzero(self.departed):
-                coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        late = self._late(done, step)
-        bias, coast = (_to_the_end(np.ascontiguousarray(values), *late, calibration) for values in (bias, coast))
+            coast, ahead = self.coast.advance(len(done), step)
+        weight, tilts = done["tau"] * estimates.used, (tilt, self.first.unsure)
+        sigma, coast_sigma = self.uncertainty.deviations((variance, ahead), weight, T, error, tilts)
+        sigma = sigma if left is None else np.hypot(sigma, left)
+        if x is not None or np.count_nonzero(self.departed):
+            coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
+        bias, coast = _to_the_end(states, at, coast, *self._late(done, step), calibration)
         return BiasOutput(bias, sigma, coast, coast_sigma)
 
     def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:
@@ -375,21 +371,27 @@ class Prediction:
 
 
 @compiled
-def _to_the_end(values: Array, share: Array, drift: Array, calibration: Array) -> Array:
-    """Return the values (N, d) with a share (N,) of the drift and with the calibration (N, d)."""
-    N, d = values.shape
-    out = np.empty((N, d))
+def _to_the_end(
+    states: Array, at: int, coast: Array, share: Array, drift: Array, calibration: Array
+) -> tuple[Array, Array]:
+    """Return the bias, of states (N, n) from place `at` on, and the prediction (N, d) at the ends of the epochs.
+
+    That is with a share (N,) of the drift, and with the calibration (N, d).
+    """
+    N, d = coast.shape
+    bias, ahead = np.empty((N, d)), np.empty((N, d))
     for k in range(N):
         k_u = min(k, len(drift) - 1)
         for j in range(d):
-            out[k, j] = values[k, j] + share[k] * drift[k_u, j] + calibration[k, j]
-    return out
+            late, known = share[k] * drift[k_u, j], calibration[k, j]
+            bias[k, j], ahead[k, j] = states[k, at + j] + late + known, coast[k, j] + late + known
+    return bias, ahead
 
 
-def _output(estimates: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
-    """Return the bias (N, d) and its variance from the states of its block."""
+def _output(estimates: Estimates, block: slice, C: Array | None) -> tuple[Array, int, Array]:
+    """Return states that hold the bias, from which place on, and its variance (N, d), from the states of its block."""
     if C is None:
-        return estimates.x[:, block], estimates.sigma[:, block] ** 2
+        return estimates.x, block.start, estimates.sigma[:, block] ** 2
     assert estimates.P is not None, "the deviation of an output needs P"
     variance = np.einsum("...ij,...jl,...il->...i", C, estimates.P[:, block, block], C)
-    return np.einsum("...ij,...j->...i", C, estimates.x[:, block]), variance
+    return np.einsum("...ij,...j->...i", C, estimates.x[:, block]), 0, variance

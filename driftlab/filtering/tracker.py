@@ -43,7 +43,7 @@ def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
     )
 
 
-SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
+SPAN = 32_768  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 

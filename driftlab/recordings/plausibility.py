@@ -103,11 +103,11 @@ class Rounding:
         if self.sensor is None or len(chunk) < BLOCK or not np.any(self.step):
             return
         starts = np.unique(np.linspace(0, len(chunk) - BLOCK, min(BLOCKS, len(chunk) // BLOCK)).astype(np.intp))
-        changes = np.abs(np.diff(chunk[self.name][starts[:, None] + np.arange(BLOCK)], axis=1))
+        rows = starts[:, None] + np.arange(BLOCK)
+        changes = np.abs(np.diff(chunk[self.name][rows], axis=1))
         self.squares.append(np.mean(changes**2, axis=1))
-        self.dt.append(float(np.median(np.diff(chunk.t))))
-        least = np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf)
-        step = np.minimum(self.step, least)
+        self.dt.append(float(np.median(np.diff(chunk.t[rows], axis=1))))
+        step = np.minimum(self.step, np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf))
         known = np.where(np.isfinite(self.step), self.step, 0.0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where there are no steps
             times = np.vstack([changes.reshape(-1, len(step)), known]) / step
@@ -176,19 +176,20 @@ class Thermometer:
     def _repeats(self, t: Array, T: Array, changed: NDArray[np.intp], known: int) -> None:
         """Look for a repetition far beyond the habit; `changed` are rows with another reading than the one before."""
         edges = np.concatenate([[known - self.run], changed, [len(T)]])
-        runs, last = np.diff(edges), edges[1:] - 1
-        begins = np.append(t[0] if np.isnan(self.since) else self.since, t[changed])
-        before = np.maximum.accumulate(np.append(self.longest, runs[:-1]))
-        lively = self.changes + np.arange(len(runs)) >= LIVELY
-        for k in np.flatnonzero(lively & (runs > STUCK * before) & (t[last] - begins >= LASTING))[:1]:
-            self.faults.doubt(
-                f"temperature shows exactly {T[last[k]]:.6g} °C from {self.faults.when(begins[k])} on, and had never "
-                f"shown one reading in more than {before[k]} rows: the thermometer is stuck; leave that part out with "
-                "PATH::START:STOP"
-            )
-            self.longest = int(runs[k])
-        self.changes, self.longest = self.changes + len(changed), max(self.longest, int(before[-1]))
-        self.run, self.since = int(runs[-1]), float(begins[-1])
+        runs, since = np.diff(edges), t[0] if np.isnan(self.since) else self.since
+        for k in np.flatnonzero(runs > STUCK * max(self.longest, 1)):  # seldom any
+            begin, last = t[edges[k]] if k else since, edges[k + 1] - 1
+            before = int(np.max(runs[:k], initial=self.longest))
+            if self.changes + k >= LIVELY and runs[k] > STUCK * before and t[last] - begin >= LASTING:
+                self.faults.doubt(
+                    f"temperature shows exactly {T[last]:.6g} °C from {self.faults.when(begin)} on, and had never "
+                    f"shown one reading in more than {before} rows: the thermometer is stuck; leave that part out with "
+                    "PATH::START:STOP"
+                )
+                self.longest = int(runs[k])
+                break
+        self.changes, self.longest = self.changes + len(changed), int(np.max(runs[:-1], initial=self.longest))
+        self.run, self.since = int(runs[-1]), float(t[changed[-1]] if len(changed) else since)
 
     def _jumps(self, t: Array, T: Array, steps: Array) -> None:
         usual = float(np.median(steps[steps > 0]))

@@ -118,9 +118,9 @@ class Gaps:
         """Pass the rows of a source on, and look at them: what is left out of them is counted by itself."""
         for chunk in chunks:
             yield chunk
-            t = chunk.t[np.isfinite(chunk.t)]
-            if len(t):
-                self.look(t)
+            known = np.isfinite(chunk.t)
+            if np.any(known):
+                self.look(chunk.t if np.all(known) else chunk.t[known])
 
     def look(self, t: Array) -> None:
         """Look at the times (N,) of the next rows."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Columns = Mapping[str, NDArray[Any]]
 PIECE = 1 << 12  # rows of one piece of a data set
-ROWS = 1 << 16  # rows written, or copied, at once
+ROWS = 1 << 15  # rows written, or copied, at once
 AS_IT_IS = 1  # of a piece that the compression was left out
 
 
@@ -137,20 +137,20 @@ class GrowingFile:
     def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
         start = written // PIECE * PIECE
         for name, data in self._data.items():
-            begun = [self._begun[name]] if name in self._begun else []
-            values = _one_by_one([*begun, *(part[name] for part in parts)], data.dtype)
-            data.id.set_extent((end, *values.shape[1:]))
+            rows = [*([self._begun[name]] if name in self._begun else []), *(part[name] for part in parts)]
+            first, rest = (_joined(rows, *ends, data.dtype) for ends in ((0, PIECE), (PIECE, sum(map(len, rows)))))
+            data.id.set_extent((end, *data.shape[1:]))
             for at in range(start, end, PIECE):
-                new = at >= written  # a piece that is there in part keeps its place
-                self._put(name, at, values[at - start : min(at + PIECE, end) - start], new=new)
-            left = values[end // PIECE * PIECE - start :]
-            self._begun[name] = left.copy() if values.strides[0] else left
+                piece = rest[at - start - PIECE : end - start - PIECE][:PIECE] if at > start else first[: end - start]
+                self._put(name, at, piece, new=at >= written)  # a piece that is there in part keeps its place
+            left = first if end - start < PIECE else rest[end // PIECE * PIECE - start - PIECE :]
+            self._begun[name] = left.copy() if left.strides[0] else left
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
         data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
         if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if name in self._settling and new and full and (piece.strides[0] == 0 or np.all(piece == piece[0])):
+        if name in self._settling and new and full and _alike(piece):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
@@ -198,13 +198,23 @@ class GrowingFile:
         self._file.swmr_mode = True
 
 
-def _one_by_one(parts: list[NDArray[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return rows joined, row by row in memory; where one row stands for all of them, as one that does."""
-    parts = [part for part in parts if len(part)]
-    if not any(part.strides[0] or np.any(part[0] != parts[0][0]) for part in parts):
-        row = parts[0][0].astype(dtype)
-        return np.broadcast_to(row, (sum(map(len, parts)), *row.shape))
-    return np.ascontiguousarray(np.concatenate(parts, dtype=dtype))
+def _joined(parts: list[NDArray[Any]], start: int, stop: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return rows of parts that follow one another, row by row in memory; where one stands for all, as one that does.
+
+    Rows of one part are not copied: most pieces are.
+    """
+    begins = np.cumsum([0, *map(len, parts)])
+    found = [part[max(start - at, 0) : max(stop - at, 0)] for part, at in zip(parts, begins, strict=False)]
+    found = [part for part in found if len(part)] or [parts[0][:0]]
+    if len(found[0]) and not any(part.strides[0] or np.any(part[0] != found[0][0]) for part in found):
+        row = found[0][0].astype(dtype)
+        return np.broadcast_to(row, (sum(map(len, found)), *row.shape))
+    return np.ascontiguousarray(found[0] if len(found) == 1 else np.concatenate(found), dtype=dtype)
+
+
+def _alike(rows: NDArray[Any]) -> bool:
+    """Return True if all rows are the same; the last tells most that are not."""
+    return rows.strides[0] == 0 or bool(np.all(rows[-1] == rows[0]) and np.all(rows == rows[0]))
 
 
 def beside(path: Path) -> Path:

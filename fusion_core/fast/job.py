@@ -25,7 +25,7 @@ from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Measurement, State, Transition
 
 DETOUR = 256  # samples of recursion once one is refused: others are often near
-SPAN = 16_384  # samples with steady gains at first; each further stretch is longer
+SPAN = 65_536  # samples with steady gains at first; each further stretch is longer
 NARROW = 8  # states of a group for the tuples of `steady`
 
 

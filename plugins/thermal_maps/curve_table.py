@@ -66,10 +66,9 @@ def _at(T: Array, low: float, scale: float, coefficients: Array) -> Array:
         place = (T[k] - low) * scale
         i = min(int(place), count - 1)
         x = place - i - 0.5
-        row, found = coefficients[i], values[k]
         for j in range(d):
-            found[j] = row[powers - 1, j]
-        for p in range(powers - 2, -1, -1):
-            for j in range(d):
-                found[j] = found[j] * x + row[p, j]
+            value = coefficients[i, powers - 1, j]
+            for p in range(powers - 2, -1, -1):
+                value = value * x + coefficients[i, p, j]
+            values[k, j] = value
     return values

@@ -76,6 +76,17 @@ def test_a_run_is_what_the_command_writes(files):
                     np.testing.assert_array_equal(array, values[:])
 
 
+@pytest.mark.parametrize("more", [{}, {"out": "{}"}, {"out": "{}", "smooth": True}])
+def test_detail_is_more_columns_and_no_other_numbers(files, more):
+    places = [more | {"out": more["out"].format(k)} if more else {} for k in range(2)]
+    plain, detailed = (driftlab.run("unit.yaml", "rest.h5", detail=k == 1, **place) for k, place in enumerate(places))
+    assert set(detailed) - set(plain) == {"white", "temperature_rate"}
+    for name, values in plain.items():
+        np.testing.assert_array_equal(detailed[name], values)
+    np.testing.assert_allclose(np.sum(detailed["white"] ** 2, axis=1), detailed["nis"], rtol=1e-5)
+    assert str(plain.summary) == str(detailed.summary)
+
+
 def test_arrays_in_memory_give_what_the_file_gives(files, data):
     from_file, from_arrays = driftlab.run("unit.yaml", "rest.h5"), driftlab.run(CONFIG, data)
     for name, values in from_file.items():

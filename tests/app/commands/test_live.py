@@ -98,7 +98,7 @@ def test_a_live_run_ends_cleanly_and_its_recording_gives_it_again(bench, end):
     assert 0.2 < last["nis_per_component"] < 5
     assert summary["updates"]["used"] == summary["updates"]["count"] > 40
     assert {path.name for path in (folder / "out").iterdir()} == {"estimates.h5", "summary.json", "report.html"}
-    driftlab(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "again")
+    driftlab(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "again", "--detail")
     same(folder / "out" / "estimates.h5", folder / "again" / "estimates.h5")
 
 
@@ -158,7 +158,7 @@ def test_what_was_flushed_is_readable_after_kill_and_the_run_goes_on(bench):
     stop.set()
     sender.join(timeout=10)
     assert run.returncode == 0, errors
-    driftlab(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "again")
+    driftlab(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "again", "--detail")
     same(folder / "out" / "estimates.h5", folder / "again" / "estimates.h5")
 
 

@@ -116,6 +116,7 @@ def test_kills_change_nothing(recording):
     killed, whole = (yaml.safe_load((recording / name / "summary.json").read_text()) for name in ("killed", "whole"))
     for name in ("faults", "motion_s", "aligned_again_s", "updates"):
         assert killed[name] == whole[name]
+    np.testing.assert_allclose(killed["whiteness_p"], whole["whiteness_p"], rtol=1e-6)
 
 
 def test_another_config_is_not_continued(recording):

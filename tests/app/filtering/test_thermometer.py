@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from readings_at_rest import DEG_H, errors
 
-from driftlab.filtering.coasting import _of_estimate
+from driftlab.filtering.coasting import _deviations
 from driftlab.filtering.thermometer import ReadingError, ThermometerError
 from fusion_core.chunk import Chunk
 from fusion_core.thermal.rate_estimators import Regression, with_rate
@@ -100,9 +100,10 @@ def test_the_part_in_an_estimate_is_that_of_all_errors_together():
     gain[0] = 1.0
     at, sigma, one = np.arange(N, dtype=float), np.empty((N, 1)), np.ones(1)
     small = 1e-15  # the variance of the states, beside the thermometer's
-    variances = small * gain, np.full(N, 1 / small), one, 0 * one
-    tables = 0.0, 1.0, slope, np.zeros((N, 0, 1))
-    _of_estimate(at, *error, *variances, *tables, np.zeros((3, 2, 1)), np.array([[np.nan], [0.0], [0.0]]), sigma)
+    variances = small * gain, small * gain, np.full(N, 1 / small), one, 0 * one, 0 * one
+    tables = 0.0, 1.0, slope, np.zeros((N, 0, 1)), np.zeros((N, 1))
+    memory = np.zeros((3, 2, 1)), np.zeros((3, 2, 1)), np.array([[np.nan], [0.0], [0.0]])
+    _deviations(at, *error, *variances, *tables, *memory, sigma, np.empty((N, 1)))
     found = sigma[:, 0] ** 2
     expected = np.zeros(N)
     filtered = np.zeros((N, N))  # what is left of the errors up to each epoch
