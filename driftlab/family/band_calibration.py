@@ -16,17 +16,15 @@ share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
+from itertools import chain
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, Posterior, fit_family
-from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
-from driftlab.family.unit_information import UnitInformation
+from driftlab.family.mixed_model import Family, Posterior, fit_parts
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, UnitOfLot, in_partitions
 from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
 
@@ -62,80 +60,76 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
     """
     units = in_partitions(units, A_FEW)
     rows = [row for own in units.map(_ranges) for row in own]
-    first, last = np.array([domain for domain, _ in rows]).T
+    first, last = np.array([domain for domain, *_ in rows]).T
     whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
     long = long[sample_of(len(long), MAX_LEFT_OUT)]
-    fold = np.full(len(units), -1)
-    fold[long] = np.arange(len(long)) % FOLDS
-    bare = units.keep("bare", _bare)
-    families = [fit_family(bare.chosen(np.flatnonzero(fold != k)), start=family) for k in range(FOLDS)]
-    measured = units.chosen(long, A_FEW).reduce(partial(_measured, families, whole), fold[long])
+    folds = [long[k::FOLDS] for k in range(FOLDS)]
+    families = fit_parts(units, [np.setdiff1d(np.arange(len(units)), fold) for fold in folds], family)
+    jobs = [(own, part) for own, fold in zip(families, folds, strict=True) for part in units.chosen(fold, A_FEW).parts]
+    of_units = [*chain.from_iterable(units.engine(partial(_measured, whole), jobs))]
+    measured = [of_units[k] for k in np.argsort(np.concatenate(folds))]
     parts, factors, far = [], [], []
-    for part, pairs in zip(PARTS, measured, strict=True):
-        if pairs:
+    for part, column in zip(PARTS, zip(*measured, strict=True), strict=True):
+        if pairs := [pair for pair in column if pair is not None]:
             parts.append(part)
             factors.append(_factors([scores for scores, _ in pairs], len(long)))
             far.append(tuple(np.quantile([distances for _, distances in pairs], 1 - FAR, axis=0).tolist()))
-    noise = _typical(np.array([noise for _, noise in rows]), _alike(units))
+    have = [k for k, (*_, known) in enumerate(rows) if known]
+    alike = units.chosen((have[k] for k in sample_of(len(have), ALIKE)), ALIKE)
+    noise = _typical(np.array([noise for _, noise, _ in rows]), *units.engine(_common_walk, alike.parts))
     return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
-def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array]]]:
-    """Return the range of each unit, degC, and the densities of its white noise and its walk."""
-    return [(soaked.knots.domain, (soaked.white, soaked.walk)) for soaked, _ in units]
-
-
-def _bare(units: Sequence[UnitOfLot]) -> list[UnitOfLot]:
-    """Return units without their rows."""
-    return [(replace(soaked, recordings=()), lot) for soaked, lot in units]
+def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array], bool]]:
+    """Return the range of each unit, degC, the densities of its white noise and its walk, and whether it has rows."""
+    return [(soaked.knots.domain, (soaked.white, soaked.walk), bool(soaked.recordings)) for soaked, _ in units]
 
 
 def _measured(
-    families: Sequence[Family], whole: tuple[float, float], units: Sequence[UnitOfLot], fold: NDArray[np.intp]
-) -> tuple[list[tuple[Array, Array]], ...]:
-    """Return, of each part, z and g of units by the families that they were left out of, and their distances."""
-    measured: tuple[list[tuple[Array, Array]], ...] = tuple([] for _ in PARTS)
-    for (soaked, lot), k in zip(units, fold.tolist(), strict=True):
-        family = families[k]
-        before = family.marginal(lot)
+    whole: tuple[float, float], job: tuple[Family, Partition[Sequence[UnitOfLot]]]
+) -> list[list[tuple[Array, Array] | None]]:
+    """Return z and g of each part of each unit by a family that it was left out of, and its distances; None of none."""
+    (family, units), laws, measured = job, dict[str, Posterior](), []
+    first, last = family.knots.domain
+    for soaked, lot in units.read():
+        before = laws.get(lot) or laws.setdefault(lot, family.marginal(lot))
         more = before.informed(*family.information_of(soaked))
-        (low, high), (first, last) = soaked.knots.domain, family.knots.domain
+        low, high = soaked.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
-        B = family.knots.values(T)
-        for part, pairs in zip(PARTS, measured, strict=True):
+        B, of_parts = family.knots.values(T), list[tuple[Array, Array] | None]()
+        for part in PARTS:
             low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
-            short = soaked.between(low, high)
-            if short is not None:
-                J, h = family.information_of(short)
-                beyond = B[(low > T) | (high < T)]
-                pairs.append((_scores(beyond, before.informed(J, h), more), before.distance(J, h)))
+            if (short := soaked.between(low, high)) is None:
+                of_parts.append(None)
+                continue
+            J, h = family.information_of(short)
+            beyond = B[(low > T) | (high < T)]
+            of_parts.append((_scores(beyond, before.informed(J, h), more), before.distance(J, h)))
+        measured.append(of_parts)
     return measured
 
 
-def _alike(units: Partitions[Sequence[UnitOfLot]]) -> list[UnitInformation]:
-    """Return some units that have rows, which tell a walk that units have alike."""
-    have = [k for k, known in enumerate(one for own in units.map(_have_rows) for one in own) if known]
-    return [soaked for soaked, _ in units.chosen(have[k] for k in sample_of(len(have), ALIKE)).read()]
+def _common_walk(units: Partition[Sequence[UnitOfLot]]) -> tuple[Array, Array]:
+    """Return the walk over white noise that units have alike, 1/sqrt(s), and the likely walk of each."""
+    some = [soaked for soaked, _ in units.read()]
+    return common_walk([soaked.recordings for soaked in some], some[0].knots.step)
 
 
-def _have_rows(units: Sequence[UnitOfLot]) -> list[bool]:
-    return [bool(soaked.recordings) for soaked, _ in units]
+def _typical(noise: Array, common: tuple[Array, Array] | None = None) -> Typical:
+    """Return the noise of units with white noise and walk (n, 2, d); the walk, which a soak may hardly show, of some.
 
-
-def _typical(noise: Array, some: Sequence[UnitInformation]) -> Typical:
-    """Return the noise of units with white noise and walk (n, 2, d); the walk, which a soak may hardly show, of `some`.
-
-    Where their sweeps need a larger walk than is likely by neighbouring rows, that is in it too.
+    Of these the `common` one is known, and the likely ones. Where their sweeps need a larger walk than is likely by
+    neighbouring rows, that is in it too.
     """
     tiny = np.finfo(float).tiny
     logs = np.log(np.maximum(noise, tiny))
     white, walk = middle = np.median(logs, axis=0)
     spread = 1.4826 * np.median(np.abs(logs - middle), axis=0)
-    if some:
-        alike, likely = common_walk([soaked.recordings for soaked in some], some[0].knots.step)
+    if common is not None:
+        alike, likely = common
         more = np.exp(walk) / np.maximum(np.median(likely, axis=0), tiny)
         walk = np.log(np.maximum(np.exp(white) * alike * np.where(more > PASSES, more, 1.0), tiny))
     return Typical(

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,10 +51,12 @@ class EffectContrasts:
     c: Array  # (..., d, K) coefficients, SI; 0 where a unit cannot show any
     information: Array  # (..., d, K) 1 / variance of each under the unit's own noise
     placebos: Array  # (..., d, K, J) noise along each placebo, in its own deviation; 0 where nothing of it is its own
+    lots: tuple[str, ...] = ()  # of units
 
     def of(self, columns: slice) -> EffectContrasts:
         """Return some of the columns."""
-        return EffectContrasts(self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :])
+        c, information, placebos = self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :]
+        return EffectContrasts(c, information, placebos, self.lots)
 
     def flat(self, units: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array, Array]:
         """Return coefficients, information (n, d K) and placebos (n, d K, J) of some units, axis by axis."""
@@ -71,25 +73,34 @@ def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     return [Chunk(rows.t, {**rows.channels, "temperature": without_noise(rows.T)}) for rows in soaked.recordings]
 
 
-def signatures(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
-    """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
+class UnitSignatures:
+    """Signatures of effects in the recordings of a unit, `chunks` as effects read them."""
 
-    A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's, with
-    the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if the
-    unit's recordings lack a channel of the effect.
-    """
-    if not effect.acts_on_input:
-        return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks]
-    curve = own_curve(soaked).T
-    temperatures = [(effect.input(chunk, None)[0], chunk["temperature"]) for chunk in chunks]
-    return [((soaked.knots.values(T) - soaked.knots.values(at)) @ curve)[:, :, None] for T, at in temperatures]
+    def __init__(self, soaked: UnitInformation) -> None:
+        self.soaked, self.chunks = soaked, chunks_of(soaked)
 
+    @cached_property
+    def _curve(self) -> tuple[Array, list[Array]]:
+        """The unit's own curve (q, d), and the splines (R, q) at the temperature of each recording."""
+        return own_curve(self.soaked).T, [self.soaked.knots.values(chunk["temperature"]) for chunk in self.chunks]
 
-def columns_of(effects: Sequence[Effect], soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
-    """Return the signatures of effects side by side (R, d, K), of each recording."""
-    none = [np.zeros((len(rows.t), len(soaked.axes), 0)) for rows in soaked.recordings]
-    parts = zip(none, *(signatures(effect, soaked, chunks) for effect in effects), strict=True)
-    return [np.concatenate(part, axis=2) for part in parts]
+    def of(self, effect: Effect) -> list[Array]:
+        """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
+
+        A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's,
+        with the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if
+        the unit's recordings lack a channel of the effect.
+        """
+        if not effect.acts_on_input:
+            return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in self.chunks]
+        curve, splines = self._curve
+        lagged = [self.soaked.knots.values(effect.input(chunk, None)[0]) for chunk in self.chunks]
+        return [((there - here) @ curve)[:, :, None] for there, here in zip(lagged, splines, strict=True)]
+
+    def columns(self, effects: Sequence[Effect]) -> list[Array]:
+        """Return the signatures of effects side by side (R, d, K), of each recording."""
+        none = [np.zeros((len(rows.t), len(self.soaked.axes), 0)) for rows in self.soaked.recordings]
+        return [np.concatenate(part, axis=2) for part in zip(none, *map(self.of, effects), strict=True)]
 
 
 def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
@@ -121,14 +132,13 @@ class UnitRows:
     """
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
-        self.soaked, self.chunks = soaked, chunks_of(soaked)
+        self.soaked, self.signatures = soaked, UnitSignatures(soaked)
         low, high = soaked.knots.domain
         knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]
-        fixed = columns_of(linear, soaked, self.chunks)
-        self.Q = [_orthonormal(X) for X in self._white(fixed, curves)]
+        self.Q = [_orthonormal(X) for X in self._white(self.signatures.columns(linear), curves)]
         bias = self._white([rows.bias[:, :, None] for rows in soaked.recordings])
         self.r = [y[:, 0] - Q @ (Q.T @ y[:, 0]) for Q, y in zip(self.Q, bias, strict=True)]
 
@@ -139,7 +149,7 @@ class UnitRows:
         at = 0
         for effect, size in zip(effects, sizes, strict=True):
             try:
-                for part, values in zip(parts, signatures(effect, self.soaked, self.chunks), strict=True):
+                for part, values in zip(parts, self.signatures.of(effect), strict=True):
                     part[:, :, at : at + size] = values
             except MissingChannel:
                 pass
@@ -152,7 +162,7 @@ class UnitRows:
 
         Raises MissingChannel if the unit's recordings lack a channel of the effect.
         """
-        signature = self._white(signatures(effect, self.soaked, self.chunks))
+        signature = self._white(self.signatures.of(effect))
         estimates = [_least_squares(Q, r, Z) for Q, r, Z in zip(self.Q, self.r, signature, strict=True)]
         c, covariances = (np.stack(values) for values in zip(*estimates, strict=True))
         return c, covariances
@@ -250,17 +260,19 @@ def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:
     square = e * e
     with_e = square.T @ waves
     G = (square.T @ products).reshape(K, PLACEBOS, PLACEBOS)
-    with_Q = (Q.T @ (e[:, :, None] * waves[:, None]).reshape(R, -1)).reshape(-1, K, PLACEBOS).transpose(1, 2, 0)
+    placebos = (np.ascontiguousarray(e.T)[:, None] * np.ascontiguousarray(waves.T)).reshape(-1, R)
+    with_Q = (Q.T @ placebos.T).reshape(-1, K, PLACEBOS).transpose(1, 2, 0)
     G -= with_Q @ with_Q.transpose(0, 2, 1) + with_e[:, :, None] * with_e[:, None] / size[:, None, None]
-    b = (e * r[:, None]).T @ waves - with_e * along[:, None]
+    b = np.ascontiguousarray(((e * r[:, None]).T @ waves - with_e * along[:, None]).T)
+    G = np.ascontiguousarray(G.transpose(1, 2, 0))
     for j in range(PLACEBOS):  # Cholesky, without what is left of none
-        own = G[:, j, j] > OWN * size
-        root = np.sqrt(np.where(own, G[:, j, j], 1.0))
-        column = np.where(own[:, None], G[:, :, j] / root[:, None], 0.0)
-        b[:, j] = np.where(own, b[:, j] / root, 0.0)
-        b[:, j + 1 :] -= column[:, j + 1 :] * b[:, j, None]
-        G -= column[:, :, None] * column[:, None]
-    return np.asarray(b)
+        own = G[j, j] > OWN * size
+        root = np.sqrt(np.where(own, G[j, j], 1.0))
+        column = np.where(own, G[j + 1 :, j] / root, 0.0)
+        b[j] = np.where(own, b[j] / root, 0.0)
+        b[j + 1 :] -= column * b[j]
+        G[j + 1 :, j + 1 :] -= column[:, None] * column
+    return b.T
 
 
 def _orthonormal(X: Array) -> Array:

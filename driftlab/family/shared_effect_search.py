@@ -146,25 +146,26 @@ def contrasts_of(
 ) -> EffectContrasts:
     """Return the contrasts of the units for all offers beside the effects in the model: arrays over (n, d, K)."""
     effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
-    return together([one for own in sample.map(partial(_contrasts, effects, sizes, beside)) for one in own])
+    found = [one for own in sample.map(partial(_contrasts, effects, sizes, beside)) for one in own]
+    return together([contrasts for contrasts, _ in found], [lot for _, lot in found])
 
 
 def _contrasts(
     effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], units: Sequence[UnitOfLot]
-) -> list[EffectContrasts]:
+) -> list[tuple[EffectContrasts, str]]:
     with threadpool_limits(1):
-        return [UnitRows(soaked, beside).contrasts(effects, sizes) for soaked, _ in units]
+        return [(UnitRows(soaked, beside).contrasts(effects, sizes), lot) for soaked, lot in units]
 
 
-def together(units: Sequence[EffectContrasts]) -> EffectContrasts:
-    """Return the contrasts of units as arrays over units."""
-    return EffectContrasts(
-        *(np.stack([getattr(unit, name) for unit in units]) for name in ("c", "information", "placebos"))
-    )
+def together(units: Sequence[EffectContrasts], lots: Sequence[str] = ()) -> EffectContrasts:
+    """Return the contrasts of units, and their lots, as arrays over units."""
+    arrays = (np.stack([getattr(unit, name) for unit in units]) for name in ("c", "information", "placebos"))
+    return EffectContrasts(*arrays, lots=tuple(lots))
 
 
-def evaluate(offers: Sequence[Offer], contrasts: EffectContrasts, lots: Sequence[str]) -> list[Candidate]:
+def evaluate(offers: Sequence[Offer], contrasts: EffectContrasts) -> list[Candidate]:
     """Return every offer with its evidence: of all units, or of the one lot that has it most clearly."""
+    lots = contrasts.lots
     everyone, counts = np.arange(len(lots)), Counter(lots)
     groups = {"": everyone}
     if len(counts) > 1:
@@ -225,9 +226,9 @@ def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate
     return total
 
 
-def between_lots(offer: Offer, contrasts: EffectContrasts, lots: Sequence[str]) -> float | None:
+def between_lots(offer: Offer, contrasts: EffectContrasts) -> float | None:
     """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
-    if len(set(lots)) < 2:
+    if len(set(lots := contrasts.lots)) < 2:
         return None
     return float(_left_out([offer], contrasts, np.arange(len(lots)), np.array(lots)).sum()) / len(lots)
 

@@ -15,11 +15,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
-from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, Partitions, UnitOfLot, in_partitions
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes
 from driftlab.family.shared_effect_search import (
     CHANCE,
     Candidate,
+    Offer,
     between_lots,
     choose,
     contrasts_of,
@@ -105,11 +106,11 @@ class _Search:
     """Effects added one by one to the model of the sampled units: of each the candidate, refined, and its rivals."""
 
     def __init__(self, sample: Partitions[Sequence[UnitOfLot]]) -> None:
-        self.sample, self.lots = sample, [lot for own in sample.map(_lots) for lot in own]
+        self.sample = sample
         self.taken: list[tuple[Candidate, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
         some = sample.chosen(range(0, len(sample), max(1, len(sample) // PROPOSING)))
-        self.offers, self.refused = offers_for([soaked for soaked, _ in some.read()])
+        ((self.offers, self.refused),) = sample.engine(_proposed, some.parts)
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
         self.noise: dict[str, UnitDensities] = {}
 
@@ -119,7 +120,7 @@ class _Search:
             pass
         for k in reversed(range(len(self.taken) - 1)):
             old, rivals = self.taken[k]
-            new = evaluate([old.offer], contrasts_of(self.sample, [old.offer], self._others(k)), self.lots)[0]
+            new = evaluate([old.offer], contrasts_of(self.sample, [old.offer], self._others(k)))[0]
             price = float(np.log(len(self.offers))) if not old.lot else old.price
             if new.chance <= price + CHANCE or new.total <= 0:
                 del self.taken[k]
@@ -133,7 +134,7 @@ class _Search:
         acting = any(effect.acts_on_input for effect in effects)
         offers = [o for o in self.offers if o.effect.kind not in kinds and not (acting and o.effect.acts_on_input)]
         contrasts = contrasts_of(self.sample, offers, effects)
-        candidates = evaluate(offers, contrasts, self.lots)
+        candidates = evaluate(offers, contrasts)
         self.last = {}
         for one in candidates:
             name = " ".join(one.offer.group).strip()
@@ -143,7 +144,7 @@ class _Search:
         if best is None:
             return False
         taken, rivals = best
-        where = np.flatnonzero([taken.lot in ("", lot) for lot in self.lots])
+        where = np.flatnonzero([taken.lot in ("", lot) for lot in contrasts.lots])
         if nested(offers, contrasts, taken, where) <= 0:
             return False
         tuned = self.sample.chosen(where[:: max(1, len(where) // TUNING)], A_FEW)
@@ -179,22 +180,22 @@ class _Search:
         laws, self.of_units, self.noise = sizes(units, [taken.offer for taken, _ in self.taken])
         for k, ((taken, rivals), law) in enumerate(zip(self.taken, laws, strict=True)):
             contrasts = contrasts_of(self.sample, [taken.offer], self._others(k))
-            where = np.flatnonzero([law.has(lot) for lot in self.lots])
+            where = np.flatnonzero([law.has(lot) for lot in contrasts.lots])
             effects.append(
                 SharedEffect(
                     **dict(law), effect=taken.effect,
                     unit=", ".join(dict.fromkeys(taken.effect.units_of(bias_unit))) or bias_unit,
                     evidence=taken.chance, of_mean=taken.mean, of_size=taken.size, price=taken.price + CHANCE,
                     left_out=nested([taken.offer], contrasts, taken, where) / max(len(where), 1),
-                    in_other_lots=between_lots(taken.offer, contrasts, self.lots) if law.others is None else None,
+                    in_other_lots=between_lots(taken.offer, contrasts) if law.others is None else None,
                     indistinguishable_from=rivals,
                 )
             )  # fmt: skip
         return tuple(effects)
 
 
-def _lots(units: Sequence[UnitOfLot]) -> list[str]:
-    return [lot for _, lot in units]
+def _proposed(units: Partition[Sequence[UnitOfLot]]) -> tuple[list[Offer], dict[str, str]]:
+    return offers_for([soaked for soaked, _ in units.read()])
 
 
 def _margin(one: Candidate) -> float:

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from driftlab.family.partitions import InMemory, Partitions
 from driftlab.family.record import Covariances, Numbers, TermParabolas, UnitRecord
-from driftlab.family.reml import WEIGHT, OfAxes, fit_axis
+from driftlab.family.reml import WEIGHT, UnitsOfAxis, fit_axis
 from driftlab.triad.model import PARABOLA, TermPrior
 from fusion_core.chunk import Array
 from fusion_core.thermal.map_file import expect_covariance
@@ -70,9 +69,9 @@ def fit_terms(records: Iterable[UnitRecord]) -> TermsLaw | None:
     low, high = (float(np.median(ends)) for ends in zip(*(unit.T for unit in units), strict=True))
     peaks = (low + high) / 2 + (high - low) / 2 * ENDS
     J, h = zip(*(_information(unit, peaks) for unit in units), strict=True)
-    content = Partitions([InMemory(OfAxes(np.stack(J), np.stack(h)), len(units))])
     lot = np.zeros(len(units), dtype=np.intp)
-    fits = [fit_axis(content, k, lot, peaks) for k in range(TERMS_OF_M)]
+    terms = zip(np.stack(J, axis=1), np.stack(h, axis=1), strict=True)
+    fits = [fit_axis(UnitsOfAxis([(*term, lot)]), peaks) for term in terms]
     return TermsLaw(
         T=(low, high), units=len(units), mu=np.stack([fit.expected.means.mu for fit in fits]),
         mu_covariance=np.stack([fit.expected.means.covariance for fit in fits]),

@@ -19,7 +19,7 @@ from driftlab.family.bands import deviation
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import LotOutlier, Outlier, Outliers, find_outliers, of_doubts
-from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
+from driftlab.family.partitions import FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
@@ -96,7 +96,7 @@ def analyse(
         family, common, apart, why = _fitted(units, status, progress)
     else:
         (family, common), why = _read(known, units, status) if records else (None, NOTHING), ""
-        apart = units.keep("apart", partial(_bare, common.effects), [None] * len(units))
+        apart = _kept(units, common)
     progress(Stage("what the line did"))
     levels = None if family is None else _levels(family, apart)
     before = None if known is None or family is None else family.baseline
@@ -133,7 +133,7 @@ def _doubted(
     """Return the reasons of each unit in doubt, its doubts first, and sentences on these units."""
     found, records = Outliers({}), status.doubted
     if family is not None and family.laws is not None and family.laws.curves and len(units):
-        apart = units.keep("doubted", partial(_bare, common.effects), [None] * len(units))
+        apart = _kept(units, common)
         found = find_outliers(family, apart, records, shown=unit, fitted=False)
     about = f"{counted(len(units))} in doubt: not in the family, not on the charts; held against the family as new"
     odd = {record.unit: (*of_doubts(record), *found.odd.get(record.unit, ())) for record in records}
@@ -171,16 +171,14 @@ def _fitted(
     try:
         progress(Stage("effects that the units share"))
         common = find_common(units, bias_unit=status.bias_unit)
-        noise = [common.noise.get(unit) for unit in status.sound.units]
-        apart = units.keep("apart", partial(_bare, common.effects), noise)
+        places = sample_of(len(units))
+        apart = _kept(units, common, status.sound.units, places)
         progress(Stage("the family"))
         family = fit_family(apart, channel=status.channel, bias_unit=status.bias_unit)
     except ValueError as error:
         return None, NOTHING, units, str(error)
     progress(Stage("the family, units left out"))
-    places = sample_of(len(units))
-    sample = units.chosen(places, A_FEW).keep("whole", partial(_apart, common.effects), [noise[k] for k in places])
-    return family.model_copy(update={"bands": measure_bands(family, sample)}), common, apart, ""
+    return family.model_copy(update={"bands": measure_bands(family, apart.chosen(places))}), common, apart, ""
 
 
 def _read(path: Path, units: Partitions[Sequence[UnitOfLot]], status: FleetStatus) -> tuple[Family, SharedEffects]:
@@ -241,17 +239,28 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     )
 
 
+def _kept(
+    units: Partitions[Sequence[UnitOfLot]], common: SharedEffects, names: Sequence[str] = (), whole: Sequence[int] = ()
+) -> Partitions[Sequence[UnitOfLot]]:
+    """Return units with the effects in the model, by `names` beside their noise; their rows stay at the places `whole`.
+
+    Who fits a family needs no rows.
+    """
+    with_rows = np.zeros(len(units), dtype=bool)
+    with_rows[[*whole]] = True
+    noise = [common.noise.get(name) for name in names] or [None] * len(units)
+    return units.keep("apart", partial(_apart, common.effects), noise, with_rows)
+
+
 def _apart(
-    effects: Sequence[SharedEffect], units: Sequence[UnitOfLot], noise: Sequence[UnitDensities | None]
+    effects: Sequence[SharedEffect],
+    units: Sequence[UnitOfLot],
+    noise: Sequence[UnitDensities | None],
+    with_rows: Sequence[bool],
 ) -> list[UnitOfLot]:
-    """Return units with the effects in the model, each drawn from its law, beside their noise."""
-    if not effects:
-        return list(units)
-    return [(without_effects(soaked, lot, effects, own), lot) for (soaked, lot), own in zip(units, noise, strict=True)]
-
-
-def _bare(
-    effects: Sequence[SharedEffect], units: Sequence[UnitOfLot], noise: Sequence[UnitDensities | None]
-) -> list[UnitOfLot]:
-    """Return units with the effects in the model without their rows, which nobody needs who fits a family."""
-    return [(replace(soaked, recordings=()), lot) for soaked, lot in _apart(effects, units, noise)]
+    """Return units with the effects in the model, each drawn from its law, beside their noise; some with their rows."""
+    kept = []
+    for (soaked, lot), own, whole in zip(units, noise, with_rows, strict=True):
+        apart = without_effects(soaked, lot, effects, own) if effects else soaked
+        kept.append((apart if whole else replace(apart, recordings=()), lot))
+    return kept
