@@ -79,8 +79,8 @@ def read_whole(path: Path, most: int = FILE) -> bytes:
     """
     check_regular(path)
     with path.open("rb") as file:
-        data = file.read(most + 1)
         size = os.fstat(file.fileno()).st_size
+        data = file.read(min(size, most) + 1)  # room is made for all that is asked for
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has {size_of(size)}, at most {size_of(most)} are read", str(path))
     return data

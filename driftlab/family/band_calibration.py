@@ -18,13 +18,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
+from operator import call
 from statistics import NormalDist
 
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, Posterior, fit_parts
-from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, UnitOfLot, in_partitions
+from driftlab.family.mixed_model import Family, Posterior, fit_family
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, Partitions, UnitOfLot, in_partitions
 from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
 
@@ -66,10 +67,13 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
     if len(long) < MIN_UNITS:
         return None
     long = long[sample_of(len(long), MAX_LEFT_OUT)]
-    folds = [long[k::FOLDS] for k in range(FOLDS)]
-    families = fit_parts(units, [np.setdiff1d(np.arange(len(units)), fold) for fold in folds], family)
-    jobs = [(own, part) for own, fold in zip(families, folds, strict=True) for part in units.chosen(fold, A_FEW).parts]
-    of_units = [*chain.from_iterable(units.engine(partial(_measured, whole), jobs))]
+    folds, have = [long[k::FOLDS] for k in range(FOLDS)], [k for k, (*_, known) in enumerate(rows) if known]
+    others = [Partitions(units.chosen(np.setdiff1d(np.arange(len(units)), fold)).parts) for fold in folds]
+    alike = units.chosen((have[k] for k in sample_of(len(have), ALIKE)), ALIKE).parts
+    jobs = [*(partial(fit_family, some, start=family) for some in others), *(partial(_common_walk, p) for p in alike)]
+    found = [*units.engine(call, jobs)]
+    todo = [(own, part) for own, fold in zip(found, folds, strict=False) for part in units.chosen(fold, A_FEW).parts]
+    of_units = [*chain.from_iterable(units.engine(partial(_measured, whole), todo))]
     measured = [of_units[k] for k in np.argsort(np.concatenate(folds))]
     parts, factors, far = [], [], []
     for part, column in zip(PARTS, zip(*measured, strict=True), strict=True):
@@ -77,9 +81,7 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
             parts.append(part)
             factors.append(_factors([scores for scores, _ in pairs], len(long)))
             far.append(tuple(np.quantile([distances for _, distances in pairs], 1 - FAR, axis=0).tolist()))
-    have = [k for k, (*_, known) in enumerate(rows) if known]
-    alike = units.chosen((have[k] for k in sample_of(len(have), ALIKE)), ALIKE)
-    noise = _typical(np.array([noise for _, noise, _ in rows]), *units.engine(_common_walk, alike.parts))
+    noise = _typical(np.array([noise for _, noise, _ in rows]), *found[FOLDS:])
     return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
 
 
@@ -92,10 +94,10 @@ def _measured(
     whole: tuple[float, float], job: tuple[Family, Partition[Sequence[UnitOfLot]]]
 ) -> list[list[tuple[Array, Array] | None]]:
     """Return z and g of each part of each unit by a family that it was left out of, and its distances; None of none."""
-    (family, units), laws, measured = job, dict[str, Posterior](), []
+    (family, units), measured = job, []
     first, last = family.knots.domain
     for soaked, lot in units.read():
-        before = laws.get(lot) or laws.setdefault(lot, family.marginal(lot))
+        before = family.marginal(lot)
         more = before.informed(*family.information_of(soaked))
         low, high = soaked.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)

@@ -8,10 +8,11 @@ of the curve there. q splines, N temperatures.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, read_only
 
 STEP = 2.5  # K: what one map of a family may have and the others not is about as wide
 DEGREE = 3
@@ -69,6 +70,12 @@ class SplineBasis:
         B = np.zeros((len(x), self.q))
         np.put_along_axis(B, k[:, None] + np.arange(DEGREE + 1), rows, axis=1)
         return B
+
+    @lru_cache(maxsize=16)  # noqa: B019  # of a family's knots, which all its units have
+    def grid(self, of_interval: int) -> tuple[Array, Array]:
+        """Return temperatures (N,) over the domain, so many of each interval, degC, and the splines there (N, q)."""
+        T = np.linspace(*self.domain, of_interval * self.intervals + 1)
+        return read_only(T), read_only(self.values(T))
 
     def within(self, wider: SplineBasis) -> slice:
         """Return the coefficients of a wider domain that are those of this one.

@@ -21,8 +21,8 @@ R rows, d axes, K columns of all effects on one axis, J placebos.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,12 +51,12 @@ class EffectContrasts:
     c: Array  # (..., d, K) coefficients, SI; 0 where a unit cannot show any
     information: Array  # (..., d, K) 1 / variance of each under the unit's own noise
     placebos: Array  # (..., d, K, J) noise along each placebo, in its own deviation; 0 where nothing of it is its own
-    lots: tuple[str, ...] = ()  # of units
+    lots: tuple[str, ...] = field(default=(), kw_only=True)  # of units
 
     def of(self, columns: slice) -> EffectContrasts:
         """Return some of the columns."""
-        c, information, placebos = self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :]
-        return EffectContrasts(c, information, placebos, self.lots)
+        some = self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :]
+        return EffectContrasts(*some, lots=self.lots)
 
     def flat(self, units: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array, Array]:
         """Return coefficients, information (n, d K) and placebos (n, d K, J) of some units, axis by axis."""
@@ -65,6 +65,7 @@ class EffectContrasts:
         return c.reshape(shape), self.information[units].reshape(shape), placebos.reshape(*shape, placebos.shape[-1])
 
 
+@lru_cache(maxsize=1)  # of the unit that is worked on
 def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     """Return the recordings as effects read them, the thermometer's noise taken off.
 
@@ -73,34 +74,31 @@ def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     return [Chunk(rows.t, {**rows.channels, "temperature": without_noise(rows.T)}) for rows in soaked.recordings]
 
 
-class UnitSignatures:
-    """Signatures of effects in the recordings of a unit, `chunks` as effects read them."""
+def signatures(effect: Effect, soaked: UnitInformation) -> list[Array]:
+    """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
 
-    def __init__(self, soaked: UnitInformation) -> None:
-        self.soaked, self.chunks = soaked, chunks_of(soaked)
+    A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's, with
+    the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if the
+    unit's recordings lack a channel of the effect.
+    """
+    if not effect.acts_on_input:
+        return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks_of(soaked)]
+    curve, splines = _own_splines(soaked)
+    lagged = [soaked.knots.values(effect.input(chunk, None)[0]) for chunk in chunks_of(soaked)]
+    return [((there - here) @ curve)[:, :, None] for there, here in zip(lagged, splines, strict=True)]
 
-    @cached_property
-    def _curve(self) -> tuple[Array, list[Array]]:
-        """The unit's own curve (q, d), and the splines (R, q) at the temperature of each recording."""
-        return own_curve(self.soaked).T, [self.soaked.knots.values(chunk["temperature"]) for chunk in self.chunks]
 
-    def of(self, effect: Effect) -> list[Array]:
-        """Return the signature of an effect in each recording (R, d, q), a coefficient of 1 each; of a lag, its own.
+@lru_cache(maxsize=1)
+def _own_splines(soaked: UnitInformation) -> tuple[Array, list[Array]]:
+    """Return the unit's own curve (q, d), and the splines (R, q) at the temperature of each recording."""
+    return own_curve(soaked).T, [soaked.knots.values(chunk["temperature"]) for chunk in chunks_of(soaked)]
 
-        A lag has no coefficient: it is the curve at the temperature of the element, less that at the thermometer's,
-        with the unit's own curve. That curve's error is independent of the residual beside it. Raises MissingChannel if
-        the unit's recordings lack a channel of the effect.
-        """
-        if not effect.acts_on_input:
-            return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in self.chunks]
-        curve, splines = self._curve
-        lagged = [self.soaked.knots.values(effect.input(chunk, None)[0]) for chunk in self.chunks]
-        return [((there - here) @ curve)[:, :, None] for there, here in zip(lagged, splines, strict=True)]
 
-    def columns(self, effects: Sequence[Effect]) -> list[Array]:
-        """Return the signatures of effects side by side (R, d, K), of each recording."""
-        none = [np.zeros((len(rows.t), len(self.soaked.axes), 0)) for rows in self.soaked.recordings]
-        return [np.concatenate(part, axis=2) for part in zip(none, *map(self.of, effects), strict=True)]
+def columns_of(effects: Sequence[Effect], soaked: UnitInformation) -> list[Array]:
+    """Return the signatures of effects side by side (R, d, K), of each recording."""
+    none = [np.zeros((len(rows.t), len(soaked.axes), 0)) for rows in soaked.recordings]
+    parts = zip(none, *(signatures(effect, soaked) for effect in effects), strict=True)
+    return [np.concatenate(part, axis=2) for part in parts]
 
 
 def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
@@ -132,13 +130,13 @@ class UnitRows:
     """
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
-        self.soaked, self.signatures = soaked, UnitSignatures(soaked)
+        self.soaked = soaked
         low, high = soaked.knots.domain
         knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]
-        self.Q = [_orthonormal(X) for X in self._white(self.signatures.columns(linear), curves)]
+        self.Q = [_orthonormal(X) for X in self._white(columns_of(linear, soaked), curves)]
         bias = self._white([rows.bias[:, :, None] for rows in soaked.recordings])
         self.r = [y[:, 0] - Q @ (Q.T @ y[:, 0]) for Q, y in zip(self.Q, bias, strict=True)]
 
@@ -149,7 +147,7 @@ class UnitRows:
         at = 0
         for effect, size in zip(effects, sizes, strict=True):
             try:
-                for part, values in zip(parts, self.signatures.of(effect), strict=True):
+                for part, values in zip(parts, signatures(effect, self.soaked), strict=True):
                     part[:, :, at : at + size] = values
             except MissingChannel:
                 pass
@@ -162,7 +160,7 @@ class UnitRows:
 
         Raises MissingChannel if the unit's recordings lack a channel of the effect.
         """
-        signature = self._white(self.signatures.of(effect))
+        signature = self._white(signatures(effect, self.soaked))
         estimates = [_least_squares(Q, r, Z) for Q, r, Z in zip(self.Q, self.r, signature, strict=True)]
         c, covariances = (np.stack(values) for values in zip(*estimates, strict=True))
         return c, covariances

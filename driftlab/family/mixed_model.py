@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -29,14 +29,14 @@ from driftlab import __version__
 from driftlab.family.bands import Bands
 from driftlab.family.baseline import Baseline
 from driftlab.family.basis import SplineBasis
-from driftlab.family.partitions import FamilyUnits, Partition, Partitions, UnitOfLot, added, in_partitions
+from driftlab.family.partitions import SIZE, FamilyUnits, Partition, Partitions, UnitOfLot, added, in_partitions, tree
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
 from driftlab.family.reml import (
+    ByLot,
     Index,
     Means,
     OfAxes,
     RemlFit,
-    UnitsOfAxis,
     VarianceComponents,
     fit_axis,
     means_of,
@@ -62,7 +62,9 @@ ENTERED = 0.199  # of an interval of the knots, for a unit to have seen it
 MIN_SHARE = 0.02  # of all units, likewise
 
 
-def fit_family(units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0) -> Family:
+def fit_family(
+    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, start: Family | None = None
+) -> Family:
     """Return the family of units.
 
     Parameters
@@ -72,6 +74,8 @@ def fit_family(units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "r
         Whose bias, and its SI unit.
     seed : int
         Of the sample of SAMPLE units that Sigma is of, where there are more.
+    start : Family, optional
+        One of nearly these units: its domain is taken, and EM begins with its law.
 
     Raises
     ------
@@ -80,136 +84,42 @@ def fit_family(units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "r
         was seen by MIN_UNITS of them.
     """
     units = in_partitions(units)
-    survey = _survey(units)
-    group = survey.group(np.arange(len(units)), seed)
-    about = {"channel": channel, "bias_unit": bias_unit, "axes": survey.axes}
-    ((family, w),) = _families(units, [group], *survey.domain(), [None] * len(survey.axes), about)
+    knots, axes, lots, lot, by_enough = _survey(units)
+    knots, seen = (knots, by_enough) if start is None else (start.knots, start.seen)
+    n, d = len(units), len(axes)
+    chosen = np.arange(n)
+    if n > SAMPLE:
+        chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
+    present, own = np.unique(lot[chosen], return_inverse=True)
+    sample = (units if n <= SAMPLE else units.chosen(chosen)).keep("sample", partial(_stacked, knots))
+    laws = [None] * d if start is None else map(VarianceComponents, start.Sigma, start.Lambda)
+    fits = [*sample.engine(partial(_fit_of, sample.parts, own, knots.peaks), enumerate(laws))]
+    w = np.stack([fit.w for fit in fits], axis=1)
+    means = _means_of_all(units, knots, fits, present, lot) if n > SAMPLE else [fit.means for fit in fits]
     low = np.flatnonzero(np.any(w < 0.5, axis=1))
-    names = [soaked.unit for soaked, _ in units.chosen(group.drawn[low]).read()]
-    return family.model_copy(
-        update={"weights": {name: tuple(w[k].tolist()) for name, k in zip(names, low, strict=True)}}
-    )
+    names = [soaked.unit for soaked, _ in units.chosen(chosen[low]).read()]
+    return Family(
+        channel=channel, bias_unit=bias_unit, axes=axes, first=knots.first, intervals=knots.intervals,
+        step=knots.step, seen=seen, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
+        mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
+        Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, means),
+        weights={name: w[k].tolist() for name, k in zip(names, low, strict=True)},
+        steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
+    )  # fmt: skip
 
 
-def fit_parts(units: FamilyUnits, parts: Sequence[Index], start: Family, seed: int = 0) -> list[Family]:
-    """Return the family of each of some parts of the units, by places (n,), of which nearly all are those of `start`.
+def _survey(
+    units: Partitions[Sequence[UnitOfLot]],
+) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Index, tuple[float, float]]:
+    """Return the knots over the temperatures that enough units saw, and the axes.
 
-    Its domain is taken, and EM begins with its law. No unit's weight is said.
+    And of each lot its number and its units; each unit's lot by number (n,); and these temperatures' ends, degC.
+
+    Raises
+    ------
+    ValueError
+        As `fit_family`.
     """
-    units = in_partitions(units)
-    survey = _survey(units)
-    groups = [survey.group(places, seed) for places in parts]
-    laws = [*map(VarianceComponents, start.Sigma, start.Lambda)]
-    about = {name: getattr(start, name) for name in ("channel", "bias_unit", "axes")}
-    return [family for family, _ in _families(units, groups, start.knots, start.seen, laws, about)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Units of one family by their `places` (n,), of each the number of its `lot` (n,), of each lot number and units.
-
-    Sigma is of those at the places `drawn` (m,), of which `own` (m,) are the lots by number among those `present`.
-    """
-
-    places: Index
-    lot: Index
-    lots: Mapping[str, tuple[int, int]]
-    drawn: Index
-    present: Index
-    own: Index
-
-
-def _families(
-    units: Partitions[Sequence[UnitOfLot]], groups: Sequence[_Group], knots: SplineBasis,
-    seen: tuple[float, float] | None, laws: Sequence[VarianceComponents | None], about: Mapping[str, Any],
-) -> list[tuple[Family, Array]]:  # fmt: skip
-    """Return the family of each group of units, and the weights (m, d) of those that Sigma is of.
-
-    Each axis of each family is fitted by itself, by whoever works on the units; EM begins with one of `laws` an axis.
-    """
-    of_any = np.unique(np.concatenate([group.drawn for group in groups]))
-    sample = (units if len(of_any) == len(units) else units.chosen(of_any)).keep("sample", partial(_stacked, knots))
-    places = [np.searchsorted(of_any, group.drawn) for group in groups]
-    jobs = [(*own, group.own, at) for group, at in zip(groups, places, strict=True) for own in enumerate(laws)]
-    fitted = sample.engine(partial(_fit_of, sample.parts, knots.peaks), jobs)
-    found = []
-    for group in groups:
-        fits, n = [next(fitted) for _ in laws], len(group.places)
-        means = [fit.expected.means for fit in fits]
-        if n > len(group.drawn):
-            whole = units if n == len(units) else units.chosen(group.places)
-            means = _means_of_all(whole, knots, fits, group.present, group.lot)
-        family = Family(
-            **about, first=knots.first, intervals=knots.intervals, step=knots.step, seen=seen, units=n,
-            sampled=len(group.drawn), mu=np.stack([m.mu for m in means]),
-            mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
-            Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(group.lots, means),
-            steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
-        )  # fmt: skip
-        found.append((family, np.stack([fit.w for fit in fits], axis=1)))
-    return found
-
-
-def _fit_of(
-    sample: Sequence[Partition[OfAxes]], peaks: Array, job: tuple[int, VarianceComponents | None, Index, Index]
-) -> RemlFit:
-    """Return the fit of an axis of units of a sample, of the lots `own` (m,), at their places (m,)."""
-    axis, law, own, places = job
-    return fit_axis(UnitsOfAxis.of((part.read() for part in sample), axis, own, places), peaks, law)
-
-
-@dataclass(frozen=True, eq=False)
-class _Survey:
-    """Units in short: their axes and the step of their knots; `spans`, how many saw each range of knots.
-
-    `ranges` (n, 2) are their temperatures, degC, and `lot` (n,) the places of their lots among those `named`.
-    """
-
-    axes: tuple[str, ...]
-    step: float
-    spans: Counter[tuple[int, int]]
-    ranges: Array
-    named: Sequence[str]
-    lot: Index
-
-    def domain(self) -> tuple[SplineBasis, tuple[float, float]]:
-        """Return the knots over the temperatures that enough units saw, and these temperatures' ends, degC.
-
-        Raises
-        ------
-        ValueError
-            As `fit_family`.
-        """
-        count, lowest = len(self.lot), min(low for low, _ in self.spans)
-        seen = np.zeros(max(sum(span) for span in self.spans) - lowest, dtype=int)
-        for (low, intervals), units in self.spans.items():
-            seen[low - lowest : low - lowest + intervals] += units
-        least = int(np.ceil(max(MIN_UNITS, MIN_SHARE * count)))
-        enough = np.flatnonzero(seen >= least)
-        if len(enough) == 0:
-            raise ValueError(
-                f"no temperature was seen by {least} of {count} units; soak the units of a family over one range"
-            )
-        lows, highs = np.sort(self.ranges, axis=0).T
-        knots = SplineBasis(lowest + int(enough[0]), int(enough[-1] - enough[0]) + 1, self.step)
-        return knots, (float(lows[least - 1]), float(highs[-least]))
-
-    def group(self, places: Index, seed: int) -> _Group:
-        """Return the units at some places (n,) as one family's."""
-        column = self.lot[places]
-        counts = np.bincount(column, minlength=len(self.named))
-        present = [name for name, count in zip(self.named, counts, strict=True) if count]
-        numbers = numbered(present, len(places))
-        lot = np.array([numbers.get(name, 0) for name in self.named])[column]
-        drawn = np.arange(len(places))
-        if len(places) > SAMPLE:
-            drawn = np.sort(np.random.default_rng(seed).choice(len(places), SAMPLE, replace=False))
-        lots = {name: (number, int(counts[self.named.index(name)])) for name, number in numbers.items()}
-        return _Group(places, lot, lots, places[drawn], *np.unique(lot[drawn], return_inverse=True))
-
-
-def _survey(units: Partitions[Sequence[UnitOfLot]]) -> _Survey:
-    """Return units in short; raises ValueError as `fit_family`."""
     if len(units) < MIN_UNITS:
         raise ValueError(f"a family of {len(units)} units; at least {MIN_UNITS} are needed to know how units differ")
     first = next(units.read())[0]
@@ -219,7 +129,25 @@ def _survey(units: Partitions[Sequence[UnitOfLot]]) -> _Survey:
         spans.update(own)
         ranges.append(temperatures)
         columns.append(np.array([places.setdefault(lot, len(places)) for lot in lots]))
-    return _Survey(axes, step, spans, np.concatenate(ranges), [*places], np.concatenate(columns))
+    numbers = numbered(places, len(units))
+    lot = np.array([numbers[name] for name in places])[np.concatenate(columns)]
+    counts = np.bincount(np.concatenate(columns))
+    lowest = min(low for low, _ in spans)
+    seen = np.zeros(max(sum(span) for span in spans) - lowest, dtype=int)
+    for (low, intervals), count in spans.items():
+        seen[low - lowest : low - lowest + intervals] += count
+    least = max(MIN_UNITS, MIN_SHARE * len(units))
+    enough = np.flatnonzero(seen >= least)
+    if len(enough) == 0:
+        raise ValueError(
+            f"no temperature was seen by {int(np.ceil(least))} of {len(units)} units; soak the units of a family over "
+            "one range"
+        )
+    knots = SplineBasis(lowest + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
+    lowest_first, highest_last = np.sort(np.concatenate(ranges), axis=0).T
+    enough_units = int(np.ceil(least))
+    seen_by_enough = float(lowest_first[enough_units - 1]), float(highest_last[-enough_units])
+    return knots, axes, {name: (numbers[name], int(counts[places[name]])) for name in numbers}, lot, seen_by_enough
 
 
 def _spans(
@@ -262,16 +190,15 @@ def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
     return OfAxes(np.stack(J), np.stack(h))
 
 
-@dataclass(frozen=True, eq=False)
-class _ByLot:
-    """Values (G, ...) of lots, of which a partition of units, of the lots `lot` (n,), is sent its own."""
-
-    values: Array
-    lot: Index
-
-    def __getitem__(self, units: slice) -> dict[int, Array]:
-        """Return the values of the lots of some units, by lot."""
-        return {int(g): self.values[g] for g in np.unique(self.lot[units])}
+def _fit_of(
+    sample: Sequence[Partition[OfAxes]], lot: Index, peaks: Array, job: tuple[int, VarianceComponents | None]
+) -> RemlFit:
+    """Return the fit of an axis of a sample, of the lots `lot` (n,), from a law on, in parts of SIZE units."""
+    axis, law = job
+    contents = ((own.J[:, axis].copy(), own.h[:, axis]) for own in (part.read() for part in sample))
+    J, h = (np.concatenate(part) for part in zip(*contents, strict=True))
+    cuts = [slice(k, k + SIZE) for k in range(0, len(lot), SIZE)]
+    return fit_axis([(J[cut], h[cut], lot[cut]) for cut in cuts], peaks, law)
 
 
 def _means_of_all(
@@ -280,12 +207,12 @@ def _means_of_all(
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
     d, q, G = len(fits), knots.q, int(lot.max()) + 1
     L, inverse, spread = (np.stack(part) for part in zip(*(fit.law.root() for fit in fits), strict=True))
-    centres = np.repeat(np.stack([fit.expected.means.mu for fit in fits])[None], G, axis=0)
-    centres[present] += np.stack([fit.expected.means.shifts for fit in fits], axis=1)
+    centres = np.repeat(np.stack([fit.means.mu for fit in fits])[None], G, axis=0)
+    centres[present] += np.stack([fit.means.shifts for fit in fits], axis=1)
     of_lots = partial(_of_their_lots, knots, L, np.array([fit.limit for fit in fits]))
     information, weighted = np.zeros((d, G, q, q)), np.zeros((d, G, q))
     at_centres = np.einsum("dij,gdj->gdi", inverse, centres)
-    for g, (own_information, own_weighted) in units.reduce(of_lots, lot, _ByLot(at_centres, lot)).items():
+    for g, (own_information, own_weighted) in tree(units.map(of_lots, lot, ByLot(at_centres, lot))).items():
         information[:, g], weighted[:, g] = own_information, own_weighted
     return [means_of(*own).turned(L[k]) for k, own in enumerate(zip(information, weighted, spread, strict=True))]
 
@@ -343,17 +270,7 @@ class Posterior:
     @cached_property
     def root(self) -> tuple[Array, Array]:
         """L (d, q, q) with the covariance L L', and its inverse."""
-        return root_of(self.covariance)
-
-    @cached_property
-    def _roots(self) -> dict[bytes, Array]:
-        return {}
-
-    def _root_of(self, part: Index) -> Array:
-        """Return L of some coefficients (r,) by themselves, once of those that many units' soaks are about."""
-        if (key := part.tobytes()) not in self._roots:
-            self._roots[key] = root_of(self.covariance[:, part][:, :, part])[0]
-        return self._roots[key]
+        return _root_of(self.covariance.tobytes(), *self.covariance.shape)
 
     def informed(self, J: Array, h: Array) -> Posterior:
         """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
@@ -371,7 +288,7 @@ class Posterior:
         """
         part = np.flatnonzero(np.any(J, axis=(0, 1)))
         J, h = J[:, part][:, :, part], h[:, part]
-        L = self._root_of(part)
+        L, _ = _root_of(self.covariance[:, part][:, :, part].tobytes(), *J.shape)
         back = L.transpose(0, 2, 1)
         gain, U = np.linalg.eigh(back @ J @ L)
         a = (U.transpose(0, 2, 1) @ (back @ (h[..., None] - J @ self.c[:, part, None])))[..., 0]
@@ -379,6 +296,12 @@ class Posterior:
         squares = np.where(seen, a**2 / np.where(seen, gain + gain**2, 1.0), 0.0).sum(axis=1)
         count = seen.sum(axis=1)
         return np.where(count > 0, squares / np.maximum(count, 1), 1.0)
+
+
+@lru_cache(maxsize=64)
+def _root_of(covariance: bytes, *shape: int) -> tuple[Array, Array]:
+    """Return the root of a covariance and its inverse, once of what many units have in common: it takes long."""
+    return root_of(np.frombuffer(covariance).reshape(shape))
 
 
 class LotEffect(BaseModel):

@@ -41,21 +41,8 @@ WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
 SEEN = 1e-6  # of the largest information of a soak on a bump: on one with less it has none
 MAX_OWN = 0.9  # of Sigma, that a unit may have been
 CURVES = ("level", "scale", "bump", "curve")  # statistics of the curve of an axis
-FIGURES = (
-    "residual",
-    "noise",
-    "walk",
-    "coast",
-    "hysteresis",
-    "soaks",
-    *TERM_FIGURES,
-)  # not the swing: it is the curve's
-TWO_SIDED = (
-    "level",
-    "scale",
-    "noise",
-    *TERM_FIGURES,
-)  # a sensor may be too quiet; of other figures less is only better
+FIGURES = ("residual", "noise", "walk", "coast", "hysteresis", "soaks", *TERM_FIGURES)  # not the swing: the curve's
+TWO_SIDED = ("level", "scale", "noise", *TERM_FIGURES)  # a sensor may be too quiet; of other figures less is better
 OF_NOISE = ("hysteresis", "soaks")  # compared with noise alone, where other units do not show the usual
 SHAPES, MARGIN = 3, 2.0  # degrees of freedom of these, and by how much noise may be larger than its estimate
 MIN_UNITS_OF_LOT, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations

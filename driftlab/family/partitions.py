@@ -167,10 +167,6 @@ class Partitions(Generic[C]):
         """
         return chain.from_iterable(self.engine(partial(_each, function), self._blocks(of_units)))
 
-    def reduce(self, function: Callable[..., R], *of_units: Any) -> R:
-        """Return the sum of the function's results of all partitions, of which there is at least one; see `map`."""
-        return tree(self.engine(partial(_sum, function), self._blocks(of_units)))
-
     def keep(self, name: str, function: Callable[..., R], *of_units: Any) -> Partitions[R]:
         """Return the function's results as partitions, which stay where they were made; see `map`."""
         if self.scratch is None:
@@ -206,10 +202,8 @@ class Partitions(Generic[C]):
             yield from part.read()
 
     def _blocks(self, of_units: Sequence[Any]) -> Iterator[list[tuple[Any, ...]]]:
-        """Yield the partitions with their units' part of `of_units`, in blocks that are whole branches of the tree."""
-        size = 1
-        while size * BLOCKS < len(self.parts):
-            size *= 2
+        """Yield the partitions with their units' part of `of_units`, in at most BLOCKS blocks."""
+        size = max(1, -(-len(self.parts) // BLOCKS))
         starts = [*accumulate(map(len, self.parts), initial=0)]
         for first in range(0, len(self.parts), size):
             yield [
@@ -256,10 +250,6 @@ def tree(leaves: Iterable[R]) -> R:
 
 def _each(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> list[R]:
     return [function(part.read(), *of_units) for part, *of_units in block]
-
-
-def _sum(function: Callable[..., R], block: Sequence[tuple[Any, ...]]) -> R:
-    return tree(function(part.read(), *of_units) for part, *of_units in block)
 
 
 def _write(function: Callable[..., Any], content: Any, places: Sequence[InFile], *of_units: Any) -> None:

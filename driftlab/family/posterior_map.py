@@ -60,7 +60,7 @@ class UnitPosterior:
     @cached_property
     def T(self) -> Array:
         """Temperatures (N,) over the family's domain, degC."""
-        return np.linspace(*self.family.knots.domain, CURVE * self.family.knots.intervals + 1)
+        return self.family.knots.grid(CURVE)[0]
 
     @cached_property
     def sigma(self) -> Array:
@@ -75,7 +75,7 @@ class UnitPosterior:
     @cached_property
     def before(self) -> Array:
         """Deviation (N, d) of a unit that was not soaked from the mean of its family."""
-        return deviation(self.family.knots.values(self.T), self.family.marginal(self.lot).covariance)
+        return deviation(self.family.knots.grid(CURVE)[1], self.family.marginal(self.lot).covariance)
 
     @property
     def hours(self) -> float:
@@ -107,8 +107,8 @@ class UnitPosterior:
             kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
             residual=self._residual(), samples=self.soaked.count, error=self._error(), provenance=recorded(provenance),
         )  # fmt: skip
-        settings = _settings(knots.step)
-        fitted = settings.from_curve(self.T, knots.values(self.T) @ self.posterior.c.T, record)
+        settings, (T, B) = _settings(knots.step), knots.grid(CURVE)
+        fitted = settings.from_curve(T, B @ self.posterior.c.T, record)
         return settings.over(fitted, family.seen or knots.domain)
 
     def _residual(self) -> tuple[float, ...]:
@@ -119,8 +119,8 @@ class UnitPosterior:
 
     def _error(self) -> CurveError:
         knots = self.family.knots
-        T = np.linspace(*knots.domain, GRID * knots.intervals + 1)
-        B, factor = knots.values(T), self.band.factor(T, knots.step)
+        T, B = knots.grid(GRID)
+        factor = self.band.factor(T, knots.step)
         per_axis = [_modes(B, C) * own for C, own in zip(self.posterior.covariance, factor.T, strict=True)]
         modes = modes_of_axes(per_axis)
         curve = B @ self.posterior.c.T

@@ -34,14 +34,14 @@ far off. q coefficients at the temperatures `peaks`, G lots.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.partitions import SIZE, tree
+from driftlab.family.partitions import tree
 from fusion_core.chunk import Array
 
 TOLERANCE = 2e-3  # of the units' deviations in a step: far below their sampling error
@@ -106,6 +106,18 @@ class OfAxes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class ByLot:
+    """Values (G, ...) of lots, of which a partition of units, of the lots `lot` (n,), is sent its own."""
+
+    values: Array
+    lot: Index
+
+    def __getitem__(self, units: slice) -> dict[int, Array]:
+        """Return the values of the lots of some units, by lot."""
+        return {int(g): self.values[g] for g in np.unique(self.lot[units])}
+
+
+@dataclass(frozen=True, eq=False)
 class EStep:
     """Expectations of the units under a law.
 
@@ -166,41 +178,26 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
     return Means(mu, P, shifts, cov + taken @ P @ taken.transpose(0, 2, 1), cov + rest @ P @ rest.transpose(0, 2, 1))
 
 
-class UnitsOfAxis:
-    """Units of an axis in partitions, of which sums are those of a tree (`driftlab.family.partitions`).
+class UnitsUnderLaw:
+    """Units of an axis under a law: in parts of J (n, q, q), h (n, q) and their lots by number (n,).
 
-    `parts` are J (n, q, q), h (n, q) and the lots by number (n,).
+    Sums are those of a tree over the parts (`driftlab.family.partitions`).
     """
 
-    def __init__(self, parts: Sequence[tuple[Array, Array, Index]]) -> None:
-        self.parts = parts
-        self._law: VarianceComponents | None = None
-        self._under: list[_UnderLaw] = []
+    def __init__(self, law: VarianceComponents, parts: Sequence[tuple[Array, Array, Index]]) -> None:
+        self.law, (self.L, _, self.lots) = law, law.root()
+        self.parts = [_PartUnderLaw(self.L, *part) for part in parts]
 
-    @classmethod
-    def of(cls, contents: Iterable[OfAxes], axis: int, lot: Index, places: Index | None = None) -> UnitsOfAxis:
-        """Return one axis of units, of the lots `lot` (n,): all, or those at some places, in partitions of SIZE."""
-        own = [(np.ascontiguousarray(units.J[:, axis]), units.h[:, axis]) for units in contents]
-        J, h = (np.concatenate(part) for part in zip(*own, strict=True))
-        chosen = np.arange(len(J)) if places is None else places
-        cuts = [slice(k, k + SIZE) for k in range(0, len(chosen), SIZE)]
-        return cls([(J[chosen[cut]], h[chosen[cut]], lot[cut]) for cut in cuts])
-
-    @property
-    def lot(self) -> Index:
-        """Lot of each unit (n,)."""
-        return np.concatenate([lot for *_, lot in self.parts])
-
-    def under(self, law: VarianceComponents) -> list[_UnderLaw]:
-        """Return the units in the coordinates of a law: most of a step of EM, kept until another law is asked for."""
-        if law is not self._law:
-            L, _, _ = law.root()
-            self._law, self._under = law, [_UnderLaw(L, *part) for part in self.parts]
-        return self._under
+    def means(self, w: Array) -> Means:
+        """Return the means of the units with weights w (n,), at most 1, in the coordinates of L."""
+        cuts = np.cumsum([len(part.lot) for part in self.parts])[:-1]
+        sums = tree(part.of_lots(own) for part, own in zip(self.parts, np.split(w, cuts), strict=True))
+        information, weighted = (np.stack(column) for column in zip(*(sums[g] for g in range(len(sums))), strict=True))
+        return means_of(information, weighted, self.lots)
 
 
-class _UnderLaw:
-    """Units of a partition under a law: A = L'JL (n, q, q), a = L'h (n, q); V, V a and K of the weight 1.
+class _PartUnderLaw:
+    """Units of a part under a law: A = L'JL (n, q, q) and a = L'h (n, q), and what follows of these and of weights.
 
     V (n, q, q) is the covariance of z, and K (n, q, q) what z follows of an error of its mean.
     """
@@ -208,75 +205,54 @@ class _UnderLaw:
     def __init__(self, L: Array, J: Array, h: Array, lot: Index) -> None:
         self.L, self.J, self.h, self.lot, self.one = L, J, h, lot, np.eye(len(L))
         self.A, self.a = inside(J, L), h @ L
-        self.V = np.linalg.inv(self.A + self.one)
-        self.Va, self.K = np.einsum("nij,nj->ni", self.V, self.a), self.one - self.V
+        V = np.asarray(np.linalg.inv(self.A + self.one), dtype=np.float64)
+        self.alike = V, np.einsum("nij,nj->ni", V, self.a), self.one - V  # V, V a and K of the weight 1
 
-    def weighted(self, w: Array) -> _Weighted:
-        """Return the units with weights w (n,), at most 1."""
-        V, Va, K, low = self.V, self.Va, self.K, np.flatnonzero(w < 1)
-        if len(low):
+    def of_lots(self, w: Array) -> dict[int, tuple[Array, Array]]:
+        """Take weights w (n,); return the information (q, q) on the lots' means, and that times these, by lot."""
+        self.w, self.low, (V, Va, K) = w, np.flatnonzero(w < 1), self.alike
+        if len(low := self.low):
             V, Va, K = V.copy(), Va.copy(), K.copy()
             V[low] = np.linalg.inv(self.A[low] + w[low, None, None] * self.one)
             Va[low] = np.einsum("nij,nj->ni", V[low], self.a[low])
             K[low] = self.one - w[low, None, None] * V[low]
-        return _Weighted(self, w, low, V, Va, K)
+        self.V, self.Va, self.K, (n, q) = V, Va, K, Va.shape
+        present = np.unique(self.lot)
+        of_lot = w * (self.lot == present[:, None])
+        sums = zip(present.tolist(), (of_lot @ K.reshape(n, q * q)).reshape(-1, q, q), of_lot @ Va, strict=True)
+        return {g: (information, weighted) for g, information, weighted in sums}
 
-
-@dataclass(frozen=True, eq=False)
-class _Weighted:
-    """Units of a partition under a law with weights w (n,), those of `low` below 1, and what these make of the rest."""
-
-    of: _UnderLaw
-    w: Array
-    low: Index
-    V: Array
-    Va: Array
-    K: Array
-
-    def of_lots(self) -> dict[int, tuple[Array, Array]]:
-        """Return the information of units on the means of their lots, (q, q), and that times their values, by lot."""
-        n, q = self.Va.shape
-        present = np.unique(self.of.lot)
-        of_lot = self.w * (self.of.lot == present[:, None])
-        information, weighted = (of_lot @ self.K.reshape(n, q * q)).reshape(-1, q, q), of_lot @ self.Va
-        return {int(g): (information[k], weighted[k]) for k, g in enumerate(present)}
-
-    def deviations(self, means: Means) -> tuple[Array, list[tuple[Array, Array]]]:
+    def deviations(self, means: Means, shares: bool) -> tuple[Array, list[tuple[Array, Array]]]:
         """Return the scatter (q, q) of units about the means of their lots.
 
-        And the square of each deviation (n,), with the sums of its variances and of their squares (n, 2).
+        And with `shares` the square of each deviation (n,), with the sums of its variances and of their squares (n, 2).
         """
-        of, w, low, K = self.of, self.w, self.low, self.K
-        centre = means.mu + means.shifts[of.lot]
+        w, low, K = self.w, self.low, self.K
+        centre = means.mu + means.shifts[self.lot]
         z = self.Va - np.einsum("nij,nj->ni", K, centre)
         scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, self.V)
-        for g in np.unique(of.lot):
-            own = K[of.lot == g]
-            half = (own @ means.of_lot[g]) * w[of.lot == g, None, None]
+        for g in np.unique(self.lot):
+            own = K[self.lot == g]
+            half = (own @ means.of_lot[g]) * w[self.lot == g, None, None]
             scatter += np.tensordot(half, own, axes=((0, 2), (0, 2)))
+        if not shares:
+            return scatter, []
         if len(low):  # their distance is that of a unit like any other, or none would ever be weighted up again
-            like, K = _UnderLaw(of.L, of.J[low], of.h[low], of.lot[low]), K.copy()
-            K[low] = like.K
-            z[low] = like.Va - np.einsum("nij,nj->ni", like.K, centre[low])
+            _, own, K_own = _PartUnderLaw(self.L, self.J[low], self.h[low], self.lot[low]).alike
+            K = K.copy()
+            K[low], z[low] = K_own, own - np.einsum("nij,nj->ni", K_own, centre[low])
         spread = np.stack([np.trace(K, axis1=1, axis2=2), np.einsum("nij,nij->n", K, K)], axis=1)
         return scatter, [(np.sum(z**2, axis=1), spread)]
 
 
-def e_step(law: VarianceComponents, units: UnitsOfAxis, w: Array) -> EStep:
-    """Return the expectations of units with the weights w (n,), at most 1.
+def e_step(under: UnitsUnderLaw, w: Array, *, shares: bool = True) -> EStep:
+    """Return the expectations of units with the weights w (n,), at most 1; without `shares` none of each unit.
 
     The units' sums first make the means of their lots, from which they then deviate.
     """
-    L, _, lots = law.root()
-    q, lot = len(L), units.lot
-    information, weighted = np.zeros((int(lot.max()) + 1, q, q)), np.zeros((int(lot.max()) + 1, q))
-    cuts = np.cumsum([len(own) for *_, own in units.parts])[:-1]
-    parts = [part.weighted(own) for part, own in zip(units.under(law), np.split(w, cuts), strict=True)]
-    for g, (own_information, own_weighted) in tree(part.of_lots() for part in parts).items():
-        information[g], weighted[g] = own_information, own_weighted
-    means = means_of(information, weighted, lots)
-    scatter, rows = tree(part.deviations(means) for part in parts)
-    squares, spread = (np.concatenate(part) for part in zip(*rows, strict=True))
+    L, means = under.L, under.means(w)
+    scatter, rows = tree(part.deviations(means, shares) for part in under.parts)
+    squares, spread = (np.concatenate(part) for part in zip((w[:0], np.zeros((0, 2))), *rows, strict=True))
     share = squares / np.maximum(spread[:, 0], 1e-12)
     between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
     return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L))
@@ -307,47 +283,50 @@ class RemlFit:
     """
 
     law: VarianceComponents
-    expected: EStep
+    means: Means
     w: Array
     limit: float
     steps: int
     moved: float
 
 
-def fit_axis(units: UnitsOfAxis, peaks: Array, start: VarianceComponents | None = None) -> RemlFit:
-    """Return the law of the units of an axis, at `peaks` (q,) degC.
+def fit_axis(
+    units: Sequence[tuple[Array, Array, Index]], peaks: Array, start: VarianceComponents | None = None
+) -> RemlFit:
+    """Return the law of the units of an axis, as `UnitsUnderLaw` has them, at `peaks` (q,) degC.
 
     EM begins with the law `start`, the last of them, or where that is None with a smooth prior's.
     """
-    lot = units.lot
-    n, lots = len(lot), int(lot.max()) > 0
+    n, lots = sum(len(lot) for *_, lot in units), max(int(lot.max()) for *_, lot in units) > 0
     w = np.ones(n)
     spread = initial_scale(units)
     prior = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])  # rough: no curve goes on anywhere
+    Psi = smooth(peaks, prior)[0]
+    law = start or VarianceComponents(Psi, 0.1 * Psi if lots else np.zeros_like(Psi))
+    under = UnitsUnderLaw(law, units)
     if start is not None:
-        law = start
-        w, _ = weights(e_step(law, units, w), w, n + WEIGHT)
-    else:
-        Psi = smooth(peaks, prior)[0]
-        law = VarianceComponents(Psi, 0.1 * Psi if lots else np.zeros_like(Psi))
-        for _ in range(SMOOTH):
-            w = _nearest(e_step(law, units, np.ones(n)))
-            expected = e_step(law, units, w)
-            prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
-            law = VarianceComponents(smooth(peaks, prior)[0], expected.between if lots else law.Lambda)
+        w, _ = weights(e_step(under, w), w, n + WEIGHT)
+    for _ in range(SMOOTH if start is None else 0):
+        w = _nearest(e_step(under, np.ones(n)))
+        expected = e_step(under, w, shares=False)
+        prior = likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
+        law = VarianceComponents(smooth(peaks, prior)[0], expected.between if lots else law.Lambda)
+        under = UnitsUnderLaw(law, units)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MAX_STEPS + 1):
-        expected, older_w = e_step(law, units, w), w
+        weighed = HYPER <= steps <= FROZEN
+        expected, older_w = e_step(under, w, shares=weighed), w
         if not settled and steps % HYPER == 1:
             older, prior = prior, likeliest_prior(peaks, expected.scatter, float(w.sum()), prior)
             settled = steps > 1 and bool(np.max(np.abs(older - prior)) < 0.1)
         later = m_step(expected, w, smooth(peaks, prior)[0], lots=lots)
         law, moved = later, change(law, later)
-        if HYPER <= steps <= FROZEN:
+        under = UnitsUnderLaw(law, units)
+        if weighed:
             w, limit = weights(expected, w, float(w.sum()) + WEIGHT)
         if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
             break
-    return RemlFit(law, e_step(law, units, w), w, limit, steps, moved)
+    return RemlFit(law, under.means(w).turned(under.L), w, limit, steps, moved)
 
 
 def weights(expected: EStep, w: Array, total: float) -> tuple[Array, float]:
@@ -367,9 +346,9 @@ def outlier_weights(share: Array, limit: float | Array) -> Array:
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 
-def initial_scale(units: UnitsOfAxis) -> float:
+def initial_scale(units: Sequence[tuple[Array, Array, Index]]) -> float:
     """Return the scale of the units' spread: median over coefficients of the units' median deviation."""
-    own, seen = (np.concatenate(part) for part in zip(*(_alone(J, h) for J, h, _ in units.parts), strict=True))
+    own, seen = (np.concatenate(part) for part in zip(*(_alone(J, h) for J, h, _ in units), strict=True))
     own = np.where(seen > 0.01 * np.median(seen), own, np.nan)
     enough = np.sum(np.isfinite(own), axis=0) >= 2
     middle = np.nanmedian(own[:, enough], axis=0)

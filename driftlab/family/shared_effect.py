@@ -23,7 +23,7 @@ from pydantic import (
 )
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from driftlab.family.contrasts import EffectContrasts, UnitRows, UnitSignatures, seen_temperatures
+from driftlab.family.contrasts import EffectContrasts, UnitRows, columns_of, seen_temperatures
 from driftlab.family.partitions import Partitions, UnitOfLot
 from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
@@ -151,7 +151,7 @@ def _without(soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect])
     laws, d, q = [one.law_of(lot) for one in coefficient], len(soaked.axes), soaked.knots.q
     mean = np.concatenate([np.zeros((d, 0)), *(law.mean for law in laws)], axis=1)
     spread = np.concatenate([np.zeros((d, 0)), *(law.spread for law in laws)], axis=1)
-    Z = UnitSignatures(soaked).columns([one.effect for one in coefficient])
+    Z = columns_of([one.effect for one in coefficient], soaked)
     T = seen_temperatures(soaked, [effect.effect for effect in effects])
     J, h = soaked.J.copy(), soaked.h.copy()
     bias = [rows.bias.copy() for rows in soaked.recordings]
@@ -229,7 +229,6 @@ def _effects_of_units(
 
 def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> UnitInformation:
     """Return the unit with its noise beside the effects: with them it passes for one that walks more."""
-    signatures = UnitSignatures(soaked)
     bias = [rows.bias.copy() for rows in soaked.recordings]
     for k, effect in enumerate(effects):
         if effect.acts_on_input:
@@ -238,7 +237,7 @@ def _with_noise_beside(soaked: UnitInformation, effects: Sequence[Effect]) -> Un
             c = UnitRows(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
         except MissingChannel:
             continue
-        for own, z in zip(bias, signatures.columns([effect]), strict=True):
+        for own, z in zip(bias, columns_of([effect], soaked), strict=True):
             own -= np.einsum("rdq,dq->rd", z, c)
     T = seen_temperatures(soaked, effects)
     rows = [replace(one, T=t, bias=own) for one, t, own in zip(soaked.recordings, T, bias, strict=True)]

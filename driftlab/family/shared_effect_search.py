@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
-from driftlab.family.partitions import Partitions, UnitOfLot
+from driftlab.family.partitions import Partition, Partitions, UnitOfLot, tree
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.acceptance import nats_of
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
@@ -103,11 +103,12 @@ class Candidate:
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 
-def offers_for(sample: Sequence[UnitInformation]) -> tuple[list[Offer], dict[str, str]]:
+def offers_for(units: Partition[Sequence[UnitOfLot]]) -> tuple[list[Offer], dict[str, str]]:
     """Return the offers of the installed effects, and why kinds of effects have none.
 
     Lines have none: their phase is the chamber's at the time, and no unit's.
     """
+    sample = [soaked for soaked, _ in units.read()]
     channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
     alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
     chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
@@ -247,7 +248,7 @@ def refine(
             replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
         ]
         if effect.acts_on_input:  # exactly, where the first look had the map's slope
-            total = np.array([-sample.reduce(partial(_squares, [*beside, one.effect])) / 2 for one in tries])
+            total = np.array([-tree(sample.map(partial(_squares, [*beside, one.effect]))) / 2 for one in tries])
         else:
             total = _left_out(tries, contrasts_of(sample, tries, beside), np.arange(len(sample))).sum(axis=0)
         k = int(np.clip(np.argmax(total), 1, len(x) - 2))

@@ -15,12 +15,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf
 
-from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, Partitions, UnitOfLot, in_partitions
+from driftlab.family.partitions import A_FEW, FamilyUnits, Partitions, UnitOfLot, in_partitions
 from driftlab.family.shared_effect import OfUnit, SharedEffect, UnitDensities, of_effect, sizes
 from driftlab.family.shared_effect_search import (
     CHANCE,
     Candidate,
-    Offer,
     between_lots,
     choose,
     contrasts_of,
@@ -110,7 +109,7 @@ class _Search:
         self.taken: list[tuple[Candidate, tuple[str, ...]]] = []
         self.last: dict[str, Candidate] = {}  # of the last round, the best of every kind
         some = sample.chosen(range(0, len(sample), max(1, len(sample) // PROPOSING)))
-        ((self.offers, self.refused),) = sample.engine(_proposed, some.parts)
+        ((self.offers, self.refused),) = sample.engine(offers_for, some.parts)
         self.of_units: dict[str, tuple[OfUnit, ...]] = {}
         self.noise: dict[str, UnitDensities] = {}
 
@@ -192,10 +191,6 @@ class _Search:
                 )
             )  # fmt: skip
         return tuple(effects)
-
-
-def _proposed(units: Partition[Sequence[UnitOfLot]]) -> tuple[list[Offer], dict[str, str]]:
-    return offers_for([soaked for soaked, _ in units.read()])
 
 
 def _margin(one: Candidate) -> float:

@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from driftlab.family.record import Covariances, Numbers, TermParabolas, UnitRecord
-from driftlab.family.reml import WEIGHT, UnitsOfAxis, fit_axis
+from driftlab.family.reml import WEIGHT, fit_axis
 from driftlab.triad.model import PARABOLA, TermPrior
 from fusion_core.chunk import Array
 from fusion_core.thermal.map_file import expect_covariance
@@ -71,10 +71,10 @@ def fit_terms(records: Iterable[UnitRecord]) -> TermsLaw | None:
     J, h = zip(*(_information(unit, peaks) for unit in units), strict=True)
     lot = np.zeros(len(units), dtype=np.intp)
     terms = zip(np.stack(J, axis=1), np.stack(h, axis=1), strict=True)
-    fits = [fit_axis(UnitsOfAxis([(*term, lot)]), peaks) for term in terms]
+    fits = [fit_axis([(*term, lot)], peaks) for term in terms]
     return TermsLaw(
-        T=(low, high), units=len(units), mu=np.stack([fit.expected.means.mu for fit in fits]),
-        mu_covariance=np.stack([fit.expected.means.covariance for fit in fits]),
+        T=(low, high), units=len(units), mu=np.stack([fit.means.mu for fit in fits]),
+        mu_covariance=np.stack([fit.means.covariance for fit in fits]),
         Sigma=np.stack([fit.law.Sigma for fit in fits]),
     )  # fmt: skip
 

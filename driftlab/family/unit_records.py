@@ -7,7 +7,7 @@ row of columns, with texts that it has in common with others.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -24,6 +24,28 @@ OF_LIMITS = ("name", "verdict", "beside")  # of each row of a unit's limits
 # key, error, repeated soaks and parabolas of the terms, where a stimulus measured them
 _Alone = tuple[str, str, tuple[RepeatedSoak, ...], TermParabolas | None]
 Rows = NDArray[np.integer[Any]]
+BLANK = UnitRecord(key="", unit="", state="done")
+
+
+class _FiguresOfRow(Mapping[str, Figure]):
+    """Figures of a row by their names, each made when it is asked for: most who go through records ask for none."""
+
+    def __init__(self, names: tuple[str, ...], d: int, values: Sequence[float], deviations: Sequence[float]) -> None:
+        self.places, self.columns = (
+            {name: slice(k * d, k * d + d) for k, name in enumerate(names)},
+            (values, deviations),
+        )
+
+    def __getitem__(self, name: str) -> Figure:
+        own = (column[self.places[name]] for column in self.columns)
+        value, sigma = (tuple(None if v != v else v for v in part) for part in own)
+        return Figure.model_construct(value=value, sigma=sigma)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __len__(self) -> int:
+        return len(self.places)
 
 
 class UnitRecords:
@@ -80,20 +102,17 @@ class UnitRecords:
         unhashed = self._keys[32 * row : 32 * row + 32].hex(), "", (), None
         key, error, repeats, parabolas = self._alone.get(row, unhashed)
         (axes, names), (_, numbers, deviations) = [*self._tables.items()][self._kinds[row]]
-        place, d = self._places[row], len(axes)
-        start, own = place * (NUMBERS + d * len(names)), place * d * len(names)
-        low, high, hours, samples, seconds = numbers[start : start + NUMBERS]
-        figures = {}
-        for k, name in enumerate(names):
-            columns = ((numbers, start + NUMBERS + k * d), (deviations, own + k * d))
-            value, sigma = (tuple(None if v != v else v for v in part[at : at + d]) for part, at in columns)
-            figures[name] = Figure.model_construct(value=value, sigma=sigma)
-        return UnitRecord.model_construct(
-            key=key, unit=self.units[row], lot=lot, date=date, more=dict(more), state=state, error=error,
-            channel=channel, bias_unit=bias_unit, axes=axes, domain=None if low != low else (low, high), hours=hours,
-            samples=int(samples), figures=figures, limits=[dict(limit) for limit in limits], seconds=seconds,
-            driftlab=driftlab, repeats=list(repeats), parabolas=parabolas, doubts=list(doubts),
-        )  # fmt: skip
+        size = len(axes) * len(names)
+        start, own = self._places[row] * (NUMBERS + size), self._places[row] * size
+        low, high, hours, samples, seconds, *values = numbers[start : start + NUMBERS + size]
+        figures = _FiguresOfRow(names, len(axes), values, deviations[own : own + size])
+        return BLANK.model_copy(update={
+            "key": key, "unit": self.units[row], "lot": lot, "date": date, "more": dict(more), "state": state,
+            "error": error, "channel": channel, "bias_unit": bias_unit, "axes": axes,
+            "domain": None if low != low else (low, high), "hours": hours, "samples": int(samples), "figures": figures,
+            "limits": [dict(limit) for limit in limits], "seconds": seconds, "driftlab": driftlab,
+            "repeats": list(repeats), "parabolas": parabolas, "doubts": list(doubts),
+        })  # fmt: skip
 
     def of(self, units: Iterable[str]) -> RecordsOfUnits:
         """Return the records of some units, in that order."""

@@ -216,14 +216,12 @@ def _level_law(family: Family) -> list[InControl]:
 
 def _mean_over_range(family: Family) -> Array:
     """Return the weights (q,) of coefficients in the mean of a curve over the family's range."""
-    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1))
-    return np.asarray(B.mean(axis=0))
+    return np.asarray(family.knots.grid(4)[1].mean(axis=0))
 
 
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     """Return the spread of the family, in a sentence."""
-    low, high = family.knots.domain
-    B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
+    (low, high), (_, B) = family.knots.domain, family.knots.grid(4)
     mean, whole = (
         np.sqrt(np.mean(deviation(B, C) ** 2, axis=0)) for C in (family.mu_covariance, family.Sigma + family.Lambda)
     )
@@ -246,21 +244,17 @@ def _kept(
 
     Who fits a family needs no rows.
     """
-    with_rows = np.zeros(len(units), dtype=bool)
-    with_rows[[*whole]] = True
     noise = [common.noise.get(name) for name in names] or [None] * len(units)
-    return units.keep("apart", partial(_apart, common.effects), noise, with_rows)
+    return units.keep("apart", partial(_apart, common.effects), noise, np.isin(np.arange(len(units)), whole))
 
 
 def _apart(
-    effects: Sequence[SharedEffect],
-    units: Sequence[UnitOfLot],
-    noise: Sequence[UnitDensities | None],
-    with_rows: Sequence[bool],
-) -> list[UnitOfLot]:
+    effects: Sequence[SharedEffect], units: Sequence[UnitOfLot], noise: Sequence[UnitDensities | None],
+    whole: Sequence[bool],
+) -> list[UnitOfLot]:  # fmt: skip
     """Return units with the effects in the model, each drawn from its law, beside their noise; some with their rows."""
     kept = []
-    for (soaked, lot), own, whole in zip(units, noise, with_rows, strict=True):
+    for (soaked, lot), own, rows in zip(units, noise, whole, strict=True):
         apart = without_effects(soaked, lot, effects, own) if effects else soaked
-        kept.append((apart if whole else replace(apart, recordings=()), lot))
+        kept.append((apart if rows else replace(apart, recordings=()), lot))
     return kept

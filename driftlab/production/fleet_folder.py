@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from driftlab.family.partitions import SIZE, Engine, Partitions, Scratch, UnitOfLot, serial
+from driftlab.family.partitions import A_FEW, SIZE, Engine, Partitions, Scratch, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_records import UnitRecords
 from driftlab.production.unit_folders import (
@@ -300,6 +300,7 @@ def stored_units(
     folders: UnitFolders, units: Sequence[str], lots: Sequence[str], engine: Engine = serial,
     scratch: Scratch | None = None,
 ) -> Partitions[Sequence[UnitOfLot]]:  # fmt: skip
-    """Return units in folders by names and lots; workers keep files in `scratch`."""
-    cuts = [slice(k, k + SIZE) for k in range(0, len(units), SIZE)]
+    """Return units in folders by names and lots; workers keep files in `scratch`. Of few units all have some to do."""
+    size = max(A_FEW, min(SIZE, -(-len(units) // A_FEW)))
+    cuts = [slice(k, k + size) for k in range(0, len(units), size)]
     return Partitions([StoredUnits(folders, tuple(units[k]), tuple(lots[k])) for k in cuts], engine, scratch)

@@ -51,6 +51,7 @@ OF_TERMS = (*TERM_FIGURES, *(f"{name}_change" for name in TERM_FIGURES))
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end", *OF_TERMS)
 ROWS = 20_000  # of a group, which is written at once
 MOST_CURVES = 5000  # maps that the report draws
+CURVE = 2  # temperatures of an interval of the knots
 Row = dict[str, Any]
 
 
@@ -163,11 +164,6 @@ class _Table:
         return len(units), curves
 
 
-def temperatures(family: Family) -> Array:
-    """Return temperatures (G,) over the family's domain, degC."""
-    return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
-
-
 def _posterior_rows(
     folders: UnitFolders, of_unit: UnitPosterior, size: Sequence[OfUnit] | None, doubts: Sequence[str]
 ) -> tuple[list[Row], Array]:
@@ -179,7 +175,7 @@ def _posterior_rows(
     doubt = {DOUBT: doubts[0]} if doubts else {}
     fitted = of_unit.map({"written": seal_of(COMMAND), "unit": name, "lot": lot, **doubt})
     folders.write(name, FAMILY_MAP, file_content(fitted, FAMILY_MAP))
-    T, before = temperatures(family), family.marginal(lot)
+    (T, B), before = family.knots.grid(CURVE), family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
     columns = {
         "coefficients": posterior.c,
@@ -191,7 +187,7 @@ def _posterior_rows(
         columns |= {"common_effect": first.c[:, 0], "common_effect_sigma": first.sigma[:, 0]}
     knots = family.knots.peaks.tolist()
     rows = [{"knots": knots, **{name: values[k].tolist() for name, values in columns.items()}} for k in range(len(off))]
-    return rows, (family.knots.values(T) @ posterior.c.T).T.astype(np.float32)
+    return rows, (B @ posterior.c.T).T.astype(np.float32)
 
 
 def rows_of(record: UnitRecord, family: Sequence[Row] = (), odd: Sequence[str] | None = None) -> Iterator[Row]:
@@ -361,7 +357,7 @@ def _overview(
     drawn: Sequence[str],
 ) -> FleetOverview:
     family, axes = analysis.family, analysis.line.axes
-    T = np.zeros(0) if family is None else temperatures(family)
+    T, B = (np.zeros(0), np.zeros(0)) if family is None else family.knots.grid(CURVE)
     return FleetOverview(
         title=title,
         records=status.records,
@@ -370,7 +366,7 @@ def _overview(
         T=T,
         curves=np.stack(curves) if curves else np.zeros((0, len(axes), len(T)), dtype=np.float32),
         drawn=drawn,
-        mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
+        mean=None if family is None else (B @ family.mu.T).T,
         odd=analysis.odd,
         effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],
         links=dict(links),

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from driftlab.spc.capability import D2, Capability
 from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
-from fusion_core.recursions import drift
 
 MIN_UNITS = 10  # for a chart
 LEVEL = "level"
@@ -364,9 +364,9 @@ def ewma(z: Array, most: float = SIGMAS) -> Array:
     Values further out belong to Shewhart's chart; else one odd unit would hold the EWMA out of its limits for ten.
     Clipped at three, it alarms once in 530 units.
     """
-    steps, left = LAMBDA * np.clip(z, -most, most), np.full((1, 1, 1), 1 - LAMBDA)
-    each = [drift(np.zeros(1), left, row[:, None]) for row in steps.reshape(-1, steps.shape[-1])]
-    return np.reshape(each, steps.shape)
+    steps = LAMBDA * np.clip(z, -most, most)
+    rows = steps.reshape(-1, steps.shape[-1]).tolist()
+    return np.reshape([[*accumulate(row, lambda w, step: step + (1 - LAMBDA) * w)] for row in rows], steps.shape)
 
 
 def ewma_limit(n: int) -> Array:

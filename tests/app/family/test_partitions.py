@@ -15,7 +15,7 @@ from driftlab.family import mixed_model, outlier_tests, partitions
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.partitions import InMemory, Partitions, added, in_partitions, tree
-from driftlab.family.reml import UnitsOfAxis, VarianceComponents, e_step
+from driftlab.family.reml import UnitsUnderLaw, VarianceComponents, e_step
 from driftlab.production.workers import Pool
 
 SIZE = 1e-4
@@ -35,7 +35,7 @@ def test_a_tree_adds_in_an_order_that_whole_branches_do_not_change(monkeypatch: 
         sums = set()
         for blocks in (1, 2, 5, 16, 1000):
             monkeypatch.setattr(partitions, "BLOCKS", blocks)
-            sums.add(parts.reduce(float))
+            sums.add(tree(parts.map(float)))
         assert sums == {tree(leaves)}
         assert_allclose(sums.pop(), float(np.sum(np.array(leaves, dtype=np.longdouble))), rtol=1e-12)
 
@@ -64,26 +64,24 @@ def _with_names(own: list[partitions.UnitOfLot], names: list[str], places: np.nd
     return [(soaked.unit, name, int(k)) for (soaked, _), name, k in zip(own, names, places, strict=True)]
 
 
-def _found(units: Partitions[list[partitions.UnitOfLot]]) -> tuple[Family, np.ndarray]:
-    family = fit_family(units)
+def _found(units: Partitions[list[partitions.UnitOfLot]], sample: int) -> tuple[Family, np.ndarray]:
+    with pytest.MonkeyPatch.context() as patched:  # here alone: what workers fit is of fewer
+        patched.setattr(mixed_model, "SAMPLE", sample)
+        family = fit_family(units)
     family = family.model_copy(update={"bands": measure_bands(family, units)})
     statistics = outlier_tests.CurveStatistics(family, fitted=True)
     return family, outlier_tests.tests_of(family, statistics, units, [], None).curves
 
 
 @pytest.mark.parametrize("sample", [1500, 40])  # all units, and some of them
-def test_processes_change_nothing(
-    sample: int, units: list[partitions.UnitOfLot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mixed_model, "SAMPLE", sample)
+def test_processes_change_nothing(sample: int, units: list[partitions.UnitOfLot], tmp_path: Path) -> None:
     with threadpool_limits(1):
-        family, values = _found(in_partitions(units, 7))
+        family, values = _found(in_partitions(units, 7), sample)
         with Pool(2) as pool:
-            by_two, theirs = _found(
-                replace(in_partitions(units, 7), engine=pool.ordered, scratch=partitions.ScratchFolder(tmp_path))
-            )
+            theirs = replace(in_partitions(units, 7), engine=pool.ordered, scratch=partitions.ScratchFolder(tmp_path))
+            by_two, of_two = _found(theirs, sample)
     assert by_two.model_dump_json() == family.model_dump_json()
-    assert np.array_equal(theirs, values, equal_nan=True)
+    assert np.array_equal(of_two, values, equal_nan=True)
 
 
 def test_sums_of_partitions_of_any_size_agree(units: list[partitions.UnitOfLot]) -> None:
@@ -96,7 +94,7 @@ def test_sums_of_partitions_of_any_size_agree(units: list[partitions.UnitOfLot])
     found = []
     for size in (1, 7, 60):
         cuts = [slice(k, k + size) for k in range(0, 60, size)]
-        found.append(e_step(law, UnitsOfAxis([(J[cut, 1], h[cut, 1], lot[cut]) for cut in cuts]), w))
+        found.append(e_step(UnitsUnderLaw(law, [(J[cut, 1], h[cut, 1], lot[cut]) for cut in cuts]), w))
     for other in found[1:]:
         for name in ("share", "spread", "scatter", "between"):
             one = getattr(found[0], name)

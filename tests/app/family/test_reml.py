@@ -9,7 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from driftlab.family.reml import EStep, UnitsOfAxis, VarianceComponents, change, e_step, m_step
+from driftlab.family.reml import EStep, UnitsUnderLaw, VarianceComponents, change, e_step, m_step
 
 
 def reml(
@@ -18,13 +18,13 @@ def reml(
     """Return the law of highest restricted likelihood, every unit's weight 1, and the expectations under it."""
     w, lots = np.ones(len(J)), int(lot.max()) > 0
     law = start if lots else replace(start, Lambda=np.zeros_like(start.Sigma))
-    units = UnitsOfAxis([(J[k : k + 90], h[k : k + 90], lot[k : k + 90]) for k in range(0, len(J), 90)])
+    units = [(J[k : k + 90], h[k : k + 90], lot[k : k + 90]) for k in range(0, len(J), 90)]
     for _ in range(most):
-        later = m_step(e_step(law, units, w), w, None, lots=lots)
+        later = m_step(e_step(UnitsUnderLaw(law, units), w), w, None, lots=lots)
         law, moved = later, change(law, later)
         if moved < tolerance:
             break
-    return law, e_step(law, units, w)
+    return law, e_step(UnitsUnderLaw(law, units), w)
 
 
 def dense(y: np.ndarray, X: list[np.ndarray], noise: float, Sigma: np.ndarray) -> float:
