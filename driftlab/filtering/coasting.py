@@ -357,7 +357,8 @@ class Prediction:
         sigma = sigma if left is None else np.hypot(sigma, left)
         if x is not None or np.count_nonzero(self.departed):
             coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        bias, coast = _to_the_end(states, at, coast, *self._late(done, step), calibration)
+        known = np.ascontiguousarray(calibration if calibration.strides[0] else calibration[:1])
+        bias, coast = _to_the_end(states, at, coast, *self._late(done, step), known)
         return BiasOutput(bias, sigma, coast, coast_sigma)
 
     def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:
@@ -376,14 +377,14 @@ def _to_the_end(
 ) -> tuple[Array, Array]:
     """Return the bias, of states (N, n) from place `at` on, and the prediction (N, d) at the ends of the epochs.
 
-    That is with a share (N,) of the drift, and with the calibration (N, d).
+    That is with a share (N,) of the drift, and with the calibration (N or 1, d).
     """
     N, d = coast.shape
     bias, ahead = np.empty((N, d)), np.empty((N, d))
     for k in range(N):
-        k_u = min(k, len(drift) - 1)
+        k_u, k_c = min(k, len(drift) - 1), min(k, len(calibration) - 1)
         for j in range(d):
-            late, known = share[k] * drift[k_u, j], calibration[k, j]
+            late, known = share[k] * drift[k_u, j], calibration[k_c, j]
             bias[k, j], ahead[k, j] = states[k, at + j] + late + known, coast[k, j] + late + known
     return bias, ahead
 

@@ -160,8 +160,8 @@ class Tracker:
                 parts = {channel: epochs[channel] - part for channel, part in less.items()}
                 corrected = epochs.having(**parts) if parts else epochs
                 channel = self.model.tracked.channel
-                calibration = less[channel] if channel in less else np.zeros_like(epochs[channel])
-                yield _Piece(epochs, corrected, calibration, steps, before)
+                none = np.broadcast_to(0.0, epochs[channel].shape)
+                yield _Piece(epochs, corrected, less.get(channel, none), steps, before)
 
     def _filter(self, part: Chunk, transition: Transition, measurement: Measurement, *, keep_P: bool) -> Estimates:
         """Run the filter up to the end, or to where the unit may be at rest anew."""

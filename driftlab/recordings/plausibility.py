@@ -108,9 +108,8 @@ class Rounding:
         self.squares.append(np.mean(changes**2, axis=1))
         self.dt.append(float(np.median(np.diff(chunk.t[rows], axis=1))))
         step = np.minimum(self.step, np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf))
-        known = np.where(np.isfinite(self.step), self.step, 0.0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where there are no steps
-            times = np.vstack([changes.reshape(-1, len(step)), known]) / step
+            times = np.vstack([changes.reshape(-1, len(step)), np.where(np.isfinite(self.step), self.step, 0.0)]) / step
             odd = np.max(np.abs(times - np.rint(times)), axis=0, where=np.isfinite(times), initial=0.0)
         self.step = np.where(odd < EXACT, step, 0.0)
 

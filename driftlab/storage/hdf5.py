@@ -150,7 +150,7 @@ class GrowingFile:
         data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
         if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if name in self._settling and new and full and _alike(piece):
+        if name in self._settling and new and full and (piece.strides[0] == 0 or np.all(piece[1:] == piece[:-1])):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
@@ -210,11 +210,6 @@ def _joined(parts: list[NDArray[Any]], start: int, stop: int, dtype: np.dtype[An
         row = found[0][0].astype(dtype)
         return np.broadcast_to(row, (sum(map(len, found)), *row.shape))
     return np.ascontiguousarray(found[0] if len(found) == 1 else np.concatenate(found), dtype=dtype)
-
-
-def _alike(rows: NDArray[Any]) -> bool:
-    """Return True if all rows are the same; the last tells most that are not."""
-    return rows.strides[0] == 0 or bool(np.all(rows[-1] == rows[0]) and np.all(rows == rows[0]))
 
 
 def beside(path: Path) -> Path:
