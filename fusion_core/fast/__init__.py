@@ -72,8 +72,11 @@ def _load(kept: Any, sig: Any, context: Any) -> Any:
     from numba.core.runtime import rtsys
 
     rtsys.initialize(context)  # memory of arrays
+    found: Any = None
     with kept._guard_against_spurious_io_errors():
-        return kept._load_overload(sig, context)
+        found = kept._load_overload(sig, context)
+    # two processes that keep a function for different types at one moment may give both the same file
+    return found if found is None or found.signature.args == sig else None
 
 
 compiled = Compiled

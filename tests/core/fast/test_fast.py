@@ -1,5 +1,6 @@
 """Functions that numba compiles when they are first called."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -66,3 +67,24 @@ print("numba.core.caching" in sys.modules, "numba.np.arraymath" in sys.modules)
     command = [sys.executable, "-c", code]
     subprocess.run(command, check=True, capture_output=True)  # compiles it where nothing is kept yet
     assert subprocess.run(command, check=True, capture_output=True, text=True).stdout.split() == ["True", "False"]
+
+
+def test_what_was_kept_for_other_types_is_not_taken(tmp_path):
+    """Two processes that keep a function at one moment, each for types of its own, may both write its first file."""
+    (tmp_path / "kept.py").write_text(
+        "from fusion_core.fast import compiled\n@compiled\ndef twice(x):\n    return 2 * x\n"
+    )
+    code = "from kept import twice; print(twice({}))"
+    said = []
+    for value in ("3.0", "3", "3"):
+        done = subprocess.run(
+            [sys.executable, "-c", code.format(value)],
+            cwd=tmp_path,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+        )
+        said.append(done.stdout.strip())
+        kept = sorted(tmp_path.rglob("*.nbc"))
+        kept[-1].write_bytes(kept[0].read_bytes())
+    assert said == ["6.0", "6", "6"]
