@@ -12,7 +12,7 @@ LONG = (
     "test_explain.py", "test_docs.py", "test_torture.py", "test_ownership.py", "test_live.py", "test_shared_effects.py",
     "test_explain_files.py", "test_unit.py", "test_plugin_examples.py", "test_family_example.py", "test_live_waits.py",
     "test_plan.py", "test_examples.py", "test_live_web.py", "test_fleet_killed.py", "test_checkpoint.py",
-    "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py",
+    "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py", "test_compilation.py",
 )  # fmt: skip
 
 
@@ -42,9 +42,9 @@ def recordings() -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def _compile_without_a_notice():
     """Commands print the same whether this installation has compiled its loops already or not."""
-    from driftlab.commands import console
+    from driftlab.commands import compilation
 
-    console.COMPILED = float("inf")
+    compilation.COMPILED = float("inf")
 
 
 @pytest.fixture(scope="session")

@@ -9,17 +9,15 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, field
-from functools import cache
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
-from threading import TIMEOUT_MAX, Timer
+from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 from fusion_core.escaping import json_text, line, lines
-from fusion_core.fast import WITH_NUMBA
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 COLOURS = {"pass": "green", "fail": "bold red", "undecided": "bold magenta", "unknown": "bold yellow"}
-COMPILED = 1.0  # s of compiling, after which it is announced
 
 
 @dataclass
@@ -77,7 +74,6 @@ def in_session(quiet: bool, verbose: bool, settings: list[str] | None) -> Iterat
     """Let a command be the one in progress; at its end say how long the stages took, where that is asked."""
     now = Session(quiet, settings or [])
     token = CURRENT.set(now)
-    WITH_NUMBA[:] = [note_compiling]
     try:
         yield
     finally:
@@ -171,41 +167,6 @@ def check_limits(config: Config, enforced: bool) -> None:
 
     if enforced and (config.limits is None or not config.limits.declared):
         raise ConfigError("--enforce-limits: the config has no limits, nothing would be enforced; set limits in it")
-
-
-@cache
-def note_compiling() -> None:
-    """Announce once in a process, on standard error, that loops are compiled for an installation or a processor."""
-    from numba.core import event
-
-    class Notice(event.Listener):  # type: ignore[misc]
-        """Waits for COMPILED seconds of compiling in all; what is compiled compiles what it calls."""
-
-        seconds, since, depth, announced = 0.0, 0.0, 0, False
-        timer: Timer | None = None
-
-        def on_start(self, event: Any) -> None:
-            self.depth += 1
-            if self.depth == 1 and not self.announced and COMPILED < TIMEOUT_MAX:
-                self.since = time.monotonic()
-                self.timer = Timer(max(COMPILED - self.seconds, 0.0), self.announce)
-                self.timer.daemon = True
-                self.timer.start()
-
-        def on_end(self, event: Any) -> None:
-            self.depth -= 1
-            if self.depth == 0 and self.timer is not None:
-                self.timer.cancel()
-                self.timer = None
-                self.seconds += time.monotonic() - self.since
-
-        def announce(self) -> None:
-            self.announced = True
-            text = "compiling the filter for this processor, up to some minutes; it is kept for the next time"
-            with suppress(OSError, ValueError):  # standard error is closed
-                terminal(stderr=True).print(text, soft_wrap=True)
-
-    event.register("numba:compile", Notice())
 
 
 @contextmanager

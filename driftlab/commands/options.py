@@ -21,6 +21,7 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperCommand
 
+from driftlab.commands.compilation import watch
 from driftlab.commands.console import check_limits, in_session, load, load_at_first_use, pairs, print_json, progress
 
 TYPES: dict[str, Any] = {  # by the first word of an annotation; of what is not here there is no option
@@ -167,6 +168,7 @@ class Command:
         def call(*, quiet: bool, verbose: bool, set_: list[str] | None = None, **given: Any) -> None:
             load_at_first_use("numpy.f2py", "numpy.testing")  # scipy takes all names of numpy: half of its own start
             with in_session(quiet, verbose, set_):
+                watch(self.name)
                 self._call(import_module(self.module), given)
 
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

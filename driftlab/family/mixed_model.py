@@ -121,7 +121,7 @@ def _survey(
         As `fit_family`.
     """
     if len(units) < MIN_UNITS:
-        raise ValueError(f"a family of {len(units)} units; at least {MIN_UNITS} are needed to know how units differ")
+        raise ValueError(f"{len(units)} units to learn from; at least {MIN_UNITS} are needed to know how units differ")
     first = next(units.read())[0]
     axes, step = first.axes, first.knots.step
     spans, places, columns, ranges = Counter[tuple[int, int]](), dict[str, int](), [], []

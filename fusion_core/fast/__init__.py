@@ -54,14 +54,19 @@ class Compiled:
             kept.load_overload = partial(_load, kept)
         return made
 
-    def __call__(self, *given: Any, **named: Any) -> Any:
-        """Call the function; it is compiled first where it has not been for such arguments."""
+    @property
+    def together(self) -> Any:
+        """The function as numba has it, and so what it calls of its module."""
         names = self.py_func.__globals__
         if isinstance(names.get(self.py_func.__name__), Compiled):  # the first of its module that is called
             with LOCK:  # compiled code calls compiled code
                 own = [(name, value) for name, value in names.items() if isinstance(value, Compiled)]
                 names.update({name: value.dispatcher for name, value in own if value.py_func.__globals__ is names})
-        return self.dispatcher(*given, **named)
+        return self.dispatcher
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        """Call the function; it is compiled first where it has not been for such arguments."""
+        return self.together(*given, **named)
 
 
 def _load(kept: Any, sig: Any, context: Any) -> Any:

@@ -157,7 +157,7 @@ def test_a_sample_makes_the_same_family_and_says_so(monkeypatch: pytest.MonkeyPa
 
 def test_who_cannot_be_a_family_is_told() -> None:
     units = soaked(made.deal("polynomial", 4, 20, size=SIZE), 20)
-    with pytest.raises(ValueError, match="a family of 2 units; at least 3 are needed"):
+    with pytest.raises(ValueError, match="2 units to learn from; at least 3 are needed"):
         fit_family(units[:2])
     other = made.deal("polynomial", 1, 20, d=2, size=SIZE)[0].soaked(20, ("x", "y"))
     with pytest.raises(ValueError, match="unit 0000 has axes x, y and knots"):
