@@ -257,7 +257,7 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 631,
-    "driftlab/commands": 3744,
+    "driftlab/commands": 3799,
     "driftlab/evaluation": 1507,
     "driftlab/family": 3309,
     "driftlab/filtering": 1259,
@@ -277,7 +277,7 @@ BUDGET = {
     "driftlab/triad": 699,
     "fusion_core": 1888,
     "fusion_core/contracts": 1963,
-    "fusion_core/fast": 819,
+    "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
     "fusion_core/thermal": 1158,
