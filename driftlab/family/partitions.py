@@ -1,8 +1,8 @@
 """Units of a family in partitions that stay where they are, and passes over them.
 
-A pass calls a function on each partition where that lies, and adds the results. Partitions are of so many units each,
-and sums are those of a binary tree over the partitions in their order, whoever works on them: one process, a pool or a
-cluster come to the same, to the last bit. Results are sums (arrays), samples or columns (lists), and these by name.
+A pass calls a function on each partition where that lies. What is added is added as a binary tree (`tree`) over parts
+in their order, whoever worked on them: one process, a pool or a cluster come to the same, to the last bit. Results are
+sums (arrays), samples or columns (lists), and these by name.
 """
 
 from __future__ import annotations
