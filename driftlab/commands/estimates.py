@@ -196,7 +196,7 @@ class EstimatesWriter:
         recording = os.path.realpath(self.recording) if self.recording is not None else ""
         attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
         keep = self.checkpoint["rows"] if self.checkpoint else 0
-        known = self.checkpoint["whiteness"] if self.checkpoint else None if self.detail else {}
+        known = self.checkpoint.get("whiteness") if self.checkpoint else None if self.detail else {}  # None: all kept
         if known is not None:
             self.whiteness = Whiteness(model.m)
             vars(self.whiteness).update(known)
