@@ -44,10 +44,19 @@ def worker(tmp_path, address, **environment):
 
 @contextmanager
 def supervised(tmp_path, address):
-    """Start a worker that Dask begins again when it is killed, as it does unless asked not to."""
+    """Start a worker that Dask begins again when it is killed, as it does unless asked not to.
+
+    Dask's nanny ends where its worker is killed before it has seen it running, some milliseconds after it has come.
+    """
+    from distributed import Client
+    from unit_work import status
+
     with started(
         tmp_path, "distributed.cli.dask_worker", address, "--nanny", "--no-dashboard", "--nthreads", "1",
     ) as (part, log):  # fmt: skip
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=60)
+            wait_until(lambda: [*client.run(status, nanny=True).values()] == ["running"])
         yield part, log
         part.terminate()  # it ends its worker, which would outlive it
         part.wait(20)
@@ -62,6 +71,14 @@ def said(path, text, patience=30.0):
                 return line
         time.sleep(0.02)
     raise AssertionError(f"{path} has no {text}: {path.read_text()}")
+
+
+def wait_until(holds, patience=30.0):
+    """Wait until a condition holds."""
+    end = time.monotonic() + patience
+    while not holds():
+        assert time.monotonic() < end, "it does not come to hold"
+        time.sleep(0.02)
 
 
 @contextmanager

@@ -54,6 +54,11 @@ def killed_so_often(path):
     return path
 
 
+def status(dask_worker):
+    """Return the status of the part of Dask that this is asked of, as a word."""
+    return dask_worker.status.name
+
+
 def square(number):
     return number * number
 
