@@ -61,6 +61,9 @@ def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
     the likely one: a short soak that does not show any does not exclude one.
     """
     d = recordings[0].bias.shape[1]
+    nothing = Figure(value=(None,) * d, sigma=(None,) * d)
+    if len(recordings) == 1:
+        return nothing
     noise, differences = [densities_of([rows], step) for rows in recordings], []
     for other in range(1, len(recordings)):
         both = (0, other)
@@ -75,7 +78,7 @@ def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
         variance = [_covariance(own, [rows], known.white, known.likely) for own, rows, known in parts]
         differences.append((np.sqrt(np.mean(apart**2, axis=0)), np.sqrt(variance[0] + variance[1])))
     if not differences:
-        return Figure(value=(None,) * d, sigma=(None,) * d)
+        return nothing
     value, sigma = (np.array(part) for part in zip(*differences, strict=True))
     largest = np.argmax(value / sigma, axis=0), np.arange(d)
     return Figure.of(value[largest], sigma[largest])

@@ -17,7 +17,7 @@ Temperatures visited only once contribute nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +99,10 @@ def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> tuple[Array
     places = np.clip(GRID + middle - logs[:, None], GRID[0], GRID[-1])
     total = np.sum([CubicSpline(GRID, costs)(at) for at, (costs, _) in zip(places, curves, strict=True)], axis=0)
     common = np.sqrt([_mean(*_fine(cost)) for cost in total.T]) * np.exp(middle / 2)
-    likely = [[_likely(*axis) for axis in zip(costs.T, scales.T, strict=True)] for costs, scales in curves]
+    likely = [
+        [_likely(*_fine(cost), CubicSpline(GRID, np.log(s2))) for cost, s2 in zip(costs.T, scales.T, strict=True)]
+        for costs, scales in curves
+    ]
     return common, np.array(likely) * np.exp(logs / 2)[:, None]
 
 
@@ -117,12 +120,9 @@ def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
     return float(np.sum(weight * scale * np.exp(at)) / np.sum(weight))
 
 
-def _likely(cost: Array, s2: Array) -> float:
-    """Return the likely walk of an axis, in the unit of the grid."""
-    from scipy.interpolate import CubicSpline
-
-    at, curve = _fine(cost)
-    return float(np.sqrt(_mean(at, curve, np.exp(CubicSpline(GRID, np.log(s2))(at)))))
+def _likely(at: Array, cost: Array, scale: Callable[[Array], Array]) -> float:
+    """Return the likely walk of an axis, in the unit of the grid; `scale` is the logarithm of the white noise."""
+    return float(np.sqrt(_mean(at, cost, np.exp(scale(at)))))
 
 
 def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
@@ -148,7 +148,8 @@ def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple
     """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
     from scipy.interpolate import CubicSpline
 
-    scale, (at, curve), likely = CubicSpline(GRID, np.log(s2)), _fine(cost), _likely(cost, s2)
+    scale, (at, curve) = CubicSpline(GRID, np.log(s2)), _fine(cost)
+    likely = _likely(at, curve, scale)
     k = int(np.argmin(curve))
     if nu < MIN_FREEDOM:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-SPANS = 240  # of time, at most
+SPANS = 120  # of time, at most
 BLOCKS = 360  # about, at most
 CELLS = 40  # of temperature: a block stays in one
 MIN_BLOCKS = 24  # blocks that separate a walk from white noise, at least

@@ -21,7 +21,11 @@ def turning_points(T: Array, turn: float) -> list[int]:
     """Return the places at which T (K,) begins to move, turns, and has its last extreme; none where it hardly moves."""
     points: list[int] = []
     low = high = way = 0  # the extremes since the last turn
-    for k, value in enumerate(T.tolist()):
+    way_on = np.sign(np.diff(T))
+    straight = np.zeros(len(T), dtype=bool)  # samples that go on as the one before did are no extremes
+    straight[1:-1] = way_on[1:] * way_on[:-1] > 0
+    for k in np.flatnonzero(~straight).tolist():
+        value = T[k]
         low, high = (k if value <= T[low] else low), (k if value >= T[high] else high)
         if way <= 0 and value - T[low] >= turn > 0:
             points, way, high = [*points, low], 1, k

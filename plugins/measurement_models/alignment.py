@@ -105,7 +105,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
         if tracked == gyro.channel:
             notes = _of_bias(LARGE * a_radian, gyro, accel, float(np.sum(window["tau"])))
     inputs[gyro.channel] = omega_ie
-    dt = float(np.median(window["tau"]))
+    dt = float(_median(window["tau"][:, None])[0])
     sensors = (gyro,) if accel is None else (gyro, accel)
     if accel is not None and tracked == accel.channel:
         unsure = np.zeros(len(accel.axes))

@@ -29,7 +29,7 @@ from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
 from fusion_core.chunk import Array, Integers
 from fusion_core.wandering import gauss_markov
 
-BLOCKS = 240  # about
+BLOCKS = 240  # about: half as many see less, one memory in a hundred of those that can be seen
 MIN_CONTRASTS = 24  # that separate slow noise from white noise, at least
 KNOTS = (8, 16, 32, 64)  # of the curve, as many as it needs
 GROUP = 3  # blocks to each at least
@@ -68,7 +68,7 @@ class FreeCurve:
         """Return the splines (N, p) at T (N,), held beyond the domain."""
         from scipy.interpolate import BSpline
 
-        return np.asarray(BSpline.design_matrix(np.clip(T, *self.domain), self.knots, 3).toarray())
+        return np.asarray(BSpline(self.knots, np.eye(len(self.knots) - 4), 3)(np.clip(T, *self.domain)))
 
 
 def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:
