@@ -13,12 +13,16 @@ from __future__ import annotations
 import errno
 import json
 import os
+from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
+
+import numpy as np
 
 from driftlab.family.partitions import A_FEW, SIZE, Engine, Partitions, Scratch, UnitOfLot, serial
 from driftlab.family.record import UnitRecord
@@ -81,7 +85,9 @@ class FleetFolder:
                 self.place.finish()
             else:
                 self.units = open_store(url, self.mark["id"])
-            self._shorten()
+            self._stamps = _Stamps(self.path / STAMPS)
+            if self._stamps.replaced:
+                self.write(STAMPS, "".join(json.dumps(note) + "\n" for note in self._stamps.last()).encode())
             self.records = UnitRecords()
             self._journal = (self.path / STAMPS).open("ab")
         except BaseException:
@@ -175,18 +181,9 @@ class FleetFolder:
         self.units.write(record.unit, RECORD, content_of(record))
         self.records[record.unit] = record
 
-    def stamps(self) -> dict[str, str]:
-        """Return the stamps of the units that were done here, by name."""
-        return {unit: stamp for unit, _, stamp in _stamps(self.path / STAMPS)}
-
-    def _shorten(self) -> None:
-        """Write the notes on stamps anew without those that later ones replace, where these are half of them."""
-        last, count = dict[str, int](), 0
-        for count, (unit, _, _) in enumerate(_stamps(self.path / STAMPS), 1):
-            last[unit] = count
-        if len(last) * 2 < count:
-            notes = (note for k, note in enumerate(_stamps(self.path / STAMPS), 1) if last[note[0]] == k)
-            self.write(STAMPS, "".join(json.dumps(note) + "\n" for note in notes).encode())
+    def as_it_was(self, unit: str, stamp: str) -> bool:
+        """Return True if a unit had this stamp when it was last done, before this command."""
+        return bool(stamp) and self._stamps.is_last(unit, stamp)
 
     def stamp(self, unit: str, key: str, stamp: str) -> None:
         """Note the state of a unit's recordings: as long as it stays, their contents need not be read."""
@@ -233,13 +230,41 @@ class FleetFolder:
             self.lock.release()
 
 
-def _stamps(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield name, key and stamp of each unit, the last note last; a line that was broken off is none."""
-    with suppress(FileNotFoundError), path.open("rb") as file:
-        while line := file.readline(LONGEST):
-            with suppress(ValueError, RecursionError):
-                unit, key, stamp = json.loads(line)
-                yield unit, key, stamp
+class _Stamps:
+    """The notes on stamps when a fleet is opened, as hashes: the names of a million units are a quarter of a gigabyte.
+
+    `replaced` is True where later notes replace half of them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, units, stamps = path, array("q"), array("q")
+        for unit, _, stamp in self._notes():
+            units.append(hash(unit))
+            stamps.append(hash(stamp))
+        back, self.count = np.frombuffer(units, dtype=np.int64)[::-1], len(units)
+        self._units, places = np.unique(back, return_index=True)
+        self._last = self.count - 1 - places
+        self._known = np.frombuffer(stamps, dtype=np.int64)[self._last]
+        self.replaced = len(self._last) * 2 < self.count
+
+    def _notes(self) -> Iterator[tuple[str, str, str]]:
+        """Yield name, key and stamp of each unit, the last note last; a line that was broken off is none."""
+        with suppress(FileNotFoundError), self.path.open("rb") as file:
+            while line := file.readline(LONGEST):
+                with suppress(ValueError, RecursionError):
+                    unit, key, stamp = json.loads(line)
+                    yield str(unit), key, str(stamp)
+
+    def last(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the last note on each unit."""
+        some = np.zeros(self.count, dtype=bool)
+        some[self._last] = True
+        return compress(self._notes(), some)
+
+    def is_last(self, unit: str, stamp: str) -> bool:
+        """Return True if the last note on a unit has a stamp."""
+        place = int(np.searchsorted(self._units, hash(unit)))
+        return place < len(self._units) and self._units[place] == hash(unit) and self._known[place] == hash(stamp)
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from __future__ import annotations
 import csv
 import errno
 import glob
-import io
 import json
 import os
 import re
@@ -223,7 +222,8 @@ def _again(paths: array[int]) -> Iterator[tuple[int, int]]:
 def _rows(text: str, name: str, wrong: _Mistakes) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield each row with the number of its line; empty ones, and those of another number of cells, are left out."""
     head = text.partition("\n")[0]
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count))
+    lines = (line.group() for line in re.finditer(r"[^\r\n]*(?:\r\n?|\n|\Z)", text))
+    reader = csv.reader(lines, delimiter=max(",;\t", key=head.count))
     header = [column.strip() for column in next(reader, [])]
     names = [column.lower() if column.lower() in COLUMNS else column for column in header]
     for column in ("unit", "path"):

@@ -135,7 +135,7 @@ class UnitPlace(UnitFolders):
 
     def unit(self, name: str) -> Path:
         """Return the folder of a unit."""
-        return self.path / UNITS / name
+        return Path(f"{self.address}/{name}")  # a path keeps its parts: a million names would stay known to Python
 
     def reached(self) -> bool:
         """Return True if this process sees the folder, and the command still holds it."""

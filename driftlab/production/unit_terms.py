@@ -6,13 +6,14 @@ bias of its own soak (`driftlab.production.unit_map`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftlab.evaluation.limits import OF_M
 from driftlab.family.record import TERM_FIGURES, Figure, UnitRecord
+from driftlab.family.unit_records import figure_of, figures_in
 from driftlab.storage.json import plain
 from driftlab.triad.model import AXES, NARROW
 from driftlab.units import number
@@ -45,13 +46,15 @@ def _by_axis(values: Array, sigma: Array, known: NDArray[np.bool_]) -> dict[str,
     return {name: Figure.of(value, own) for name, (value, own) in zip(TERM_FIGURES, columns, strict=True)}
 
 
-def terms_of_units(records: Iterable[UnitRecord]) -> dict[str, Any] | None:
+def terms_of_units(records: Sequence[UnitRecord]) -> dict[str, Any] | None:
     """Return median and spread of each term over units, by its name, and how many units have one; None where none has.
 
     The spread is 1.48 times the median deviation, which odd units hardly widen; null of a single unit.
     """
-    tables = [record.table(TERM_FIGURES, 3)[0] for record in records if len(record.axes) == 3]
-    M = np.array([table for table in tables if np.any(np.isfinite(table))])  # (n, TERM_FIGURES, 3)
+    if not figures_in(records).intersection(TERM_FIGURES):
+        return None
+    M = np.stack([figure_of(records, name, len(AXES))[0] for name in TERM_FIGURES], axis=1)
+    M = M[np.any(np.isfinite(M), axis=(1, 2))]
     if not len(M):
         return None
     found: dict[str, Any] = {"units": len(M)}

@@ -154,10 +154,10 @@ class UnitJobs:
 
         Raises ConfigError where the recordings of most are not there: each takes its time, and there may be any number.
         """
-        folder, units, lost, first, stamps = self.folder, self.manifest.units, 0, "", self.folder.stamps()
+        folder, units, lost, first = self.folder, self.manifest.units, 0, ""
         for name, entry in zip(self.manifest.names, units, strict=True):
             task = self._task(entry)
-            stamp, record, before = stamp_of(task, self.versions), folder.brief(name), stamps.pop(name, "")
+            stamp, record = stamp_of(task, self.versions), folder.brief(name)
             if not stamp and record is None and missing(task):
                 lost, first = lost + 1, first or entry.unit
             if lost > MISSING + len(units) - lost:
@@ -165,8 +165,7 @@ class UnitJobs:
                     f"--units {self.manifest.name}: the recordings of {lost:,} of {len(units):,} units are not there, "
                     f"the first is {first}; at most {MISSING:,} may be missing beside as many as are there, name those"
                 )
-            as_it_was = bool(stamp) and before == stamp
-            if self.options.force or not as_it_was or record is None:
+            if self.options.force or record is None or not folder.as_it_was(name, stamp):
                 yield name, stamp
 
     def _tasks(self, stamps: Mapping[str, str], stage: Stage) -> Iterator[Task]:
@@ -303,11 +302,11 @@ def stamp_of(task: Task, versions: str) -> str:
 
 def missing(task: Task) -> bool:
     """Return True if a recording on a file system is not there."""
-    return any(not is_url(name) and not _path(task.folder, name).exists() for name in task.names)
+    return any(not is_url(name) and not os.path.exists(_path(task.folder, name)) for name in task.names)
 
 
-def _path(folder: str, name: str) -> Path:
-    return Path(folder, part_of(name)[0])
+def _path(folder: str, name: str) -> str:
+    return os.path.join(folder, part_of(name)[0])
 
 
 def _looks(folder: str, name: str) -> Iterator[tuple[int | str, ...] | None]:
@@ -322,7 +321,8 @@ def _looks(folder: str, name: str) -> Iterator[tuple[int | str, ...] | None]:
         yield state
         return
     path = _path(folder, name)
-    parts = sorted(part for part in path.rglob("*") if part.is_file()) if path.is_dir() else [path]
+    folders = os.path.isdir(path)
+    parts = sorted(part for part in Path(path).rglob("*") if part.is_file()) if folders else [path]
     for part in parts:
         file = os.stat(part)
         yield file.st_size, file.st_mtime_ns, file.st_ctime_ns, file.st_ino

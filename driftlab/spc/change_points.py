@@ -204,13 +204,16 @@ def least_alike(z: Array, a: Array, blocks: Iterable[tuple[int, int]] = ()) -> t
 
 def parts(L: int, blocks: Iterable[tuple[int, int]] = ()) -> Index:
     """Return begins and ends (P, 2) of the parts of a piece of L, at least 2 SHORTEST, that are looked at."""
-    found, length = [(0, k) for k in range(SHORTEST, L - SHORTEST + 1)], float(DECAY * L)
+    ends, length = np.arange(SHORTEST, L - SHORTEST + 1), float(DECAY * L)
+    found = [np.column_stack([np.zeros_like(ends), ends])]
     while length >= SHORTEST:
         size = int(np.ceil(length - 1e-9))
         starts = np.unique(np.round(np.linspace(0, L - size, 2 * int(np.ceil(L / length)) - 1)).astype(int))
-        found += [(start, start + size) for start in starts.tolist()]
+        found.append(np.column_stack([starts, starts + size]))
         length *= DECAY
-    return np.array([(i, j) for i, j in [*found, *blocks] if SHORTEST <= j - i <= L - SHORTEST], dtype=np.intp)
+    of = np.concatenate([*found, np.reshape([*blocks], (-1, 2))]).astype(np.intp)
+    lengths = of[:, 1] - of[:, 0]
+    return of[(lengths >= SHORTEST) & (lengths <= L - SHORTEST)]
 
 
 def shares(z: Array, a: Array, of: Index) -> Array:

@@ -116,13 +116,15 @@ def lots_of(names: NDArray[Any], x: Array, own: Array, known: float | None = Non
     list of (name, (7,) array)
         Units, mean, its limits, deviation, its limits.
     """
-    of_lot = {name: names == name for name in dict.fromkeys(names.tolist())}
-    n = np.array([np.sum(part) for part in of_lot.values()], dtype=np.intp)
-    s = np.array([np.std(x[part], ddof=1) if np.sum(part) > 1 else np.nan for part in of_lot.values()])
+    _, first, number = np.unique(names, return_index=True, return_inverse=True)
+    places = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    of_lot = [(str(names[first[k]]), places[k]) for k in np.argsort(first).tolist()]
+    n = np.array([len(part) for _, part in of_lot], dtype=np.intp)
+    s = np.array([np.std(x[part], ddof=1) if len(part) > 1 else np.nan for _, part in of_lot])
     sigma = within(n.copy(), s) if known is None else known
     ratio = sigma / float(np.median(own)) if sigma > 0 else 1.0  # of what lots vary to what neighbours do
     points = []
-    for (name, part), count, deviation in zip(of_lot.items(), n.tolist(), s.tolist(), strict=True):
+    for (name, part), count, deviation in zip(of_lot, n.tolist(), s.tolist(), strict=True):
         weight = 1 / own[part] ** 2
         about = x[part] - np.median(x[part])
         z = np.clip(about / own[part], -REACH, REACH)

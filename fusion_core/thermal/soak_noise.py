@@ -97,7 +97,6 @@ def blocks_of(T: Array, left: Array, group: Integers | None = None) -> Blocks:
     state = cell if group is None else group * CELLS + cell
     count, spans = int(state.max()) + 1, min(SPANS, N)
 
-
     def cut() -> Integers:
         return _numbered(np.arange(N) * spans // N * count + state)
 

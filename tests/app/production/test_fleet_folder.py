@@ -31,7 +31,9 @@ def test_a_folder_is_opened_again_whatever_its_units_are_called(name, tmp_path):
         folder.put(UnitRecord(key="k", unit=name, state="failed", error="none"), {"unit.npz": b"1"}, "stamp")
     with fleet_folder(tmp_path / "fleet") as folder:
         assert (folder.place.unit(name) / "unit.npz").read_bytes() == b"1"
-        assert folder.stamps() == {name: "stamp"}
+        assert folder.as_it_was(name, "stamp")
+        assert not folder.as_it_was(name, "another")
+        assert not folder.as_it_was("another", "stamp")
 
 
 def test_notes_on_stamps_that_later_ones_replace_do_not_pile_up(tmp_path):
@@ -41,7 +43,9 @@ def test_notes_on_stamps_that_later_ones_replace_do_not_pile_up(tmp_path):
             folder.stamp("7", "k", "as it was")
     with fleet_folder(tmp_path / "fleet") as folder:
         assert (folder.path / "inputs.ndjson").read_text().count("\n") == 2
-        assert folder.stamps() == {"6": "stamp 4", "7": "as it was"}
+        assert folder.as_it_was("6", "stamp 4")
+        assert folder.as_it_was("7", "as it was")
+        assert not folder.as_it_was("6", "stamp 3")
 
 
 def test_what_a_killed_command_left_is_finished(tmp_path):
