@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -186,7 +187,8 @@ def _closed(
     progress("opening the test recording")
     # a test recording that leaves the map's domain is judged all the same, and not refused after all the work
     both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
-    outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in recordings["holdout"]]
+    compared = both if explanation.anything else both[:1]
+    outcomes = [outcome_of(compared, recording, progress) for recording in recordings["holdout"]]
     identities = {role: list(map(identity, names)) for role, names in recordings.items()}
     whole = closed(explanation, outcomes, identities)
     if whole.refuted:
@@ -267,18 +269,21 @@ def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult])
     return replace(sheet, recordings=recordings, maps=maps)
 
 
-def outcome_of(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
-    """Run one test recording, which is read once, through both configs, and return their predictions."""
-    config, faults = with_recording(declared, recording), Faults()
+def outcome_of(compared: Sequence[Config], recording: str, progress: Progress) -> Outcome:
+    """Run one test recording, which is read once, through both configs side by side, and return their predictions.
+
+    Those of one config, where nothing was added to it.
+    """
+    config, faults = with_recording(compared[0], recording), Faults()
     stream = list(epochs(read(config, faults), config.filter.update_interval if config.filter else 1.0))
-    progress(f"running {recording} through the declared config")
-    first, before = _run(config, stream, deepcopy(faults))
-    progress(f"running {recording} through the explained config")
-    second, after = _run(with_recording(explained, recording), stream, faults)
+    progress(f"running {recording} through the declared config{' and the explained one' * (len(compared) > 1)}")
+    with ThreadPoolExecutor(len(compared)) as pool:
+        runs = [pool.submit(_run, with_recording(c, recording), stream, deepcopy(faults)) for c in compared]
+        (first, before), (second, after) = runs[0].result(), runs[-1].result()
     coasting = np.isfinite(first["coast"][:, 0])
     return Outcome(
         name=recording,
-        unit=tracked_unit(declared.filter),
+        unit=tracked_unit(config.filter),
         t=first["t"][coasting],
         temperature=next((c["temperature_raw"][coasting] for c in (first, second) if "temperature_raw" in c), None),
         reference=moving_average(first["t"], first["rate"], first["tau"], first["still"])[coasting],
@@ -343,28 +348,38 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
         *(("train", k, calibration, alike, SAME) for k in range(len(train))),
         *(("holdout", k, [*calibration, *train], fresh, np.inf) for k in range(len(holdout))),
     ]
-    contents: dict[str, Content] = {}
+    contents = _contents(config, list(dict.fromkeys(name for names in recordings.values() for name in names)))
     for role, k, others, problem, same in pairs:
         name = recordings[role][k]
         for other in others:
-            if SMALL < _share(config, name, other, contents) < same:
+            if SMALL < _share(name, other, contents) < same:
                 raise ConfigError(f"--{role} {name}: {problem.format(other)}")
-    names = [next((c for c in calibration if _share(config, name, c, contents) >= SAME), name) for name in train]
+    names = [next((c for c in calibration if _share(name, c, contents) >= SAME), name) for name in train]
     return list(calibration), names
 
 
-def _share(config: Config, name: str, other: str, contents: dict[str, Content]) -> float:
+def _contents(config: Config, names: Sequence[str]) -> dict[str, Content]:
+    """Return the contents of recordings, read side by side; empty where all are parts of one file."""
+    if len({_span(name)[0] for name in names}) < 2:
+        return {}
+    assert config.filter is not None
+    channel = config.filter.tracked.channel
+
+    def content(name: str) -> Content:
+        chunks = read(with_recording(config, name), Faults())
+        return recording_content((chunk for chunk in chunks if channel in chunk.channels), channel)
+
+    with ThreadPoolExecutor(2) as pool:
+        return dict(zip(names, pool.map(content, names), strict=True))
+
+
+def _share(name: str, other: str, contents: Mapping[str, Content]) -> float:
     """Return the share of the samples of the shorter recording that is in both; 1 where one file's parts overlap."""
     (file, start, stop), (other_file, other_start, other_stop) = _span(name), _span(other)
     if file == other_file:
         if (start, stop) == (other_start, other_stop):
             return 1.0
         return SAME / 2 if start < other_stop and other_start < stop else 0.0
-    for one in (name, other):
-        if one not in contents:
-            assert config.filter is not None
-            channel, chunks = config.filter.tracked.channel, read(with_recording(config, one), Faults())
-            contents[one] = recording_content((chunk for chunk in chunks if channel in chunk.channels), channel)
     return contents[name].share(contents[other])
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from fusion_core.chunk import Array
+from fusion_core.contracts import SLAB
 
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
@@ -55,12 +56,13 @@ class TailLaw(BaseModel):
         off = x - centre
         below, above = _widths(off)
         wide = np.minimum(below, above) > WIDTH * np.nanmax(np.abs(off), axis=0, initial=0.0)  # most are not the same
-        u = off[:, wide] / np.where(off[:, wide] > 0, above[wide], below[wide])
+        off = off[:, wide]
+        off /= np.where(off > 0, above[wide], below[wide])
         at = np.zeros((3, values.shape[1]))
         at[:, known >= MIN_UNITS] = centre, below, above
         return cls(
             centre=tuple(at[0].tolist()), below=tuple(at[1].tolist()), above=tuple(at[2].tolist()),
-            share=_weights(-u[u < 0], u[u > 0]), most=SURE * float(np.max(known)),
+            share=_weights(-off[off < 0], off[off > 0]), most=SURE * float(np.max(known)),
         )  # fmt: skip
 
     def column(self, k: int) -> TailLaw | None:
@@ -113,8 +115,9 @@ def _widths(off: Array) -> tuple[Array, Array]:
 
     As far apart as more than chance has them (James and Stein): a width of one side is of half the values.
     """
-    sides = [1.4826 * np.nanmedian(np.where(s * off >= 0, np.abs(off), np.nan), axis=0) for s in (-1, 1)]
-    both = 1.4826 * np.nanmedian(np.abs(off), axis=0)
+    # a column at a time: of a million units all at once would be a gigabyte
+    sides = [np.array([1.4826 * np.nanmedian(np.abs(x[s * x >= 0])) for x in off.T]) for s in (-1, 1)]
+    both = np.array([1.4826 * np.nanmedian(np.abs(x)) for x in off.T])
     tiny = 1e-6 * both + np.finfo(float).tiny
     apart = np.log(np.maximum(sides[1], tiny) / np.maximum(sides[0], tiny))
     chance = OF_SIDES / np.sum(np.isfinite(off), axis=0)
@@ -144,12 +147,14 @@ def _likely(x: Array) -> Array:
     """Return the log-likelihood of each of DOF by values x (n,) of one side, in its widths."""
     from scipy.special import betaln, logsumexp
 
-    reach, likely = float(np.max(x, initial=0.0)) + 1.0, []
-    for dof in DOF:
-        own = (dof + 1) / 2 * np.log1p((x * _unit(dof)) ** 2 / dof) + betaln(0.5, dof / 2) + 0.5 * np.log(dof)
-        density = 2 * _unit(dof) * np.exp(-own)
-        likely.append(logsumexp([np.sum(np.log((1 - e) * density + e / reach)) for e in SHARES]))
-    return np.array(likely)
+    reach, likely = float(np.max(x, initial=0.0)) + 1.0, np.zeros((len(DOF), len(SHARES)))
+    for start in range(0, len(x), SLAB):
+        part = x[start : start + SLAB]
+        for dof, sums in zip(DOF, likely, strict=True):
+            own = (dof + 1) / 2 * np.log1p((part * _unit(dof)) ** 2 / dof) + betaln(0.5, dof / 2) + 0.5 * np.log(dof)
+            density = 2 * _unit(dof) * np.exp(-own)
+            sums += [np.sum(np.log((1 - e) * density + e / reach)) for e in SHARES]
+    return np.asarray(logsumexp(likely, axis=1))
 
 
 def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:

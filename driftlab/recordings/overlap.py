@@ -103,7 +103,10 @@ def _words(x: Array, long: int) -> Words:
 
 def _noisy(words: Words, bits: int) -> Flags:
     """Return the mask of words with noise in them: some of each bit."""
-    part = np.unpackbits(words.view(np.uint8).reshape(len(words), 8), axis=1).sum(axis=1) / bits
+    ones = words.copy()  # of each pair of bits, each four, each eight
+    for shift, mask in ((1, 0x5555555555555555), (2, 0x3333333333333333), (4, 0x0F0F0F0F0F0F0F0F)):
+        ones = (ones & np.uint64(mask)) + (ones >> np.uint64(shift) & np.uint64(mask))
+    part = (ones * np.uint64(0x0101010101010101) >> np.uint64(56)) / bits
     return np.asarray((part >= PLAIN) & (part <= 1 - PLAIN))
 
 
