@@ -6,15 +6,22 @@ Figures are drawn by uPlot (https://github.com/leeoniya/uPlot, MIT), which each 
 from __future__ import annotations
 
 import re
+import sys
+from contextlib import suppress
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
 from driftlab import __version__
 from driftlab.reports.charts import LOOKS, Chart, content
 from fusion_core.escaping import css_text, line, lines, script_json
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from jinja2.bccache import Bucket
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
@@ -24,15 +31,27 @@ def write_page(path: Path, template: str, **values: Any) -> None:
 
 def page(template: str, **values: Any) -> str:
     """Return a template of this package, filled; a value that is a Chart is printed with `{{ interactive(chart) }}`."""
+    return environment().get_template(f"{template}.html").render(version=__version__, **values)
+
+
+@cache
+def environment() -> Environment:
+    """Return the templates; what they are compiled to is kept beside Python's own bytecode, where that is kept."""
     import jinja2
+
+    class Kept(jinja2.FileSystemBytecodeCache):
+        def dump_bytecode(self, bucket: Bucket) -> None:
+            with suppress(OSError):
+                super().dump_bytecode(bucket)
 
     loader = jinja2.PackageLoader("driftlab.reports", "pages")
     # texts with the codes of characters that are invisible, or that turn what is beside them
     escaped = lambda value: lines(value) if type(value) is str else value  # noqa: E731
-    environment = jinja2.Environment(loader=loader, autoescape=True, finalize=escaped)
+    kept = None if sys.dont_write_bytecode else Kept(str(Path(__file__).parent / "__pycache__"))
+    environment = jinja2.Environment(loader=loader, autoescape=True, finalize=escaped, bytecode_cache=kept)
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     environment.filters["prose"] = prose
-    return environment.get_template(f"{template}.html").render(version=__version__, **values)
+    return environment
 
 
 def looks() -> dict[str, dict[str, str | float]]:

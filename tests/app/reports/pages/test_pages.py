@@ -9,7 +9,7 @@ from browsers import colours, drag, overflow, range_of_x
 
 from driftlab.reports import pages
 from driftlab.reports.charts import LOOKS, SERIES, Chart, Line, Panel, Rule, Shade, content, series
-from driftlab.reports.pages import embedded, interactive, looks, prose, quoted
+from driftlab.reports.pages import embedded, environment, interactive, looks, prose, quoted
 
 BODY = """{% extends "base.html" %}{% block title %}charts{% endblock %}{% block body %}<h1>Charts</h1>
 {% for chart in charts %}<h2>{{ chart.title }}</h2>{{ interactive(chart) }}{% endfor %}
@@ -39,7 +39,7 @@ def written(tmp_path, monkeypatch) -> Path:
     """Write a page of charts, as a template of the package."""
     package = jinja2.PackageLoader("driftlab.reports", "pages")
     both = jinja2.ChoiceLoader([jinja2.DictLoader({"charts.html": BODY}), package])
-    monkeypatch.setattr(jinja2, "PackageLoader", lambda *_: both)
+    monkeypatch.setattr(environment(), "loader", both)
     path = tmp_path / "charts.html"
     pages.write_page(path, "charts", charts=[bias_chart(), log_chart(), bias_chart(NASTY)])
     return path

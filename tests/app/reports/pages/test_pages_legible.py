@@ -19,7 +19,7 @@ def written(tmp_path, monkeypatch):
     """Return a function that writes a page with a text of some length, and a chart over two units with dates."""
     package = jinja2.PackageLoader("driftlab.reports", "pages")
     both = jinja2.ChoiceLoader([jinja2.DictLoader({"wide.html": BODY}), package])
-    monkeypatch.setattr(jinja2, "PackageLoader", lambda *_: both)
+    monkeypatch.setattr(pages.environment(), "loader", both)
 
     def write(text):
         line = Line(np.array([1.0, 2.0]), np.array([3.0, 4.0]), "unit", style="points")
