@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3852
+    assert 0 < count <= 3863
 
 
 def imports():
@@ -257,21 +257,21 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 631,
-    "driftlab/commands": 3799,
+    "driftlab/commands": 3806,
     "driftlab/evaluation": 1507,
-    "driftlab/family": 3309,
+    "driftlab/family": 3318,
     "driftlab/filtering": 1259,
     "driftlab/identification": 2256,
     "driftlab/live": 844,
     "driftlab/maps": 1806,
     "driftlab/noise": 1255,
     "driftlab/planning": 1247,
-    "driftlab/production": 3171,
+    "driftlab/production": 3190,
     "driftlab/products": 6,
-    "driftlab/recordings": 653,
-    "driftlab/reports": 3516,
+    "driftlab/recordings": 656,
+    "driftlab/reports": 3539,
     "driftlab/soak": 693,
-    "driftlab/spc": 1538,
+    "driftlab/spc": 1543,
     "driftlab/starter": 873,
     "driftlab/storage": 1268,
     "driftlab/triad": 699,
@@ -280,7 +280,7 @@ BUDGET = {
     "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1158,
+    "fusion_core/thermal": 1169,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 246,

@@ -21,7 +21,7 @@ from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
 from driftlab.family.unit_records import at_places
 from driftlab.reports.fleet_charts import FleetOverview, map_charts
-from driftlab.reports.line_charts import MAX_LOTS, control_charts, distributions, joint_charts, limit_charts
+from driftlab.reports.line_charts import MAX_LOTS, charts_of_units, distributions, limit_charts
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import LineReport
 from driftlab.spc.sentences import alarms, by_how_much, in_tables, place
@@ -41,6 +41,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     done_over = (record.domain for record in records if record.domain and record.state == "done")
     domains = np.fromiter(chain.from_iterable(done_over), dtype=np.float64).reshape(-1, 2)
     lists, shown_below = _lists(overview, reasons), in_tables(line)
+    charts, names = charts_of_units(line)
     write_page(
         path,
         "fleet",
@@ -57,7 +58,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         maps=map_charts(overview, domains),
         lots=distributions(line),
         lot_names=embedded([*dict.fromkeys(lot for lot in line.lots if lot)][-MAX_LOTS:]),
-        charts=[*joint_charts(line), *control_charts(line)],
+        charts=charts, names=embedded(names),
         **{name: rows[:LISTED] for name, rows in lists.items()},
         **{f"{name}_count": len(rows) for name, rows in lists.items()},
         gauge=overview.gauge,
@@ -69,7 +70,6 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         failed=failed[:LISTED],
         failed_count=len(failed),
         left_out=len(records) - len(table["unit"]),
-        names=embedded([f"{unit}\n{date[:10]}".rstrip() for unit, date in zip(line.units, line.dates, strict=True)]),
         table=embedded(table),
     )  # fmt: skip
 

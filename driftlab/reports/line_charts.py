@@ -26,6 +26,8 @@ MAX_RANGES = 1000  # moving ranges of a panel, beside those beyond the limit
 MAX_LOTS = 60  # lots that are drawn: the latest
 MANY = 0.05  # share of the units that may lie beyond an axis
 CURVE = 20  # points of a trend
+MAX_NAMES = 5000  # units whose names a page holds, beside those that are drawn
+TICKS = 50  # under an axis, more or less
 LIMITS = 300  # points of a limit that differs from unit to unit
 TITLES = {
     "residual": "Residual of the map, rms of 30 s averages",
@@ -74,6 +76,19 @@ def joint_charts(line: LineReport) -> list[Chart]:
     names = ", ".join(map(figure_name, line.multivariate[0].quantities))
     caption = f"{names} of an axis together, by their frozen covariance: units that are unusual in what goes with what."
     return [Chart(tuple(panels), "unit", "T-squared", caption, named="units-of-the-line")]
+
+
+def charts_of_units(line: LineReport) -> tuple[list[Chart], dict[int, str]]:
+    """Return the charts over the units of a line, and name and date of units by their place, from 0 on.
+
+    Of many, those that charts and axes show.
+    """
+    charts, places = [*joint_charts(line), *control_charts(line)], np.arange(len(line.units))
+    if len(places) > MAX_NAMES:
+        shown = [one.x for chart in charts for panel in chart.panels for one in panel.lines]
+        ticks = np.arange(0, len(places) + 1, 10 ** int(np.log10(len(places) / TICKS)))[1:]
+        places = np.unique(np.concatenate([ticks, *shown]).astype(np.int64)) - 1
+    return charts, {k: f"{line.units[k]}\n{line.dates[k][:10]}".rstrip() for k in places.tolist()}
 
 
 def _by_quantity(line: LineReport) -> dict[str, list[ControlChart]]:

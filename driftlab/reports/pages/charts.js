@@ -23,6 +23,10 @@ const driftlab = (() => {
       Object.assign(this, { figure, content, looks, hidden: new Set(), plots: [], span: null });
       this.body = figure.querySelector(".panels");
       this.names = content.named ? JSON.parse(document.getElementById(content.named).textContent) : null;
+      const known = Object.values(this.names ?? {});
+      this.last = Number(Object.keys(this.names ?? {}).at(-1) ?? -1) + 1;
+      this.longest = known.reduce((wide, name) => Math.max(wide, ...name.split("\n").map((part) => Math.min(part.length, LABEL))), 5);
+      this.dated = known.some((name) => name.includes("\n"));
       this.keys = figure.querySelector(".keys");
       this.read = figure.querySelector(".read");
       figure.querySelector(".reset").onclick = () => this.zoom(null);
@@ -33,17 +37,17 @@ const driftlab = (() => {
       new ResizeObserver(() => this.resize()).observe(this.body);
     }
 
-    // what a value of x is called: a number, or the one of so many
-    called(v) { return this.names ? this.names[v - 1] ?? "" : digits(v); }
+    // what a value of x is called: a number, or the one of so many; of many a page has some names, and the places of others
+    called(v) { return this.names?.[v - 1] ?? (!this.names || (Number.isInteger(v) && v >= 1 && v <= this.last) ? digits(v) : ""); }
 
     // pixels from one number or name under an axis to the next, at least
-    apart() { return this.names ? 16 + 7 * this.names.reduce((wide, name) => Math.max(wide, ...name.split("\n").map((part) => Math.min(part.length, LABEL))), 5) : 50; }
+    apart() { return this.names ? 16 + 7 * this.longest : 50; }
 
     // under an axis there is no room for long names: of serial numbers the ends differ; a date stands below
     label(v) { return this.called(v).toString().split("\n").map((name) => (name.length > LABEL ? `…${name.slice(1 - LABEL)}` : name)).join("\n"); }
 
     // pixels under the last panel
-    foot() { return this.names?.some((name) => name.includes("\n")) ? 48 : 34; }
+    foot() { return this.dated ? 48 : 34; }
 
     colour(role) { return this.looks[role][dark() ? "dark" : "light"]; }
 

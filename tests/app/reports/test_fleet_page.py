@@ -13,6 +13,7 @@ from driftlab.evaluation.limits import verdict_of_units
 from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES, Figure, RepeatedSoak, figure_name
 from driftlab.reports import fleet as fleet_rows
+from driftlab.reports import line_charts
 from driftlab.reports.fleet import write_fleet_report
 from driftlab.reports.fleet_charts import FleetOverview, SharedEffectRow, percentiles
 from driftlab.reports.line_charts import control_charts
@@ -197,6 +198,27 @@ def test_five_thousand_units_open_in_three_megabytes(opened, tmp_path):
     assert shown.locator(".rows tbody tr").count() < 80
     shown.evaluate("document.querySelector('.rows').scrollTop = 28 * 2500")
     shown.wait_for_function("[...document.querySelectorAll('.rows tbody td')].some((td) => td.textContent === '2500')")
+
+
+def test_of_many_units_the_page_has_the_names_of_those_that_are_drawn_and_the_places_of_others(
+    monkeypatch, opened, tmp_path
+):
+    for name, most in (("MAX_NAMES", 50), ("MAX_POINTS", 40), ("MAX_RANGES", 40), ("LIMITS", 10), ("TICKS", 5)):
+        monkeypatch.setattr(line_charts, name, most)
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(300))
+    shown = opened(path)
+    names = json.loads(shown.locator("#units-of-the-line").text_content())
+    chart = "driftlab.charts.find((one) => one.content.named === 'units-of-the-line')"
+    drawn = shown.evaluate(
+        f"{chart}.content.x[{chart}.content.panels[0].lines.find((one) => one.style === 'points').x]"
+    )
+    assert {str(round(k) - 1) for k in drawn} < set(names)
+    assert len(names) < 200
+    assert names["99"].startswith("0099"), "the unit at place 100, under the axis"
+    (other, *_) = set(range(300)) - set(map(int, names))
+    said = [shown.evaluate(f"{chart}.called({k})") for k in (100, other + 1, 1.5, 301)]
+    assert said == [names["99"], str(other + 1), "", ""]
 
 
 def test_of_more_units_the_table_has_the_odd_the_failed_and_an_even_sample(monkeypatch, opened, tmp_path):
