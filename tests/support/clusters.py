@@ -78,7 +78,7 @@ def wait_until(holds, patience=30.0):
     end = time.monotonic() + patience
     while not holds():
         assert time.monotonic() < end, "it does not come to hold"
-        time.sleep(0.02)
+        time.sleep(0.005)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
 from fusion_core.chunk import Array, Integers
 from fusion_core.wandering import gauss_markov
 
-BLOCKS = 240  # about: half as many see less, one memory in a hundred of those that can be seen
+BLOCKS = 240  # about; half as many miss one more memory in a hundred
 MIN_CONTRASTS = 24  # that separate slow noise from white noise, at least
 KNOTS = (8, 16, 32, 64)  # of the curve, as many as it needs
 GROUP = 3  # blocks to each at least

@@ -4,14 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from threading import Thread
 
 import fleets
 import polars as pl
 import pytest
-from clusters import said, scheduler, worker
+from clusters import said, scheduler, wait_until, worker
 
 from driftlab.config import load_config
 from driftlab.production import fleet as job
@@ -46,13 +45,6 @@ def assert_same(line, out):
     assert [path.name for path in (line / out).rglob(".*")] == []
 
 
-def wait_for(there, patience=600.0):
-    end = time.monotonic() + patience
-    while not there():
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
 def a_unit(out):
     return lambda: any((out / "units").glob("0*/unit.json"))
 
@@ -70,7 +62,7 @@ def test_a_worker_is_killed(part, line, cluster, monkeypatch):
     out = f"worker-{part.__name__}"
 
     def kill():
-        wait_for(part(line / out))
+        wait_until(part(line / out), 600.0)
         os.kill(workers[0].pid, signal.SIGKILL)
 
     thread = Thread(target=kill)
@@ -92,7 +84,7 @@ def test_the_driver_is_killed_and_started_again(line, cluster):
             [*command, "--out", "driver"], cwd=line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         if part is not None:
-            wait_for(lambda part=part, process=process: part(line / "driver")() or process.poll() is not None)
+            wait_until(lambda part=part, process=process: part(line / "driver")() or process.poll() is not None, 600.0)
             process.send_signal(signal.SIGKILL)
         _, errors = process.communicate()
         assert process.returncode == (0 if part is None else -signal.SIGKILL), errors

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import unit_work
+from clusters import wait_until
 
 from driftlab.errors import WorkersError
 from driftlab.production import workers
@@ -42,13 +43,6 @@ def gone(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     except (FileNotFoundError, ProcessLookupError):
         return True
-
-
-def until(condition, patience=10.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 def script(tmp_path, last):
@@ -93,7 +87,7 @@ def test_a_worker_that_is_killed_while_it_waits_is_replaced():
     with Pool(1) as pool:
         [(_, pid)] = pool.map(unit_work.nap, [0.0])
         os.kill(pid, signal.SIGKILL)
-        until(lambda: gone(pid))
+        wait_until(lambda: gone(pid))
         [(_, other)] = pool.map(unit_work.nap, [0.0])
     assert isinstance(other, int)
     assert other != pid
@@ -144,7 +138,7 @@ def test_the_same_processes_work_on_what_comes_next():
     with Pool(2) as pool:
         first = {pid for _, pid in pool.map(unit_work.nap, [0.1, 0.1])}
         assert first == {pid for _, pid in pool.map(unit_work.nap, [0.1, 0.1])}
-    until(lambda: all(map(gone, first)))
+    wait_until(lambda: all(map(gone, first)))
 
 
 @pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, None), (signal.SIGTERM, -15), (signal.SIGKILL, -9)])
@@ -158,7 +152,7 @@ def test_workers_end_with_the_one_who_began_them(how, status, tmp_path):
         started.kill()
     assert status is None or started.returncode == status
     assert status is not None or "KeyboardInterrupt" in said
-    until(lambda: all(map(gone, pids)))
+    wait_until(lambda: all(map(gone, pids)))
 
 
 def test_a_script_that_is_not_written_for_it_is_run_once(tmp_path):
