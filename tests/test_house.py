@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3863
+    assert 0 < count <= 3856
 
 
 def imports():
@@ -280,7 +280,7 @@ BUDGET = {
     "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1169,
+    "fusion_core/thermal": 1162,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 246,

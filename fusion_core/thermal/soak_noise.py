@@ -30,11 +30,10 @@ if TYPE_CHECKING:
 
 SPANS = 240  # of time, at most
 BLOCKS = 360  # about, at most
-ENOUGH = 160  # blocks: of spans there are as few as leave so many
 CELLS = 40  # of temperature: a block stays in one
 MIN_BLOCKS = 24  # blocks that separate a walk from white noise, at least
 KNOTS = 40  # at most, and at least GROUP blocks to each
-GROUP = 7
+GROUP = 8
 FINE = 1000
 STRETCHES = 1920  # of time, at most: resolution of the times of a block
 RANK = 1e-9  # of the largest singular value: columns that are combinations of others
@@ -96,29 +95,18 @@ def blocks_of(T: Array, left: Array, group: Integers | None = None) -> Blocks:
     cell = np.minimum(((T - T.min()) * (CELLS / np.ptp(T))).astype(np.int64), CELLS - 1)
     state = cell if group is None else group * CELLS + cell
     count, spans = int(state.max()) + 1, min(SPANS, N)
-
-    def cut() -> Integers:
-        return _numbered(np.arange(N) * spans // N * count + state)
-
-    of_sample = cut()
-    while spans > 2:
-        spans //= 2
-        fewer = cut()
-        if of_sample.max() < BLOCKS and fewer.max() + 1 < ENOUGH:
+    while True:
+        blocks, of_sample = np.unique(np.arange(N) * spans // N * count + state, return_inverse=True)
+        if len(blocks) <= BLOCKS or spans <= 2:
             break
-        of_sample = fewer
+        spans //= 2
     return summed(T, left, of_sample)
-
-
-def _numbered(which: Integers) -> Integers:
-    """Return the numbers (N,) from 0 on of those that occur in `which` (N,), in their order."""
-    return np.asarray((np.cumsum(np.bincount(which) > 0) - 1)[which])
 
 
 def cells_of(T: Array, left: Array) -> Blocks:
     """Return samples T (N,) and (N, d) by narrow cells of temperature, whenever they were: of what follows from T."""
     near = np.rint((T - T.min()) * ((FINE - 1) / np.ptp(T))).astype(np.int64)
-    return summed(T, left, _numbered(near))
+    return summed(T, left, (np.cumsum(np.bincount(near) > 0) - 1)[near])
 
 
 def summed(T: Array, left: Array, of_sample: Integers) -> Blocks:
