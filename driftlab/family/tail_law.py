@@ -116,7 +116,7 @@ def _widths(off: Array) -> tuple[Array, Array]:
     As far apart as more than chance has them (James and Stein): a width of one side is of half the values.
     """
     # a column at a time: a million units need no table more
-    sides = [np.array([1.4826 * np.nanmedian(np.abs(x[s * x >= 0])) for x in off.T]) for s in (-1, 1)]
+    sides = [np.array([1.4826 * np.median(np.abs(x[s * x >= 0])) for x in off.T]) for s in (-1, 1)]
     both = np.array([1.4826 * np.nanmedian(np.abs(x)) for x in off.T])
     tiny = 1e-6 * both + np.finfo(float).tiny
     apart = np.log(np.maximum(sides[1], tiny) / np.maximum(sides[0], tiny))

@@ -20,8 +20,7 @@ from driftlab.reports.charts import LOOKS, Chart, content
 from fusion_core.escaping import css_text, line, lines, script_json
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
-    from jinja2.bccache import Bucket
+    from jinja2 import Environment, bccache
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
@@ -36,18 +35,22 @@ def page(template: str, **values: Any) -> str:
 
 @cache
 def environment() -> Environment:
-    """Return the templates; what they are compiled to is kept beside Python's own bytecode, where that is kept."""
+    """Return the templates; what they are compiled to is kept beside Python's own bytecode, where that is kept.
+
+    One that is kept has the results of our filters on its constants in it, so each version has its own.
+    """
     import jinja2
 
     class Kept(jinja2.FileSystemBytecodeCache):
-        def dump_bytecode(self, bucket: Bucket) -> None:
+        def dump_bytecode(self, bucket: bccache.Bucket) -> None:
             with suppress(OSError):
                 super().dump_bytecode(bucket)
 
     loader = jinja2.PackageLoader("driftlab.reports", "pages")
     # texts with the codes of characters that are invisible, or that turn what is beside them
     escaped = lambda value: lines(value) if type(value) is str else value  # noqa: E731
-    kept = None if sys.dont_write_bytecode else Kept(str(Path(__file__).parent / "__pycache__"))
+    beside = str(Path(__file__).parent / "__pycache__")
+    kept = None if sys.dont_write_bytecode else Kept(beside, f"__jinja2_{__version__}_%s.cache")
     environment = jinja2.Environment(loader=loader, autoescape=True, finalize=escaped, bytecode_cache=kept)
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     environment.filters["prose"] = prose
