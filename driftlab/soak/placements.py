@@ -79,7 +79,7 @@ def placed(T: Array, reading: Array, placement: Integers, length: float, unsure:
     counts = np.bincount(placement, minlength=P)
     means = np.stack([np.bincount(placement, column, minlength=P) / counts for column in reading.T], axis=1)
     blocks = blocks_of(T, reading - means[placement], placement)
-    design = _Design(blocks, blocks.shares(placement, P))
+    design = _Design(blocks, blocks.shares(placement, P).toarray())
     force = means
     for _ in range(PASSES):
         up = force / np.linalg.norm(force, axis=1)[:, None]

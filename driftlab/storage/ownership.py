@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import re
-import zlib
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -188,11 +187,13 @@ def _sums(path: Path, size: int) -> str:
 
 def _sums_of_part(path: Path, start: int) -> tuple[bytes, int]:
     """Return the CRC-32 of each block of a part of a file, and the bytes that there are of it."""
+    from fastcrc import crc32  # ten times as fast as zlib's
+
     sums, length, block = [], 0, memoryview(bytearray(BLOCK))
     with open(os.open(path, os.O_RDONLY | PLAIN), "rb") as file:
         file.seek(start)
         while length < PART and (count := file.readinto(block)):
-            sums.append(zlib.crc32(block[:count]).to_bytes(4, "little"))
+            sums.append(crc32.iso_hdlc(block[:count]).to_bytes(4, "little"))
             length += count
     return b"".join(sums), length
 

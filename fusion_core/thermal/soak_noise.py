@@ -75,11 +75,16 @@ class Blocks:
         of_block = places // count
         return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
 
-    def shares(self, group: Integers, count: int) -> Array:
-        """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
+    def shares(self, group: Integers, count: int) -> csr_array:
+        """Return by what share each of `count` groups is in each block (count, K), sparse; group (N,) of each sample."""
+        from scipy.sparse import csr_array
+
         K = len(self.T)
-        table = np.bincount(group * K + self.of_sample, minlength=count * K).reshape(count, K)
-        return np.asarray(table / np.maximum(table.sum(axis=1, keepdims=True), 1), dtype=np.float64)
+        table = np.bincount(group * K + self.of_sample, minlength=count * K)
+        places = np.flatnonzero(table)
+        of_group, n = places // K, np.bincount(group, minlength=count)
+        ends = np.searchsorted(of_group, np.arange(count + 1))
+        return csr_array((table[places] / n[of_group], places % K, ends), shape=(count, K))
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
@@ -171,14 +176,13 @@ class Contrasts:
         return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
     def _turned(self, A: Array, u: Array) -> tuple[Array, Array]:
-        """Return the walk's variances (m,) and u (m,) in contrasts A (m, K) turned so that white noise has one of 1.
+        """Return the walk's covariance (r, r) and u (r,) in contrasts A (m, K) turned so that white noise has one of 1.
 
         What the map leaves nothing of is left out.
         """
         white, walk = (A * self.white) @ A.T, A @ self.covariance @ A.T
         root = _inverse_root(white)
-        own, turn = np.linalg.eigh(root @ walk @ root.T)
-        return np.maximum(own, 0.0), turn.T @ (root @ u)
+        return root @ walk @ root.T, root @ u
 
 
 def _inverse_root(covariance: Array) -> Array:
@@ -229,21 +233,42 @@ def _solved(root: Array, X: Array) -> Array:
     return np.asarray(cho_solve((root, True), X, check_finite=False))
 
 
-def _expected(own: Array, u: Array) -> tuple[float, float]:
-    """Return the means of the variances of walk and white noise, given u (m,) ~ N(0, k^2 own + s^2).
+def _expected(walk: Array, u: Array) -> tuple[float, float]:
+    """Return the means of the variances of walk and white noise, given u (m,) ~ N(0, k^2 walk + s^2), walk (m, m).
 
     The likeliest walk is none in many soaks that have one. What follows from the noise is linear in both variances,
     and is right on average with their means: k / s and log s are as probable everywhere before (A. Gelman, Prior
     distributions for variance parameters in hierarchical models, Bayesian Analysis 1 (2006) 515).
     """
-    if len(u) < 3 or not np.any(u):
-        return 0.0, float(u @ u) / max(len(u), 1)
-    variances = np.outer(RATIOS, own) + 1.0
-    squares = np.sum(u**2 / variances, axis=1)
-    log_density = np.log(RATIOS) / 2 - len(u) / 2 * np.log(squares) - np.sum(np.log(variances), axis=1) / 2
+    m = len(u)
+    if m < 3 or not np.any(u):
+        return 0.0, float(u @ u) / max(m, 1)
+    # the first contrast along u, and each walks with its neighbours alone: the pivots of elimination, from the last on,
+    # are the determinant, and the first of them the squares. Eigenvectors take five times as long
+    variances, covariances, length = _tridiagonal(walk, u)
+    pivots, beside = np.outer(variances, RATIOS) + 1.0, np.outer(covariances**2, RATIOS**2)
+    for k in range(m - 1, 0, -1):
+        pivots[k - 1] -= beside[k - 1] / pivots[k]
+    squares = length**2 / pivots[0]
+    log_density = np.log(RATIOS) / 2 - m / 2 * np.log(squares) - np.sum(np.log(pivots), axis=0) / 2
     weight = np.exp(log_density - np.max(log_density))
-    white = weight / np.sum(weight) * squares / (len(u) - 2)
+    white = weight / np.sum(weight) * squares / (m - 2)
     return float(white @ RATIOS), float(np.sum(white))
+
+
+def _tridiagonal(M: Array, u: Array) -> tuple[Array, Array, float]:
+    """Return the diagonals (r,) and (r - 1,) of Q' M Q, Q orthogonal with its first column along u (r,), and u's length.
+
+    By Householder's reflections of M (r, r) bordered by u, which leave the border's own place where it is.
+    """
+    from scipy.linalg.lapack import dsytrd, dsytrd_lwork
+
+    r = len(u)
+    bordered = np.zeros((r + 1, r + 1), order="F")
+    bordered[1:, 1:], bordered[1:, 0] = M, u
+    room = int(dsytrd_lwork(r + 1, lower=1)[0])
+    _, diagonal, beside, _, _ = dsytrd(bordered, lower=1, lwork=room, overwrite_a=1)
+    return diagonal[1:], beside[1:], float(beside[0])
 
 
 def _pieces(blocks: Blocks) -> tuple[Array, Array]:
