@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -102,12 +103,14 @@ class BiasMeans:
             *(BiasWalk(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds)),
         ]
 
+    @cached_property
     def covariances(self) -> list[Array]:
-        """Return the covariance (K, K) of the rows by each law."""
+        """The covariance (K, K) of the rows by each law."""
         return self._of_means(self.t, self.lasted)
 
+    @cached_property
     def inside(self) -> list[float]:
-        """Return the variance of averages about their row by each law."""
+        """The variance of averages about their row by each law."""
         n, step = self.size, self.lasted / self.size
         if n < 2:
             return [0.0] * len(self.laws)
@@ -150,7 +153,7 @@ def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     """Return the contrasts of what P (K, K) leaves of rows, by each law."""
     each = []
     free = rows.count - len(P)
-    for W, inside in zip(rows.covariances(), rows.inside(), strict=True):
+    for W, inside in zip(rows.covariances, rows.inside, strict=True):
         left = P @ W @ P.T
         value, V = np.linalg.eigh(left)
         of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
@@ -163,6 +166,17 @@ def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
             )
         )
     return each
+
+
+def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:
+    """Return the contrasts of rows about their mean: once for all recordings of a line that are as long."""
+    return _about_level((rows.t - rows.t[0]).tobytes(), rows.lasted, rows.size, rows.count)
+
+
+@lru_cache(maxsize=8)
+def _about_level(t: bytes, lasted: float, size: int, count: int) -> list[WalkContrasts]:
+    rows = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), count)
+    return contrasts(rows, np.eye(len(rows.t)) - 1 / len(rows.t))
 
 
 def bounds(

@@ -29,12 +29,12 @@ def known_gravity(latitude: float | None) -> tuple[float, float]:
 
 
 def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array | None = None) -> Array:
-    """Return the Earth's rotation rate (3,), or (P, 3), in rad/s in the axes of the unit.
+    """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
 
     Parameters
     ----------
-    up : (3,) or (P, 3) array
-        Unit vector that points up, in the axes of the unit, or several of them.
+    up : (3,) array
+        Unit vector that points up, in the axes of the unit.
     latitude : float
         In rad.
     heading : float or None
@@ -51,11 +51,11 @@ def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array
     if heading is None:
         return vertical
     if x_level is None:
-        x_level = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
-        length = np.sqrt(np.sum(x_level**2, axis=-1, keepdims=True))
-        if np.any(length < 1e-3):
+        x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        length = np.sqrt(x_level @ x_level)
+        if length < 1e-3:
             raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
         x_level /= length
-    across = up[..., NEXT] * x_level[..., LAST] - up[..., LAST] * x_level[..., NEXT]  # up x x_level
+    across = up[NEXT] * x_level[LAST] - up[LAST] * x_level[NEXT]  # up x x_level
     north = np.cos(heading) * x_level + np.sin(heading) * across
     return np.asarray(vertical + RATE * np.cos(latitude) * north)

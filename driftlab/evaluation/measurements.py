@@ -22,7 +22,7 @@ from driftlab.noise.recording import MIN_SAMPLES, MIN_STRETCH, Pieces, pieces
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Alignment, FittedMap, Sensor, TriadMatrix
-from fusion_core.wandering import bounds, contrasts, rows_of
+from fusion_core.wandering import bounds, contrasts_about_level, rows_of
 
 COAST = "10 min"  # the horizon that a limit is about
 MIN_SHARE = 0.9  # of it that must have been measured at rest
@@ -183,11 +183,10 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     J = len(yardsticks.coasts)
     values = np.sqrt(np.mean(yardsticks.coasts**2, axis=0))
     rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MAX_ROWS)
-    P = np.eye(len(joined)) - 1 / len(joined)
     before, after = np.arange(CELL / 2, align, CELL) - align, np.arange(CELL / 2, HORIZONS[COAST], CELL)
     t = rows.t[0] + np.concatenate([before, after]) + align
     wanted = [(CELL / WINDOW + CELL / align, _drifted(law.covariance(t, CELL), len(before))) for law in rows.laws]
-    each = contrasts(rows, P)
+    each = contrasts_about_level(rows)
     variances = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
     low, high = np.sqrt(np.array(variances)).T
     high = np.maximum(high, yardsticks.coast[COAST])

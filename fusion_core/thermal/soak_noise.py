@@ -76,15 +76,13 @@ class Blocks:
         return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
-        """Return by what share each of `count` groups is in each block (count, K), sparse; group (N,) of each sample."""
+        """Return which share of each of `count` groups is in each block (count, K), sparse; `group` (N,) of samples."""
         from scipy.sparse import csr_array
 
         K = len(self.T)
-        table = np.bincount(group * K + self.of_sample, minlength=count * K)
-        places = np.flatnonzero(table)
-        of_group, n = places // K, np.bincount(group, minlength=count)
-        ends = np.searchsorted(of_group, np.arange(count + 1))
-        return csr_array((table[places] / n[of_group], places % K, ends), shape=(count, K))
+        places, counts = np.unique(group * K + self.of_sample, return_counts=True)
+        of_group, of_block = np.divmod(places, K)
+        return csr_array((counts / np.bincount(group)[of_group], (of_group, of_block)), shape=(count, K))
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
@@ -209,10 +207,10 @@ def walk_covariance(blocks: Blocks) -> Array:
     during = blocks.during
     S = during.shape[1]
     # sum of during(s) min(s, r) over s: twice the sum, over the stretches before r, of what is still to come after them
-    later = np.cumsum(during.toarray()[:, ::-1], axis=1)[:, ::-1]
+    later = np.cumsum(during.T.toarray()[::-1], axis=0)[::-1]
     least = np.zeros_like(later)
-    np.cumsum(later[:, 1:], axis=1, out=least[:, 1:])
-    covariance = (during @ least.T + 0.5 - (during @ during.T).toarray() / 6) / S
+    np.cumsum(later[1:], axis=0, out=least[1:])
+    covariance = (during @ least + 0.5 - (during @ during.T).toarray() / 6) / S
     return np.asarray((covariance + covariance.T) / 2)
 
 
@@ -257,7 +255,7 @@ def _expected(walk: Array, u: Array) -> tuple[float, float]:
 
 
 def _tridiagonal(M: Array, u: Array) -> tuple[Array, Array, float]:
-    """Return the diagonals (r,) and (r - 1,) of Q' M Q, Q orthogonal with its first column along u (r,), and u's length.
+    """Return the diagonals (r,) and (r - 1,) of Q' M Q, Q orthogonal, its first column along u (r,), and u's length.
 
     By Householder's reflections of M (r, r) bordered by u, which leave the border's own place where it is.
     """

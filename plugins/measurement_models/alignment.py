@@ -14,7 +14,7 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Sensor, Site
 from fusion_core.errors import BadValue
-from fusion_plugins.earth import earth_rate, gravity
+from fusion_plugins.earth import RATE, earth_rate, gravity
 
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
@@ -152,18 +152,24 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
 
 
 def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
-    """Return the Earth rate (3,) about the axes, and its deviation a radian that the vertical is off either way."""
+    """Return the Earth rate (3,) about the axes, and its deviation a radian that the vertical is off either way.
+
+    Off by a radian along the level part X of the x axis, which has the heading h, or along Y across it::
+
+        s X - c cos h up,    s Y + c (k (sin h X - cos h Y) - sin h up),    k = up_x / |level part of x|
+
+    s and c the vertical and the level part of the Earth's rate.
+    """
     assert site.latitude is not None
-    (x, y, z), k = up, int(np.argmin(np.abs(up)))
-    first = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])[k]
-    first /= np.sqrt(first @ first)
-    a, b, c = first
-    level = np.array([first, [y * c - z * b, z * a - x * c, x * b - y * a]])  # two directions across the vertical
-    moved = up + np.concatenate([1e-4 * level, -1e-4 * level])
-    moved /= np.sqrt(np.sum(moved**2, axis=1, keepdims=True))
-    rates = earth_rate(np.concatenate([moved, up[None]]), site.latitude, site.heading)
-    changes = (rates[:2] - rates[2:4]) / 2e-4
-    return rates[4], np.asarray(np.sqrt(np.sum(changes**2, axis=0)))
+    rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * np.sin(site.latitude), RATE * np.cos(site.latitude)
+    if site.heading is None:
+        return rate, np.asarray(abs(s) * np.sqrt(np.maximum(1 - up**2, 0.0)))
+    sin, cos = np.sin(site.heading), np.cos(site.heading)
+    level = np.sqrt(1 - up[0] ** 2)
+    X, Y = np.array([level, -up[0] * up[1] / level, -up[0] * up[2] / level]), np.array([0.0, up[2], -up[1]]) / level
+    along = s * X - c * cos * up
+    across = s * Y + c * (up[0] / level * (sin * X - cos * Y) - sin * up)
+    return rate, np.asarray(np.sqrt(along**2 + across**2))
 
 
 def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:

@@ -120,6 +120,7 @@ class SoakContrasts:
         self.Z = np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
         self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
         self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
+        self._inverses: dict[int, Array] = {}
 
     def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
@@ -189,12 +190,17 @@ class SoakContrasts:
         own, V = self.laws[noise // len(RATIOS)]
         return self.weights(own)[noise % len(RATIOS)], V
 
-    def covariance(self, noise: int) -> Array:
-        """Return the covariance (K, K) of the blocks under a noise, whose white part has a variance of 1."""
-        law, ratio = divmod(noise, len(RATIOS))
-        C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
-        C[np.diag_indices(len(C))] += 1.0
-        return np.asarray(C)
+    def inverse(self, noise: int) -> Array:
+        """Return the inverse (K, K) of the blocks' covariance under a noise, whose white part has a variance of 1."""
+        from scipy.linalg.lapack import dpotrf, dpotri
+
+        if noise not in self._inverses:
+            law, ratio = divmod(noise, len(RATIOS))
+            C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
+            C[np.diag_indices(len(C))] += 1.0
+            half = np.tril(dpotri(dpotrf(C, lower=1)[0], lower=1)[0])
+            self._inverses[noise] = half + np.tril(half, -1).T
+        return self._inverses[noise]
 
     def gram(self, noise: int, z: Array) -> Array:
         """Return the inner products (J, J) of shapes z (m, J) under a noise."""
@@ -212,7 +218,7 @@ class SoakContrasts:
         has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
         """
         w, V = self.under(noise)
-        solved = np.linalg.solve(self.covariance(noise), self.X)
+        solved = self.inverse(noise) @ self.X
         spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
         bent = spread @ (solved.T @ self.y[:, axis])
         free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), FINEST)
@@ -276,7 +282,7 @@ class SoakContrasts:
         """
         S, variances = curves.late, np.zeros(curves.partly.shape)
         for axis, noise in enumerate(noises):
-            inverse = np.linalg.inv(self.covariance(int(noise)))
+            inverse = self.inverse(int(noise))
             solved, turned = inverse @ self.X, np.swapaxes(S, 1, 2) @ inverse
             of_X, whole = turned @ self.X, turned @ S  # (J, p, P) and (J, p, p)
             spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
@@ -295,8 +301,7 @@ class SoakContrasts:
         w, V = self.under(noise)
         white = np.sqrt(w)[:, None] * (V.T @ shown)
         most = np.linalg.eigh(np.swapaxes(white, 1, 2) @ white)[1][:, :, -PARTS:]
-        bias = np.broadcast_to(self.u[:, None], (len(self.u), len(shown), self.u.shape[1]))
-        like, a = self.integrated(bias, np.moveaxis(shown @ most, 0, 1), SIZES)
+        like, a = self.integrated(self.u[:, None], np.moveaxis(shown @ most, 0, 1), SIZES)
         return like, most @ a
 
     def followed(self, z: Array, ways: Array) -> Array:
@@ -308,8 +313,9 @@ class SoakContrasts:
     def integrated(self, y: Array, ways: Array, sizes: Array | None = None) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, e) under every THIN-th ratio, and the likeliest a (J, q, e).
 
-        Of y = ways a + noise, y (m, J, e), ways (m, J, q), a ~ N(0, s^2): s and a are integrated out. With `sizes`,
-        a ~ N(0, g s^2) in units in which what is shown most has g, one of these: Zellner's prior of a whole curve.
+        Of y = ways a + noise, y (m, J, e) or (m, 1, e), ways (m, J, q), a ~ N(0, s^2): s and a are integrated out. With
+        `sizes`, a ~ N(0, g s^2) in units in which what is shown most has g, one of these: Zellner's prior of a
+        whole curve.
         """
         m, J, q = ways.shape
         some, other = np.triu_indices(q)
@@ -327,7 +333,7 @@ class SoakContrasts:
             B = np.swapaxes(along, 2, 3) @ B / size[..., None]
             g = size[None] if sizes is None else sizes[:, None, None, None] * size / size[..., -1:]
             a = (g / (1 + g))[..., None] * B
-            Q = np.reshape(w @ (u**2).reshape(m, -1), (len(w), J, -1))
+            Q = np.reshape(w @ (u**2).reshape(m, -1), (len(w), *u.shape[1:]))
             left = np.maximum(Q - np.sum(a * B * size[..., None], axis=3), 1e-9 * Q + 1e-300)
             more = np.sum(np.log(w), axis=1)[:, None] - np.sum(np.log1p(g), axis=3)
             likes.append((more[..., None] - m * np.log(left)) / 2)

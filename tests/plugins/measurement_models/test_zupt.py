@@ -9,6 +9,7 @@ from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment
 from fusion_core.errors import ConfigError
 from fusion_core.kalman import estimate
+from fusion_plugins.earth import earth_rate, gravity
 
 SETTINGS = {
     "filter": {
@@ -100,3 +101,24 @@ def test_an_unknown_bias_of_the_accelerometers_is_noted_where_the_gyro_could_see
         assert "one of 20 mg puts the gyro's bias off by x 0.19, y 0.19" in found.notes[0]
     told = found.unsure[:2] > np.deg2rad(0.15 / 3600)
     assert np.all(told) == (sigma_0 is not None), "what is said of it is in the sigma"
+
+
+@pytest.mark.parametrize("heading", [None, "0.7 rad"])
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.3, -0.5, 0.8), (-0.8, 0.1, 0.5)])
+def test_a_tilt_is_unsure_by_what_it_moves_the_earth_rate(up, heading):
+    """The rate at a vertical that is off by a small angle, in two directions across it, less that at the true one."""
+    up = np.array(up) / np.linalg.norm(up)
+    accel = SETTINGS["filter"]["accel"] | {"bias": SETTINGS["filter"]["accel"]["bias"] | {"sigma_0": "10 mg"}}
+    turned = {} if heading is None else {"heading": heading}
+    given = {"latitude": "40.9 deg", "filter": SETTINGS["filter"] | {"accel": accel}, **turned}
+    config = Config.model_validate(given)
+    length = gravity(config.site.latitude)
+    chunk = epoch_chunk(0.1, 0.1, 60).having(accel=np.tile(length * up, (60, 1)))
+    across = np.linalg.svd(up[None])[2][1:]
+
+    def rate(vertical):
+        return earth_rate(vertical / np.linalg.norm(vertical), config.site.latitude, config.site.heading)
+
+    moved = [(rate(up + 1e-5 * a) - rate(up - 1e-5 * a)) / 2e-5 for a in across]
+    expected = np.linalg.norm(moved, axis=0) * 10e-3 * 9.80665 / length
+    np.testing.assert_allclose(config.filter.aligned(chunk, config.site).unsure, expected, rtol=1e-8, atol=1e-16)
