@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from common import Row, best, filterpy_run, limit, problem, ratio, show, statsmodels_run
 
-from driftlab.commands.console import keep_freed_memory
+from driftlab.storage.system import keep_freed_memory
 from fusion_core.contracts import Transition
 from fusion_core.feedback import feed_back
 from fusion_core.kalman import correct, estimate, predict

@@ -81,9 +81,9 @@ def main() -> None:
         import driftlab.filtering.run as run
         import driftlab.filtering.tracker as tracker
         import driftlab.storage.ownership as ownership
-        from driftlab.commands.console import keep_freed_memory
         from driftlab.config import load_config
         from driftlab.storage.hdf5 import GrowingFile
+        from driftlab.storage.system import keep_freed_memory
 
         loaded = load_config(Path(config), recording)
     timed_iterator(type(loaded.source), "chunks", "read")

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from driftlab.config import Config
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 COLOURS = {"pass": "green", "fail": "bold red", "undecided": "bold magenta", "unknown": "bold yellow"}
 
 
@@ -226,17 +225,3 @@ def load_at_first_use(*names: str) -> None:
         loader.exec_module(module)
         parent, _, child = name.rpartition(".")
         setattr(sys.modules[parent], child, module)
-
-
-def keep_freed_memory() -> None:
-    """Ask the C library to keep what is freed, where it is glibc: a run asks for the same blocks thousands of times.
-
-    It gives large blocks back to the system at once, and the system hands them out again page by page, each cleared: a
-    third of the steady method's time, an eighth of a whole run's.
-    """
-    import ctypes
-
-    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "gnu_get_libc_version"):
-        library = ctypes.CDLL(None)
-        library.mallopt(TRIM_THRESHOLD, 1 << 30)
-        library.mallopt(MMAP_THRESHOLD, 1 << 25)

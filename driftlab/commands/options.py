@@ -23,6 +23,7 @@ from typer.core import TyperCommand
 
 from driftlab.commands.compilation import watch
 from driftlab.commands.console import check_limits, in_session, load, load_at_first_use, pairs, print_json, progress
+from driftlab.storage.system import keep_freed_memory
 
 TYPES: dict[str, Any] = {  # by the first word of an annotation; of what is not here there is no option
     "bool": bool, "int": int, "float": float, "str": str, "Place": Path, "ConfigLike": Path,
@@ -166,6 +167,7 @@ class Command:
         parameters += [option.parameter(name) for name, option in options.items()]
 
         def call(*, quiet: bool, verbose: bool, set_: list[str] | None = None, **given: Any) -> None:
+            keep_freed_memory()
             load_at_first_use("numpy.f2py", "numpy.testing")  # scipy takes all names of numpy: half of its own start
             with in_session(quiet, verbose, set_):
                 watch(self.name)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab import __version__
-from driftlab.commands.console import keep_freed_memory, print_verdict, say, say_lines, terminal
+from driftlab.commands.console import print_verdict, say, say_lines, terminal
 from driftlab.commands.estimates import (
     CHECKPOINT,
     EstimatesWriter,
@@ -286,12 +286,6 @@ def finish(
     result._write(folder, certificate=certificate)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result
-
-
-def arguments_of(arguments: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments as they are; the command line's run is the first in its process, and large."""
-    keep_freed_memory()
-    return arguments
 
 
 def show(result: RunResult, given: Mapping[str, Any]) -> None:

@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from driftlab.errors import WorkersError
-from driftlab.storage.system import has_posix_locks
+from driftlab.storage.system import has_posix_locks, keep_freed_memory
 from fusion_core.errors import DataError, FusionError, describe_error
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ def _serve(pipe: Connection) -> None:
     """Work on items until there are no more: the main function of a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the one who began this one ends it
     os.environ.update(ONE_THREAD)
+    keep_freed_memory()
     _end_with_parent()
     with suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("500")  # where memory runs out, the system takes a worker before the one who has all results

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ from pathlib import Path
 
 PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 """Of `os.open`: no link is followed, nothing is waited for, and bytes stay as they are."""
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 OWNER = 4096  # bytes at the front of a lock file that name its owner; Windows locks one behind them
 
 
@@ -72,3 +74,17 @@ def sync(path: Path) -> None:
 def is_read_only(folder: Path) -> bool:
     """Return True if the file system of a folder is known to be read-only."""
     return hasattr(os, "statvfs") and bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+
+
+def keep_freed_memory() -> None:
+    """Ask the C library to keep what is freed, where it is glibc: a command asks for the same blocks many times.
+
+    It gives large blocks back to the system at once, and the system hands them out again page by page, each cleared: a
+    third of the steady method's time, an eighth of a whole run's.
+    """
+    import ctypes
+
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "gnu_get_libc_version"):
+        library = ctypes.CDLL(None)
+        library.mallopt(TRIM_THRESHOLD, 1 << 30)
+        library.mallopt(MMAP_THRESHOLD, 1 << 25)

@@ -34,19 +34,15 @@ def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
 
 
 def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Target) -> Array:
-    """Return the derivative (m, p) of the bias at T (m,) with each weight of a network of one output, numerically.
+    """Return the derivative (m, p) of the bias at T (m,) with each weight of a network of one output, by its size.
 
     Where the network gives the slope, its integral from the lower end of the domain answers, and a constant.
     """
     fine = T if target == "bias" else np.linspace(*domain, 2001)
-    columns = []
-    for layer, arrays in enumerate(network):
-        for which, array in enumerate(arrays):
-            for place in np.ndindex(array.shape):
-                step = 1e-5 * max(abs(float(array[place])), 1e-3 * float(np.abs(array).max()), 1e-300)
-                values = [forward(_moved(network, layer, which, place, sign * step), fine)[-1] for sign in (1, -1)]
-                columns.append((values[0] - values[1])[:, 0] / 2)  # in steps: columns of one scale
-    J = np.stack(columns, axis=1)
+    arrays = [array for layer in network for array in layer]
+    sizes = [np.maximum(np.abs(array), max(1e-3 * float(np.abs(array).max()), 1e-300)) for array in arrays]
+    theta, scale = (np.concatenate([array.ravel() for array in each]) for each in (arrays, sizes))
+    J = jacobian(theta, len(network[0][1]), fine) * scale  # columns of one scale
     if target == "bias":
         return J
     area = np.concatenate([np.zeros((1, J.shape[1])), np.cumsum((J[1:] + J[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
@@ -65,12 +61,6 @@ def answer(
     J, J_grid = (tangent(network, x, domain, target) for x in (T, grid))
     inverse = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9), dtype=np.float64)
     return np.asarray(J_grid @ (inverse * root))
-
-
-def _moved(network: Weights, layer: int, which: int, place: tuple[int, ...], step: float) -> Weights:
-    moved = [tuple(array.copy() for array in arrays) for arrays in network]
-    moved[layer][which][place] += step
-    return moved  # type: ignore[return-value]
 
 
 def train(
