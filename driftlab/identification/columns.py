@@ -383,14 +383,13 @@ class EffectRegressors:
             return
         gram = self._gram
         if size > gram.shape[1]:
-            room = max(size, 3 * gram.shape[1] // 2)
-            gram = np.zeros((len(self.segments), room, room))
+            gram = np.zeros((len(self.segments), 2 * size, 2 * size))  # of what stays zero the system makes no pages
             gram[:, :known, :known] = self._gram[:, :known, :known]
         for s, segment in enumerate(self.segments):
-            part = self._W[:size, segment.rows]
-            new = part @ part[known:].T
-            gram[s, :size, known:size] = new
-            gram[s, known:size, :size] = new.T
+            part, new = self._W[:known, segment.rows], self._W[known:size, segment.rows]
+            gram[s, known:size, known:size] = new @ new.T  # half the work of any product: it is symmetric
+            gram[s, :known, known:size] = both = part @ new.T
+            gram[s, known:size, :known] = both.T
         self._gram, self._known = gram, size
         self._sums.clear()
 
