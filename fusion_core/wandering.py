@@ -137,35 +137,33 @@ def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:
 class WalkContrasts:
     """Contrasts V' (m, K) of the residual rows, with the variance of each of white noise and of wandering (m,).
 
-    `white` and `wandering` are the mean squares that P leaves of all averages, of white noise and of what wanders;
     `inside` is the variance of what wanders within a row.
     """
 
     V: Array
     of_white: Array
     of_wandering: Array
-    white: float
-    wandering: float
     inside: float
 
 
 def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     """Return the contrasts of what P (K, K) leaves of rows, by each law."""
     each = []
-    free = rows.count - len(P)
     for W, inside in zip(rows.covariances, rows.inside, strict=True):
-        left = P @ W @ P.T
-        value, V = np.linalg.eigh(left)
+        value, V = np.linalg.eigh(P @ W @ P.T)
         of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
         free_of_map = of_white > TAKEN / rows.size
-        white = (free + float(np.sum(P**2))) / rows.count
-        wandering = float(np.trace(left)) / len(P) + free * inside / rows.count
-        each.append(
-            WalkContrasts(
-                V.T[free_of_map], of_white[free_of_map], np.maximum(value[free_of_map], 0.0), white, wandering, inside
-            )
-        )
+        wandering = np.maximum(value[free_of_map], 0.0)
+        each.append(WalkContrasts(V.T[free_of_map], of_white[free_of_map], wandering, inside))
     return each
+
+
+def mean_squares(rows: BiasMeans, P: Array) -> list[tuple[float, float]]:
+    """Return the mean squares a and b that P (K, K) leaves of all averages, of white noise and of wandering, by law."""
+    free = rows.count - len(P)
+    white = (free + float(np.sum(P**2))) / rows.count
+    laws = zip(rows.covariances, rows.inside, strict=True)
+    return [(white, float(np.sum((P @ W) * P)) / len(P) + free * inside / rows.count) for W, inside in laws]
 
 
 def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:

@@ -18,7 +18,7 @@ from driftlab.soak.blocks import means, runs
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.soak_noise import summed
-from fusion_core.wandering import WalkContrasts, bounds, contrasts, rows_of
+from fusion_core.wandering import WalkContrasts, bounds, contrasts, mean_squares, rows_of
 
 AVERAGED = 30.0  # s: as the reference of every table of errors
 MAX_ROWS = 120  # rows whose covariance is written down
@@ -57,19 +57,19 @@ def residual_of(
         return Residual(rms, np.zeros_like(rms), np.full_like(rms, np.inf))
     row = np.minimum(np.arange(len(T)) // rows.size, len(joined) - 1)
     blocks, smoother = summed(T, left, row), settings.smoother(T, left + fitted.bias(T))
-    chosen: list[list[WalkContrasts]] = []  # of a map that chooses, alike for all axes
-    squares, taken, left_of = [], np.empty(0), [list[WalkContrasts]()] * 2
+    squares, taken = [], np.empty(0)
+    one = np.eye(len(joined))
+    chosen: tuple[list[WalkContrasts], Array] | None = None  # of a map that chooses, alike for all axes
     for axis, r in enumerate(joined.T):
         answer = smoother(blocks, blocks.T, axis)
         if not np.array_equal(answer, taken):
             taken = answer
             if np.allclose(answer @ answer, answer, atol=CHOSEN):
-                left_of = [contrasts(rows, np.eye(len(r)) - answer)] * 2
+                each, P = contrasts(rows, one - answer), one - answer
             else:
-                chosen = chosen or [contrasts(rows, _without(blocks.T, order)) for order in (FREE, STIFF)]
-                left_of = chosen
-        wanted = [(one.white, one.wandering) for one in left_of[1]]
-        squares.append(bounds(rows, left_of[0], r, float(rows.within[axis]), wanted))
+                each, P = chosen = chosen or (contrasts(rows, _without(blocks.T, FREE)), _without(blocks.T, STIFF))
+            wanted = mean_squares(rows, P)
+        squares.append(bounds(rows, each, r, float(rows.within[axis]), wanted))
     low, high = np.sqrt(np.array(squares)).T
     return Residual(rms, np.minimum(low, rms), np.maximum(high, rms))
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion_core.wandering import BiasWalk, bounds, contrasts, rows_of
+from fusion_core.wandering import BiasWalk, bounds, contrasts, mean_squares, rows_of
 
 
 @pytest.mark.parametrize("taus", [(), (40.0,), (5.0, 400.0)])
@@ -28,8 +28,9 @@ def test_white_noise_alone_is_between_its_limits_and_they_are_narrow():
     t = 30.0 * np.arange(480)
     for _ in range(40):
         rows, means = rows_of(t, rng.normal(size=(480, 1)), 120)
-        each = contrasts(rows, np.eye(120) - 1 / 120)
-        low, high = bounds(rows, each, means[:, 0], float(rows.within[0]), [(one.white, one.wandering) for one in each])
+        P = np.eye(120) - 1 / 120
+        each = contrasts(rows, P)
+        low, high = bounds(rows, each, means[:, 0], float(rows.within[0]), mean_squares(rows, P))
         inside.append(low <= 479 / 480 <= high)
         width.append(high / low)
     assert np.mean(inside) >= 0.85  # 90 % or more
