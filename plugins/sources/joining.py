@@ -16,7 +16,7 @@ from __future__ import annotations
 import mmap
 import re
 from collections.abc import Iterable, Iterator
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +35,7 @@ HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn acr
 FIRST, LEAST = 11, 5  # readings that tell how often a thermometer is read, and at least
 HELD = 1 << 18  # rows in which they are looked for
 
-ROWS, FEW = 1 << 16, 100  # places read at once, and for which no memory is given back
+SPAN, FEW = 1 << 23, 100  # bytes of a log in memory at once, and places for which none is given back
 PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
 
 
@@ -229,16 +229,17 @@ def interval(t: Array) -> float:
 
 
 def records(data: Bytes | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes.
+    """Return the values (N,), of arrays (N, k), that begin at places `at` (N,) of the bytes, which rise.
 
-    What of a mapped file is held in memory for it is given back, piece by piece: a log is larger than what it takes.
+    What of a mapped file is held in memory for it is given back, piece by piece: a log is larger than what it takes,
+    and the system may hold megabytes of it for one place.
     """
     size = dtype.itemsize
     # every place in the data where one could begin, without a copy
     windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
     values = np.empty(len(at), windows.dtype)
-    for start in range(0, len(at), ROWS):
-        values[start : start + ROWS] = windows[at[start : start + ROWS]]
+    for start, stop in pairwise([*np.flatnonzero(np.diff(at // SPAN, prepend=-1)), len(at)]):
+        values[start:stop] = windows[at[start:stop]]
         if len(at) > FEW:
             release(data)
     return values.view(dtype.base).reshape(len(at), *dtype.shape)

@@ -30,14 +30,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
 from fusion_core.chunk import Array, Bytes, Integers
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile, quote
 from fusion_core.faults import Faults
-from fusion_plugins.sources.joining import ROWS, mapped, records, release
+from fusion_plugins.sources.joining import mapped, records, release
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
@@ -154,7 +153,7 @@ class LogFile:
         self._dropouts: list[tuple[int, float]] = []  # place, and duration in ms
         self._lost, self._first_lost = 0, -1
         self._fields = self._names = 0  # of all subscriptions: numbers in a row, and characters of what they are called
-        found = dict(self._found(*self._messages(*_sections(path, first, len(self.data)))))
+        found = dict(self._found(self._messages(*_sections(path, first, len(self.data)))))
         self.instances = {key: found[key] for key in sorted(found)}
         if not self.instances:
             raise UnreadableFile(f"{path}: ends before its first row ({len(self.data)} bytes); copy or log it again")
@@ -182,16 +181,20 @@ class LogFile:
             )
         return data
 
-    def _messages(self, begin: int, ends: Sequence[int]) -> tuple[Integers, NDArray[np.uint16]]:
-        """Read the definitions, and return the places of the rows of what they define, and which these are."""
-        rows, numbers = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
+    def _messages(self, begin: int, ends: Sequence[int]) -> dict[int, list[Integers]]:
+        """Read the definitions, and return the places of the rows of what they define, by its number, in parts."""
+        places: dict[int, list[Integers]] = {}
         out, at, count, text = np.empty(BLOCK // 5 + 1, np.int64), begin, 0, 0
+        small = np.int32 if len(self.data) < 2**31 - IDS else np.int64
         with TimeBudget(self.path, "what is no row") as clock:
             for end in ends:
                 while at < end:
                     at, n, lost, first, stopped = _walk(self.data[:end], at, at + BLOCK, self._lengths, out, *TYPES)
-                    rows.append(out[:n].copy())
-                    numbers.append(records(self.data, out[:n] + 3, U16))
+                    numbers = records(self.data, out[:n] + 3, U16)
+                    order = np.argsort(numbers, kind="stable")
+                    rows, (which, first_of) = out[order].astype(small), np.unique(numbers[order], return_index=True)
+                    for number, part in zip(which.tolist(), np.split(rows, first_of[1:]), strict=False):
+                        places.setdefault(number, []).append(part)
                     self._lost, self._first_lost = self._lost + lost, self._first_lost if self._lost else first
                     clock.check(n + stopped)
                     if not stopped:
@@ -203,7 +206,7 @@ class LogFile:
                         at, count, text = at + 3 + size, count + 1, text + size
                         check_count(self.path, "parameters, dropouts and the like", count, COUNT // 2)
                         check_size(self.path, "what describes its rows", text, TEXTS)
-        return np.concatenate(rows), np.concatenate(numbers)
+        return places
 
     def _define(self, kind: str, at: int, content: bytes) -> None:
         """Take in a message: formats and parameters before the first subscription, dropouts behind it."""
@@ -224,14 +227,11 @@ class LogFile:
             form, name = content[1 : 1 + content[0]].decode(errors="ignore").split(" ")[:2]
             (self.parameters[name],) = np.frombuffer(content[1 + content[0] :], NUMBERS[form]).tolist()
 
-    def _found(self, rows: Integers, numbers: NDArray[np.uint16]) -> Iterator[tuple[tuple[str, int], Instance]]:
+    def _found(self, places: dict[int, list[Integers]]) -> Iterator[tuple[tuple[str, int], Instance]]:
         """Yield the instances that have rows with a time; of several subscriptions of one, the first comes last."""
-        order = np.argsort(numbers, kind="stable")
-        rows, numbers = rows[order], numbers[order]
         for number, (topic, instance, row) in reversed(self._added.items()):
-            at = rows[slice(*np.searchsorted(numbers, [number, number + 1]))]
-            if len(at) and "timestamp" in (row.names or ()):
-                yield (topic, instance), Instance(topic, instance, at, row, self.data)
+            if (parts := places.pop(number, None)) and "timestamp" in (row.names or ()):
+                yield (topic, instance), Instance(topic, instance, np.concatenate(parts), row, self.data)
 
     def _row(self, topic: str) -> tuple[np.dtype[np.void], int]:
         """Return the fields of a topic's rows, and the bytes of padding behind them."""
@@ -288,6 +288,7 @@ def _sections(path: Path, first: bytes, size: int) -> tuple[int, list[int]]:
 
 
 IDS = 65536  # subscriptions that a file can have
+ROWS = 1 << 16  # of an instance, read at once
 TIMES = "timestamp", "timestamp_sample"  # fields: of the message, and of the sample where it has another
 BLOCK = 4 << 20  # bytes between two looks at the clock
 SAMPLED = 1024  # of the rows of an instance that tell about it, each so many-th is taken, and some of the first ones

@@ -131,23 +131,21 @@ class ULogTopics(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows of the topic of the first path."""
         named = {path: self._instance(path) for path in paths}
-        leading = named[paths[0]]
-        instances = list(dict.fromkeys(named.values()))
+        instances = list(dict.fromkeys(named.values()))  # the leading one first
         wanted = {i: [_column(path).field for path in paths if named[path] is i] for i in instances}
         data = self.log.read(wanted, self.faults)
         self._check_temperatures(named, data)
-        t, order = self._rows(leading, data[leading])
-        values: dict[str, Array] = {}
+        t, values = np.empty(0), dict[str, Array]()
         for instance in instances:
-            fields = [path for path in paths if named[path] is instance]
-            columns = [self._column(instance, data[instance], _column(path).field) for path in fields]
-            if instance is leading:
-                values |= {path: column[order] for path, column in zip(fields, columns, strict=True)}
+            fields, own = [path for path in paths if named[path] is instance], data.pop(instance)
+            times, rows = self._rows(instance, own)
+            columns = [self._column(instance, own, _column(path).field)[rows] for path in fields]
+            if instance is instances[0]:
+                t = times
             else:
-                times, rows = self._rows(instance, data[instance])
-                at_rows = joined(t, times, np.column_stack([column[rows] for column in columns]))
-                values |= {path: at_rows[:, k] for k, path in enumerate(fields)}
-        del data
+                columns = [*joined(t, times, np.column_stack(columns)).T]
+            values |= zip(fields, columns, strict=True)
+        del own, times, rows, columns
         yield from row_blocks(len(t), size, lambda rows, path: np.asarray(values[path][rows], dtype=np.float64))
 
     def _instance(self, path: str) -> Instance:
