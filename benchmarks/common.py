@@ -7,10 +7,14 @@ the fastest of several turns each, so that what else the machine does falls on b
 from __future__ import annotations
 
 import gc
+import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -57,6 +61,25 @@ def limit(what: str, value: float, unit: str, most: float | None = None, stretch
     target = "" if most is None else f"≤ {most:g} {unit}" + (f" (stretch {stretch:g})" if stretch else "")
     measured = 0 <= value < np.inf
     return Row(what, f"{value:.3g} {unit}", target, value <= most if measured and most is not None else None)
+
+
+def largest_memory(channels: dict[str, dict[str, object]], path: Path, most: float) -> Row:
+    """Return the row of the largest memory of `driftlab check` on a log that its kind of source reads, MB."""
+    kind = {".ulg": "ulog", ".bin": "dataflash"}[path.suffix]
+    config = path.with_suffix(".json")
+    config.write_text(json.dumps({"source": {"kind": kind, "channels": channels}}))
+    # of the process itself: what the system notes of a child begins with the memory of its parent
+    code = """import sys
+from driftlab.cli import main
+try:
+    main()
+finally:
+    print("VmHWM", open("/proc/self/status").read().split("VmHWM:")[1].split()[0])
+"""
+    command = [sys.executable, "-c", code, "check", str(config), "--input", str(path)]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    size, largest = path.stat().st_size / 1e6, int(said.rsplit("VmHWM ", 1)[1]) / 1024
+    return limit(f"`driftlab check` of a log of {size:.0f} MB: largest memory", largest, "MB", most)
 
 
 def show(title: str, rows: list[Row]) -> None:

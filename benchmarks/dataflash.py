@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from common import Row, best, limit, ratio, show
+from common import Row, best, largest_memory, limit, ratio, show
 from pymavlink import DFReader
 
 from fusion_core.faults import Faults
@@ -41,19 +41,26 @@ def source(path: Path, compensated: str) -> Callable[[], object]:
     return lambda: [len(chunk) for chunk in reader.chunks(65_536, Faults())]
 
 
-def rows(N: int = 20_000) -> list[Row]:
-    """Return the rows of the table for a log of two units with N rows each."""
+def written(path: Path, N: int) -> Path:
+    """Write a log of two units with N rows each."""
     rng = np.random.default_rng(1)
     t = 10 + np.arange(N) / 400
+    unit = (rng.normal(size=(N, 3)), rng.normal(size=(N, 3)), 20 + t / 10)
+    return write_log(path, t, [unit, unit], {"AHRS_ORIENTATION": 6, **TCAL})
+
+
+def rows(N: int = 20_000) -> list[Row]:
+    """Return the rows of the table for a log of two units with N rows each."""
     with tempfile.TemporaryDirectory() as name:
-        unit = (rng.normal(size=(N, 3)), rng.normal(size=(N, 3)), 20 + t / 10)
-        path = write_log(Path(name) / "log.bin", t, [unit, unit], {"AHRS_ORIENTATION": 6, **TCAL})
+        path = written(Path(name) / "log.bin", N)
         kept, undone, theirs = best(source(path, "keep"), source(path, "undo"), lambda: pymavlink(path), turns=3)
+        memory = largest_memory(CHANNELS, written(Path(name) / "long.bin", 50 * N), 200)
     return [
         ratio("DataFlash, rows as logged, against pymavlink", kept, theirs, 30),
         limit("DataFlash, a row as logged", kept / N * 1e6, "µs", 3),
         limit("DataFlash, a row with the autopilot's corrections undone", undone / N * 1e6, "µs", 3),
         limit("pymavlink's DFReader, a row", theirs / N * 1e6, "µs"),
+        memory,
     ]
 
 

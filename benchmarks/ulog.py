@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from common import Row, best, show
+from common import Row, best, largest_memory, show
 
 from fusion_core.faults import Faults
 from fusion_plugins.sources.ulog import Ulog
@@ -77,6 +77,10 @@ def main() -> None:
             rows.append(Row(f"{what}: ratio", f"{mine / other:.2f}", "≤ 2", mine / other <= 2))
             rows.append(Row(f"{what}: memory for {size:.0f} MB", f"{grown('ulog.ours(p);', path):.0f} MB", "", None))
             rows.append(Row(f"{what}: pyulog's memory", f"{grown('ulog.theirs(p);', path):.0f} MB", "", None))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.ulg"
+        write(path, 660_000 if N > 20_000 else N, 3)
+        rows.append(largest_memory(CHANNELS, path, 320))
     show("PX4 logs", rows)
 
 
