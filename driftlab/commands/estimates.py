@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.evaluation.overview import OverviewAccumulator
+from driftlab.evaluation.overview import OverviewAccumulator, counted
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.segment import TEMPERATURES, RunLog, RunSegment
 from driftlab.filtering.smoothing import Spool
@@ -103,7 +103,7 @@ class Stored(Mapping[str, NDArray[Any]]):
 
 
 def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
-    """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
+    """Return `estimates.h5`, to be written stretch by stretch (`RunSegment.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.
     """
@@ -208,8 +208,7 @@ class EstimatesWriter:
         """Add the estimates of a stretch, and return them as they are kept."""
         columns: Columns = stretch.columns()
         if self.whiteness is not None:
-            after = columns["used"] & (columns["t"] > self.journal.alignments[0].t)
-            self.whiteness.add(columns["white"][slice(None) if np.all(after) else after].astype(np.float32))
+            self.whiteness.add(columns["white"][counted(columns, self.journal.alignments[0])].astype(np.float32))
         columns = at_file_precision(columns, detail=self.whiteness is None)
         self.add(columns)
         if self.spool is not None:

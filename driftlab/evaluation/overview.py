@@ -14,8 +14,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.config import Config
 from driftlab.evaluation.limits import LimitResult, Measured, check_limits
@@ -116,8 +118,7 @@ class OverviewAccumulator:
             self._before = _half_window([*self._before, self._waiting.pop(0)])
 
     def _look(self, block: Columns) -> None:
-        used = block["used"].astype(bool)
-        after = used & (block["t"] > self.alignment.t)
+        used, after = block["used"].astype(bool), counted(block, self.alignment)
         self.start = self.start if self.count else float(block["t"][0])
         self.count, self.used = self.count + len(used), self.used + int(np.count_nonzero(used))
         if "temperature" in block:
@@ -127,7 +128,7 @@ class OverviewAccumulator:
         errors = errors_of(block, block["reference"])
         self._scores.add(block, errors)
         if "white" in block:
-            self._whiteness.add(block["white"] if np.all(after) else block["white"][after])
+            self._whiteness.add(block["white"][after])
         self._envelope.add(block, errors, after)
         self._curves.add(block)
         if self.averages is not None:
@@ -157,6 +158,11 @@ class OverviewAccumulator:
             nis_highest=found.nis_highest,
             swing=max(self._warmest - self._coldest, 0.0),
         )
+
+
+def counted(columns: Mapping[str, NDArray[Any]], alignment: Alignment) -> Flags:
+    """Return the updates (N,) that NIS and whiteness are tested on: those used after the first alignment."""
+    return columns["used"].astype(np.bool_) & (columns["t"] > alignment.t)
 
 
 class _Thinned:

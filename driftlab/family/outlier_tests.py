@@ -354,11 +354,13 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
 
 def _off(u: Array, lots: Texts) -> dict[str, float]:
     """Return the shift, in widths, of each lot that is off as a whole."""
-    shifts = {}
-    for lot in sorted(set(lots)):
-        own = u[(lots == lot) & np.isfinite(u)]
-        if MIN_UNITS_OF_LOT <= len(own) <= len(u) / 2:
-            middle = float(np.median(own))
-            if abs(middle) > max(1.0, LOT_OFF * 1.2533 / np.sqrt(len(own))):
-                shifts[lot] = middle
-    return shifts
+    from scipy.ndimage import median
+
+    known = np.isfinite(u)
+    if not np.any(known):
+        return {}
+    names, number, count = np.unique(lots[known], return_inverse=True, return_counts=True)
+    middle = np.asarray(median(u[known], number, np.arange(len(names))))
+    off = np.abs(middle) > np.maximum(1.0, LOT_OFF * 1.2533 / np.sqrt(count))
+    off &= (count >= MIN_UNITS_OF_LOT) & (count <= len(u) / 2)
+    return dict(zip(names[off].tolist(), middle[off].tolist(), strict=True))

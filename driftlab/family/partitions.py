@@ -18,6 +18,9 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from driftlab.family.unit_information import UnitInformation
 
 SIZE = 50  # units of a partition
@@ -27,6 +30,15 @@ BLOCKS = 64  # of partitions, that a pass has at most: what a worker is given at
 R = TypeVar("R")
 C = TypeVar("C", covariant=True)
 UnitOfLot = tuple[UnitInformation, str]
+Index = NDArray[np.intp]
+
+
+def by_lot(lots: Iterable[str]) -> dict[str, Index]:
+    """Return the places of the units of each lot, in the order of the lots' first units; `lots` are of all units."""
+    places: dict[str, list[int]] = {}
+    for k, lot in enumerate(lots):
+        places.setdefault(lot, []).append(k)
+    return {lot: np.array(own, dtype=np.intp) for lot, own in places.items()}
 
 
 class Engine(Protocol):

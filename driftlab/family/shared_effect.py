@@ -24,7 +24,7 @@ from pydantic import (
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, columns_of, seen_temperatures
-from driftlab.family.partitions import Partitions, UnitOfLot
+from driftlab.family.partitions import Partitions, UnitOfLot, by_lot
 from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
@@ -262,8 +262,7 @@ def _excess_noise(contrasts: EffectContrasts) -> Array:
 
 
 def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: Sequence[str]) -> LotEffects:
-    members = {name: np.flatnonzero([lot == name for lot in lots]) for name in dict.fromkeys(lots)}
-    known = {name: units for name, units in members.items() if name and len(units) >= MIN_UNITS}
+    known = {name: units for name, units in by_lot(lots).items() if name and len(units) >= MIN_UNITS}
     whole = _law(effect, c, v, np.arange(len(lots)))
     if len(known) < 2:
         return LotEffects(**dict(whole))

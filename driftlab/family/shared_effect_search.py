@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
-from driftlab.family.partitions import Partition, Partitions, UnitOfLot, tree
+from driftlab.family.partitions import Partition, Partitions, UnitOfLot, by_lot, tree
 from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.acceptance import nats_of
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
@@ -167,11 +167,10 @@ def together(units: Sequence[EffectContrasts], lots: Sequence[str] = ()) -> Effe
 def evaluate(offers: Sequence[Offer], contrasts: EffectContrasts) -> list[Candidate]:
     """Return every offer with its evidence: of all units, or of the one lot that has it most clearly."""
     lots = contrasts.lots
-    everyone, counts = np.arange(len(lots)), Counter(lots)
+    everyone, members = np.arange(len(lots)), sorted(by_lot(lots).items())
     groups = {"": everyone}
-    if len(counts) > 1:
-        names = sorted(name for name, count in counts.items() if name and count >= IN_LOT)
-        groups |= {name: np.flatnonzero(np.array(lots) == name) for name in names}
+    if len(members) > 1:
+        groups |= {name: units for name, units in members if name and len(units) >= IN_LOT}
     of_groups = {name: chances(offers, contrasts, units) for name, units in groups.items()}
     price = {name: float(np.log(len(offers) * (len(groups) if name else 1))) for name in groups}
     gained = _left_out(offers, contrasts, everyone)

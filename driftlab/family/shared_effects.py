@@ -76,7 +76,7 @@ def find_common(units: FamilyUnits, *, bias_unit: str = "rad/s", sample: int = S
     """
     units = in_partitions(units)
     count = len(units)
-    drawn = units.chosen(_drawn(count, sample), A_FEW)
+    drawn = units.chosen(np.random.default_rng(0).choice(count, min(count, sample), replace=False).tolist(), A_FEW)
     if len(drawn) < MIN_UNITS:
         why = f"{len(drawn)} units; {MIN_UNITS} are needed to tell what they have in common"
         return SharedEffects(rejected=(RejectedEffect(effect="all", reason=why),), units=count, searched=len(drawn))
@@ -88,17 +88,6 @@ def find_common(units: FamilyUnits, *, bias_unit: str = "rad/s", sample: int = S
         verdict=verdict if effects else "nothing_common", effects=effects, rejected=search.rejected(),
         tried=len(search.offers), units=count, searched=len(drawn), of_units=search.of_units, noise=search.noise,
     )  # fmt: skip
-
-
-def _drawn(count: int, most: int) -> list[int]:
-    """Return the places of at most some units at random, of so many (reservoir sampling)."""
-    rng = np.random.default_rng(0)
-    reservoir = dict.fromkeys(range(min(count, most)))
-    for number in range(most, count):
-        if (place := int(rng.integers(number + 1))) < most:
-            del reservoir[list(reservoir)[place]]
-            reservoir[number] = None
-    return sorted(reservoir)
 
 
 class _Search:

@@ -131,30 +131,36 @@ def _trial(
     search: Search, base: Model, model: Model, noises: list[LocalLevel], without: Errors, errors: Errors
 ) -> Trial:
     """Judge a candidate by its left-out errors and its matched filter."""
-    price = float(np.log(max(search.tried, 1)))
-    effect = model[-1].effect
-    left_out, logs, by_part = 0.0, [], []
-    for axis in search.axes:
-        squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
-        squares = np.maximum(squares, 1e-300)
-        total = squares.sum(axis=1)
-        logs.append(float(np.log(total[0] / total[1])))
-        by_part.append(np.log(squares[0] / squares[1]))
-        n = sum(
-            effective(new[axis], old[axis] - new[axis], walking=effect.walks)
-            for new, old in zip(errors, without, strict=True)
-        )
-        left_out -= n / 4 * logs[-1]
-    ratio = float(np.exp(np.mean(logs)))
-    chance, gain = fast_evidence(search.squares, model[:-1], model[-1], noises)
-    steps = np.mean(by_part, axis=0)
-    steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
-    whole = [float(np.exp(step)) for step, part in zip(steps, search.left_out, strict=True) if part.whole]
-    evidence = CandidateEvidence(
-        ratio, steady, len(steps), max(whole, default=0.0), bool(base), left_out - price, chance, gain - price, price
-    )
+    effect, price = model[-1].effect, float(np.log(max(search.tried, 1)))
+    fast = fast_evidence(search.squares, model[:-1], model[-1], noises)
+    evidence = evidence_of(search, effect, errors, without, fast, price, beside=bool(base))
     passes, reason = accept(effect, evidence, search.named)
     return Trial(model, evidence, blocks_of(errors, search.axes), _likelihood(search, model, noises), passes, reason)
+
+
+def evidence_of(
+    search: Search, effect: Effect, errors: Errors, without: Errors, fast: tuple[float, float], price: float, *,
+    beside: bool = False, gained: bool = True,
+) -> CandidateEvidence:  # fmt: skip
+    """Return the figures of an effect by the errors of all parts with it and without.
+
+    `fast` are chance and gain of its matched filter (nats), `price` is log M, `beside` whether the base has effects.
+    The left-out gain is slow to work out; unless it is `gained`, it is infinite.
+    """
+    squares = [[[np.sum(part[axis] ** 2) for part in side] for axis in search.axes] for side in (errors, without)]
+    new, old = np.maximum(squares, 1e-300)  # (d, parts)
+    logs, steps = np.log(new.sum(axis=1) / old.sum(axis=1)), np.mean(np.log(new / old), axis=0)
+    steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
+    whole = [float(np.exp(step)) for step, part in zip(steps, search.left_out, strict=True) if part.whole]
+    left_out = np.inf
+    if gained:
+        pairs = [[(one[axis], other[axis] - one[axis]) for one, other in zip(errors, without, strict=True)]
+                 for axis in search.axes]  # fmt: skip
+        rows = [sum(effective(e, added, walking=effect.walks) for e, added in own) for own in pairs]
+        left_out = -float(np.sum(np.array(rows) / 4 * logs)) - price
+    (chance, gain), ratio = fast, float(np.exp(np.mean(logs)))
+    poorest = max(whole, default=0.0)
+    return CandidateEvidence(ratio, steady, len(steps), poorest, beside, left_out, chance, gain - price, price)
 
 
 def with_uncertain_map(search: Search, trial: Trial) -> Trial:

@@ -127,10 +127,9 @@ def _cubic(T: Array, bend: float, most: int) -> Array:
 
 def _orthonormal(columns: Array) -> Array:
     """Return orthonormal columns (K, r) of the same space, but for a constant; r is its dimension."""
-    if not columns.shape[1]:
-        return columns
-    left, sizes, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
-    return np.asarray(left[:, sizes > DEPENDENT * sizes[0]])
+    from scipy.linalg import orth
+
+    return np.asarray(orth(columns - columns.mean(axis=0), DEPENDENT)) if columns.shape[1] else columns
 
 
 def _quietest(t: Array, values: Array) -> slice | None:

@@ -14,18 +14,18 @@ y (n, m + S) is the realisations, then the shapes.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.identification.acceptance import CHANCE, CandidateEvidence, accept, matched_on_axes
+from driftlab.identification.acceptance import CHANCE, accept, matched_on_axes
 from driftlab.identification.candidates import candidates_of
 from driftlab.identification.columns import Indices
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.state import Search
-from driftlab.identification.trials import AS_GOOD
-from driftlab.noise.local_level import effective, one_step
+from driftlab.identification.trials import AS_GOOD, evidence_of
+from driftlab.noise.local_level import one_step
 from driftlab.planning.simulated_search import Body, Information, measured, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
@@ -40,8 +40,6 @@ OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters, for the smallest s
 REALISATIONS = 7  # of the noise
 POWERS = range(-2, 7)  # of 2, times the size that has ten nats: sizes that are tried
 HALVINGS = 3  # of the last factor 2
-
-Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the errors with the effect and without
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def _one(information: Information, k: int, simulated: MonteCarlo) -> tuple[Array
 
 
 def _smallest(information: Information, own: list[int], simulated: MonteCarlo) -> list[float]:
-    """Return the smallest sizes that are search, over the grid of hyper-parameters."""
+    """Return the smallest sizes that are found, over the grid of hyper-parameters."""
     at = [own[round(share * (len(own) - 1))] for share in OF_GRID]
     shapes, starts, alike = [], [], np.ones((len(at), len(own)), dtype=bool)
     for j, k in enumerate(at):
@@ -287,7 +285,7 @@ class _Case:
             ]
             for fits in self._fits
         ]
-        self._white = [self._base(axis) for axis in range(len(self.y))]
+        self._white = [self._without_map(axis, y) for axis, y in enumerate(self.y)]  # (n - 1, m + S)
 
     def passes(self, j: int, size: float) -> bool:
         """Return True if most realisations pass where the effect has the j-th shape and this size."""
@@ -299,24 +297,17 @@ class _Case:
         return passed > REALISATIONS // 2
 
     def _passes(self, k: int, j: int, size: float) -> bool:
-        whole = self._chosen(-1, k, j, size)
-        if not self.alike[j - REALISATIONS, whole]:
+        """Return True if realisation k passes, with the j-th signal of this size in it."""
+        number, search = self._chosen(-1, k, j, size), self.bench.search
+        if not self.alike[j - REALISATIONS, number]:
             return False
-        pairs: Pairs = []
-        for p in range(len(self.bench.search.left_out)):
-            new, old = self._left_out[1 + self._chosen(p, k, j, size)][p], self._left_out[0][p]
-            pairs.append([
-                (a[:, k] + size * a[:, j], b[:, k] + size * b[:, j]) for a, b in zip(new, old, strict=True)
-            ])  # fmt: skip
-        effect = self.effects[whole]
-        evidence = self._evidence(pairs, k, j, size)
-        if not accept(effect, evidence, ())[0]:
-            return False
-        gained = 0.0  # what is left is slow to work out
-        for axis, log in enumerate(_logs(pairs)):
-            parts = [part[axis] for part in pairs]
-            gained -= sum(effective(e, old - e, walking=effect.walks) for e, old in parts) / 4 * float(log)
-        return accept(effect, replace(evidence, left_out=gained - self.bench.price), ())[0]
+        models = [1 + self._chosen(p, k, j, size) for p in range(len(search.left_out))], [0] * len(search.left_out)
+        errors, without = (
+            [[e[:, k] + size * e[:, j] for e in self._left_out[m][p]] for p, m in enumerate(own)] for own in models
+        )
+        effect, fast = self.effects[number], self._fast(number, k, j, size)
+        given = search, effect, errors, without, fast, self.bench.price
+        return all(accept(effect, evidence_of(*given, gained=gained), ())[0] for gained in (False, True))
 
     def _chosen(self, own: int, k: int, j: int, size: float) -> int:
         """Return the hyper-parameters that fit realisation k best, of one set of segments (-1: all of them)."""
@@ -329,21 +320,8 @@ class _Case:
         ]
         return int(np.argmin(costs))
 
-    def _evidence(self, pairs: Pairs, k: int, j: int, size: float) -> CandidateEvidence:
-        """Return the figures of realisation k as `driftlab.identification.trials` has them, but the left-out gain."""
-        price = self.bench.price
-        squares = np.maximum([[[float(e @ e) for e in pair] for pair in part] for part in pairs], 1e-300)
-        steps = np.mean(np.log(squares[:, :, 0] / squares[:, :, 1]), axis=1)
-        spread = max(float(np.std(steps, ddof=1)) / np.sqrt(len(steps)), 1e-12)
-        ratio, steady = float(np.exp(np.mean(_logs(pairs)))), float(np.mean(steps)) / spread
-        chance, gain = self._fast(k, j, size)
-        return CandidateEvidence(
-            ratio, steady, len(steps), 0.0, beside=False, left_out=np.inf, chance=chance, gain=gain - price, price=price
-        )
-
-    def _fast(self, k: int, j: int, size: float) -> tuple[float, float]:
+    def _fast(self, number: int, k: int, j: int, size: float) -> tuple[float, float]:
         """Return the figures of the matched filter, as `driftlab.identification.acceptance.fast_evidence`."""
-        number = self._chosen(-1, k, j, size)
         left = (own[:, k] + size * own[:, j] for own in self._white)
         axes = ((e, self._columns(number, axis, k, j, size)) for axis, e in enumerate(left))
         return matched_on_axes(axes, len(self.effects[number].continuous))
@@ -356,16 +334,14 @@ class _Case:
             base, other = self._fits[0][-1][axis], self._fits[1 + number][-1][axis]
             own = [W[:, f.cols] @ (f.beta[:, k] + size * f.beta[:, j]) for f in (base, other)]
             Z = np.column_stack([Z, own[0] - own[1]])
-        fit = self.bench.search.squares.fit((), axis, self.bench.search.everything)
-        base_columns = W[:, fit.cols]
-        left = Z - base_columns @ fit.equations.solve(base_columns.T @ Z)
-        return one_step([left], self.bench.noises[axis].gain)[0]
+        return self._without_map(axis, Z)
 
-    def _base(self, axis: int) -> Array:
-        """Return the residuals of the map alone of all signals (n - 1, m + S), as white."""
-        fit = self._fits[0][-1][axis]
-        left = self.y[axis] - self.bench.search.columns.W[:, fit.cols] @ fit.beta
-        return one_step([left], self.bench.noises[axis].gain)[0]
+    def _without_map(self, axis: int, values: Array) -> Array:
+        """Return columns (n, p) less what map and level can make of them, as white (n - 1, p)."""
+        search = self.bench.search
+        fit = search.squares.fit((), axis, search.everything)
+        B = search.columns.W[:, fit.cols]
+        return one_step([values - B @ fit.equations.solve(B.T @ values)], self.bench.noises[axis].gain)[0]
 
     def _fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> _Fit:
         fit = self.bench.search.squares.fit(model, axis, segments)
@@ -378,9 +354,3 @@ class _Case:
         e = self.y[axis][part.rows] - self.bench.search.columns.W[part.rows][:, fit.cols] @ fit.beta
         e = e[part.window.stop - part.rows.start :]
         return np.asarray(e - e.mean(axis=0))
-
-
-def _logs(pairs: Pairs) -> Array:
-    """Return the log (d,) of the ratio of what is left of all parts, with the effect over without."""
-    squares = np.sum([[[float(e @ e) for e in pair] for pair in part] for part in pairs], axis=0)
-    return np.asarray(np.log(np.maximum(squares[:, 0], 1e-300) / np.maximum(squares[:, 1], 1e-300)))

@@ -87,14 +87,14 @@ class ControlChart:
         Places of the units in the line.
     figures : callable
         Returns the values (m,), SI, and the deviations (m,) of their measurements in the scale, by the records.
-    scale : Scale
+    scale : ChartScale
         In which the limits lie alike above and below.
     basis : (start, stop)
         Places in the line of the units on which the limits stand, unless `of_family`.
     centre : float
         Middle of a line in control, SI.
-    changes : tuple of Change
-    lots : tuple of Lot
+    changes : tuple of StepChange
+    lots : tuple of LotPoint
         In the order of their first units.
     law : InControl
         Of the values in the scale: the limits stand on it.
@@ -251,7 +251,7 @@ class LineReport:
     axes : tuple of str
     unit : BiasUnit
         Of the bias: in SI, and as it is shown.
-    controls : tuple of Control
+    controls : tuple of ControlChart
     capability : tuple of Capability
     too_few : tuple of str
         Quantities without a chart because fewer than MIN_UNITS units have them.

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.family.partitions import by_lot
 from fusion_core.chunk import Array
 
 REACH = 3.0  # sigmas
@@ -116,9 +117,7 @@ def lots_of(names: NDArray[Any], x: Array, own: Array, known: float | None = Non
     list of (name, (7,) array)
         Units, mean, its limits, deviation, its limits.
     """
-    _, first, number = np.unique(names, return_index=True, return_inverse=True)
-    places = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
-    of_lot = [(str(names[first[k]]), places[k]) for k in np.argsort(first).tolist()]
+    of_lot = [*by_lot(names.tolist()).items()]
     n = np.array([len(part) for _, part in of_lot], dtype=np.intp)
     s = np.array([np.std(x[part], ddof=1) if len(part) > 1 else np.nan for _, part in of_lot])
     sigma = within(n.copy(), s) if known is None else known

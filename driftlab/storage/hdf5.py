@@ -87,7 +87,7 @@ class GrowingFile:
             self._file.attrs.update(attributes)
         self._data: dict[str, h5py.Dataset] = {}
         self._pending: list[Columns] = []
-        self._begun: dict[str, NDArray[Any]] = {}  # rows of the piece that is not full
+        self._begun: dict[str, list[NDArray[Any]]] = {}  # rows of the piece that is not full
         self._packed: dict[str, tuple[bytes, bytes]] = {}  # the row that a column repeated last, and the piece of it
         self._waiting = self._written = 0  # rows in memory alone, and handed to the thread that writes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="writer")
@@ -135,16 +135,16 @@ class GrowingFile:
                 self._under_way.result()
 
     def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
-        start = written // PIECE * PIECE
+        """Write rows up to `end`, from the beginning of the piece on that is not full; keep those of the last one."""
+        start, whole = written // PIECE * PIECE, end // PIECE * PIECE
         for name, data in self._data.items():
-            rows = [*([self._begun[name]] if name in self._begun else []), *(part[name] for part in parts)]
-            first, rest = (_joined(rows, *ends, data.dtype) for ends in ((0, PIECE), (PIECE, sum(map(len, rows)))))
+            rows = [*self._begun.get(name, []), *(part[name] for part in parts)]  # from `start` on
             data.id.set_extent((end, *data.shape[1:]))
             for at in range(start, end, PIECE):
-                piece = rest[at - start - PIECE : end - start - PIECE][:PIECE] if at > start else first[: end - start]
+                piece = _joined(rows, at - start, min(at + PIECE, end) - start, data.dtype)
                 self._put(name, at, piece, new=at >= written)  # a piece that is there in part keeps its place
-            left = first if end - start < PIECE else rest[end // PIECE * PIECE - start - PIECE :]
-            self._begun[name] = left.copy() if left.strides[0] else left
+            left = _joined(rows, whole - start, sum(map(len, rows)), data.dtype)
+            self._begun[name] = [left.copy() if left.strides[0] else left]
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
         data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE

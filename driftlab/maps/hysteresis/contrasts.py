@@ -120,7 +120,7 @@ class SoakContrasts:
         self.Z = np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
         self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
         self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
-        self._inverses: dict[int, Array] = {}
+        self._fits: dict[int, tuple[Array, Array, Array]] = {}
 
     def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
@@ -190,17 +190,22 @@ class SoakContrasts:
         own, V = self.laws[noise // len(RATIOS)]
         return self.weights(own)[noise % len(RATIOS)], V
 
-    def inverse(self, noise: int) -> Array:
-        """Return the inverse (K, K) of the blocks' covariance under a noise, whose white part has a variance of 1."""
+    def fit(self, noise: int) -> tuple[Array, Array, Array]:
+        """Return C^-1 (K, K), C^-1 X (K, P) and (X' C^-1 X)^-1 (P, P) of generalised least squares under a noise.
+
+        C is the covariance of the blocks, whose white part has a variance of 1.
+        """
         from scipy.linalg.lapack import dpotrf, dpotri
 
-        if noise not in self._inverses:
+        if noise not in self._fits:
             law, ratio = divmod(noise, len(RATIOS))
             C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
             C[np.diag_indices(len(C))] += 1.0
             half = np.tril(dpotri(dpotrf(C, lower=1)[0], lower=1)[0])
-            self._inverses[noise] = half + np.tril(half, -1).T
-        return self._inverses[noise]
+            inverse = half + np.tril(half, -1).T
+            solved = inverse @ self.X
+            self._fits[noise] = inverse, solved, np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
+        return self._fits[noise]
 
     def gram(self, noise: int, z: Array) -> Array:
         """Return the inner products (J, J) of shapes z (m, J) under a noise."""
@@ -218,8 +223,7 @@ class SoakContrasts:
         has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
         """
         w, V = self.under(noise)
-        solved = self.inverse(noise) @ self.X
-        spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
+        _, solved, spread = self.fit(noise)
         bent = spread @ (solved.T @ self.y[:, axis])
         free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), FINEST)
         again = spread @ solved.T @ late
@@ -282,10 +286,9 @@ class SoakContrasts:
         """
         S, variances = curves.late, np.zeros(curves.partly.shape)
         for axis, noise in enumerate(noises):
-            inverse = self.inverse(int(noise))
-            solved, turned = inverse @ self.X, np.swapaxes(S, 1, 2) @ inverse
+            inverse, _, spread = self.fit(int(noise))
+            turned = np.swapaxes(S, 1, 2) @ inverse
             of_X, whole = turned @ self.X, turned @ S  # (J, p, P) and (J, p, p)
-            spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
             free = whole - of_X @ spread @ np.swapaxes(of_X, 1, 2)  # of the contrasts: the curve here is another
             M = np.where(curves.partly[:, axis, None, None], free, whole) / s2[axis] + np.eye(S.shape[2]) / FREE**2
             a, g = curves.coefficients[:, :, axis], between[:, axis]
