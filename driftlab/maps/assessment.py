@@ -173,8 +173,8 @@ def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit
     larger = f"{', '.join(f'{name} {text(float(v) * unit.factor, 2)}' for name, v in named)} {unit.shown}"
     if memory.answer == "none":
         return (
-            f"no hysteresis or lag is seen between up and down; one larger than {larger}, of any kind, would have been "
-            "seen with 95 % probability"
+            f"no hysteresis or lag is seen between up and down; one larger than {larger}, of any kind that spans "
+            f"{text(memory.over, 2)} K or more, would have been seen with 95 % probability"
         )
     if memory.answer == "undecided":
         known = np.all(np.isfinite(memory.none_larger_than))

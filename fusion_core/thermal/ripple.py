@@ -7,7 +7,9 @@ neighbouring cells, u is how far the middle one is off the mean of the others on
 
 since noise and walk of two ways are independent, and what differs between up and down is smooth. Without a ripple the
 sign of u v is as good as tossed, triple by triple, so that z = sum(u v) / sqrt(sum((u v)^2)) exceeds x with a
-probability of exp(-x^2 / 2) at most (W. Hoeffding, J. Am. Stat. Assoc. 58 (1963) 13). N samples, d axes.
+probability of exp(-x^2 / 2) at most (W. Hoeffding, J. Am. Stat. Assoc. 58 (1963) 13). A dip at one temperature is one
+product of many: it is seen where u and v are both, and to the same side, beyond NARROW of their robust deviations.
+N samples, d axes.
 """
 
 from __future__ import annotations
@@ -23,16 +25,22 @@ CHANCE = 1e-3  # probability that noise alone is taken for a ripple, of an axis
 HALVINGS = 6  # widths of cells: the widest is half of what the curve is looked at with
 TRIPLES = 16  # of cells, at least
 GAIN = 1.5  # of E(u v) over r^2
+NARROW = 5.0  # deviations of u and of v: more is a dip
+HELD = 2.0  # times the usual deviation of white noise, or its inverse: at a temperature that is held, a bias walks
 POINTS = 4000  # of the temperature, of which its ways are found
 
 
 class Ripple(NamedTuple):
-    """A ripple of one axis: its rms and the deviation that chance gives to it, in the unit of the bias."""
+    """A ripple of one axis: its rms and the deviation that chance gives to it, in the unit of the bias.
+
+    Of a `dip`, which is at one temperature, its depth below the cells beside it.
+    """
 
     rms: float
     chance: float
     T: float  # where it shows most
     width: float  # of the cells that show it
+    dip: bool = False
 
 
 def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
@@ -48,33 +56,67 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
     least = np.sqrt(2 * np.log(HALVINGS / CHANCE))
     for halving in range(1, HALVINGS + 1):
         cell = width / 2**halving
-        products, at = _products(((T - T.min()) / cell).astype(np.int64), way, left)
+        ways, noise, at = _ways_apart(((T - T.min()) / cell).astype(np.int64), way, left)
+        where, third = float(T.min()) + (at + 0.5) * cell, at % 3 == 1  # of cells that no other three have
+        inner = (where > T.min() + width) & (where < T.max() - width)  # about a turn, both ways are of one moment
+        products = ways[0, third] * ways[1, third]
         if len(products) < TRIPLES:
             continue
         total, scatter = products.sum(axis=0), np.sqrt(np.sum(products**2, axis=0))
-        for axis in np.flatnonzero(total > least * scatter):
-            rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
-            where = float(T.min()) + (at[int(np.argmax(products[:, axis]))] + 0.5) * cell
-            ripple, wider = Ripple(float(rms), float(chance), where, cell), found[axis]
-            found[axis] = ripple if wider is None or ripple.rms > wider.rms else wider
+        for axis in range(left.shape[1]):
+            candidates = [_dip(ways[:, inner, axis], noise[:, inner], where[inner], cell)]
+            if total[axis] > least * scatter[axis]:
+                rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
+                most = float(where[third][int(np.argmax(products[:, axis]))])
+                candidates.append(Ripple(float(rms), float(chance), most, cell))
+            known = [one for one in (found[axis], *candidates) if one is not None]
+            found[axis] = max(known, key=lambda one: one.rms, default=None)
     return found
 
 
-def _products(cell: Integers, way: Integers, left: Array) -> tuple[Array, Integers]:
-    """Return u v (M, d) of each three neighbouring cells that both ways have gone through, and the middle ones (M,)."""
-    count = 3 * (int(cell.max()) // 3 + 1)
-    apart, there = [], np.ones(count // 3, dtype=np.bool_)
+def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Array, Integers]:
+    """Return u and v (2, M, d) of each three neighbouring cells that both ways have gone through.
+
+    And their deviations (2, M) for white noise of 1 a sample, and the middle cells (M,).
+    """
+    count = int(cell.max()) + 1
+    apart, noise, there = [], [], np.ones(max(count - 2, 0), dtype=np.bool_)
     for sign in (1, -1):
         own = way == sign
         n = np.bincount(cell[own], minlength=count)
-        there &= np.all(n.reshape(-1, 3) > 0, axis=1)
-        sums = np.stack([np.bincount(cell[own], column, count) for column in left[own].T], axis=1)
-        low, middle, high = np.moveaxis((sums / np.maximum(n, 1)[:, None]).reshape(-1, 3, left.shape[1]), 1, 0)
-        apart.append(middle - (low + high) / 2)
-    return (apart[0] * apart[1])[there], 3 * np.flatnonzero(there).astype(np.int64) + 1
+        there &= (n[:-2] > 0) & (n[1:-1] > 0) & (n[2:] > 0)
+        share = 1 / np.maximum(n, 1)
+        means = np.stack([np.bincount(cell[own], column, count) for column in left[own].T], axis=1) * share[:, None]
+        apart.append(means[1:-1] - (means[:-2] + means[2:]) / 2)
+        noise.append(np.sqrt(share[1:-1] + (share[:-2] + share[2:]) / 4))
+    return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64) + 1
+
+
+def _dip(ways: Array, noise: Array, where: Array, cell: float) -> Ripple | None:
+    """Return the dip that u and v (2, M) of an axis show at temperatures (M,); None where there is none."""
+    if len(where) < TRIPLES:
+        return None
+    passed = np.all(np.abs(np.log(noise / np.median(noise))) < np.log(HELD), axis=0)
+    if np.sum(passed) < TRIPLES:
+        return None
+    ways, noise, where = ways[:, passed], noise[:, passed], where[passed]
+    z = ways / noise
+    usual = 1.4826 * np.median(np.abs(z), axis=1)[:, None]
+    beyond = np.min(np.abs(z) / np.maximum(usual, np.finfo(float).tiny), axis=0) * (ways[0] * ways[1] > 0)
+    k = int(np.argmax(beyond))
+    if not beyond[k] > NARROW:
+        return None
+    chance = float(np.sqrt(np.mean((usual[:, 0] * noise[:, k]) ** 2) / 2))
+    return Ripple(abs(float(np.mean(ways[:, k]))), chance, float(where[k]), cell, dip=True)
 
 
 def ripple_modes(ripple: Ripple, grid: Array) -> Array:
-    """Return two modes (G, 2) on a grid (G,): a wave of the ripple's rms and of any phase, as narrow as the grid."""
+    """Return two modes (G, 2) on a grid (G,): a wave of the ripple's rms and of any phase, as narrow as the grid.
+
+    Of a dip one (G, 1), where it is.
+    """
+    if ripple.dip:
+        wide = max(ripple.width, float(grid[1] - grid[0]))
+        return np.asarray(ripple.rms * np.exp(-(((grid - ripple.T) / wide) ** 2) / 2)[:, None])
     phase = 2 * np.pi * grid / max(3 * ripple.width, 8 * float(grid[1] - grid[0]))
     return np.asarray(ripple.rms * np.stack([np.cos(phase), np.sin(phase)], axis=1))

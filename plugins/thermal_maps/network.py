@@ -42,7 +42,7 @@ def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Tar
     arrays = [array for layer in network for array in layer]
     sizes = [np.maximum(np.abs(array), max(1e-3 * float(np.abs(array).max()), 1e-300)) for array in arrays]
     theta, scale = (np.concatenate([array.ravel() for array in each]) for each in (arrays, sizes))
-    J = jacobian(theta, len(network[0][1]), fine) * scale  # columns of one scale
+    J: Array = jacobian(theta, len(network[0][1]), fine) * scale  # columns of one scale
     if target == "bias":
         return J
     area = np.concatenate([np.zeros((1, J.shape[1])), np.cumsum((J[1:] + J[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])

@@ -7,11 +7,12 @@ from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
-from driftlab.soak.blocks import WAYS, SoakSummary
+from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
@@ -20,6 +21,8 @@ PAIRS = 24
 HINT = 1.0  # of the evidence: more is worth a mention (Kass and Raftery, 1995)
 CLEAR = 1.96  # deviations of a size, on one axis at least: with less a size is not signed
 TWO = 3.0  # of the evidence of two shapes against one: both are there
+BESIDE = 4  # cells of temperature on either side, that a narrow difference stands out of
+NARROW = 8.0  # deviations of a cell's difference from those beside it: more is a narrow loop, or a jump
 WHY = {
     "warms": "only ever warms: hysteresis cannot be seen; come back down by the same steps",
     "cools": "only ever cools: hysteresis cannot be seen; come back up by the same steps",
@@ -35,6 +38,9 @@ WHY = {
     "places or when they are read: whether it remembers more is not known; go up and down faster, and slower",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
+    "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
+    "a narrow loop, or where the bias jumped: whether it remembers is not known; go up and down again, by the same "
+    "steps",
     "none": "what is between up and down is no more than noise",
     "seen": "what a free curve leaves goes with where the temperature came from",
 }
@@ -62,6 +68,7 @@ class MemoryVerdict:
     # (G, d): warming less cooling there in the mean over the sweeps, if there is a memory, and its standard deviation
     difference: Array = field(default_factory=lambda: np.empty((0, 0)))
     spread: Array = field(default_factory=lambda: np.empty((0, 0)))
+    over: float = 0.0  # K: a memory that spans as much has been looked for; a narrower one shows where it stands out
 
     @classmethod
     def unknown(cls, d: int, why: str) -> MemoryVerdict:
@@ -140,6 +147,31 @@ def _unseen(soak: SoakSummary) -> str:
     return "short" if len(soak.T) < 2 * MIN_CONTRASTS else ""
 
 
+def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
+    """Return where up and down differ in one cell of temperature by more than beside it, as WHY has it; None: nowhere.
+
+    Blocks of a soak are too wide for it. Differences of cells are as unsure as their samples' white noise and a robust
+    deviation of all cells say. One recording alone is looked at: several have levels of their own.
+    """
+    (n, T, bias), (below_n, below_T, below) = soak.cells(WAYS["warming"]), soak.cells(WAYS["cooling"])
+    both, d = (n > 0) & (below_n > 0), bias.shape[1]
+    if len(np.unique(soak.recording)) > 1 or np.sum(both) < MIN_CONTRASTS:
+        return None
+    T, apart, mean = (T[both] + below_T[both]) / 2, (T - below_T)[both], (bias + below)[both] / 2
+    difference = (bias - below)[both] - np.gradient(mean, T, axis=0) * apart[:, None]
+    own = np.arange(-BESIDE, BESIDE + 1) != 0
+    off = difference[BESIDE:-BESIDE] - np.median(sliding_window_view(difference, len(own), axis=0)[..., own], axis=2)
+    white = (1 / n[both] + 1 / below_n[both])[BESIDE:-BESIDE, None] * soak.white**2
+    usual = np.median(off**2, axis=0) / 0.455  # of chi-square with one degree of freedom
+    sigma = np.sqrt(white + np.maximum(usual - np.median(white, axis=0), 0.0))
+    beyond = np.abs(off) / np.maximum(sigma, np.finfo(float).tiny)
+    cell, axis = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
+    if not beyond[cell, axis] > NARROW:
+        return None
+    name = "xyz"[axis] if d == 3 else str(axis + 1)
+    return {"width": float(np.ptp(soak.domain)) / len(n), "T": float(T[BESIDE + cell]), "axis": name}
+
+
 @dataclass(frozen=True, eq=False)
 class _MemoryTest:
     """Shapes, their evidence, and the bias that they add on the slots (S, J, d)."""
@@ -160,6 +192,7 @@ class _MemoryTest:
         seen = total > SEEN
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.bias, axis=0)
+        narrow = _narrow(self.contrasts.soak)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         sized = self if total <= HINT else self._following()
         noise = np.argmax(self.evidence.noises, axis=0)
@@ -169,14 +202,20 @@ class _MemoryTest:
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
             why = "slight"
-        if why in ("brief", "slight"):
+        if why != "seen" and narrow is not None:
+            why = "narrow"
+        if why in ("brief", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        reason = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
+        said = WHY[why] if narrow is None else WHY[why].format(**narrow)
+        reason = "; ".join([said, *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
-        return MemoryVerdict(answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread)
+        over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
+        return MemoryVerdict(
+            answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread, over
+        )
 
     def _following(self) -> _MemoryTest:
         """Return the same of shapes whose curves follow their inputs, estimated from the soak: for their sizes."""
