@@ -168,6 +168,25 @@ def _after(chunk: Chunk, keep: Flags, faults: Faults) -> str:
     return f"before {faults.when(chunk.t[good[0]])}" if len(good) else "in rows that have none"
 
 
+BEGIN_AGAIN = {
+    86_400.0: "it is the time of a day: add 86,400 s to the rows behind each midnight",
+    **{
+        2.0**bits * unit: f"its counter of {bits} bits began again: add {2**bits:,} {name} to the rows behind that"
+        for bits, unit, name in ((16, 1e-3, "ms"), (32, 1e-3, "ms"), (32, 1e-6, "µs"))
+    },
+}
+"""By how many s a time that begins again goes back."""
+
+
+def advice_backwards(steps: Array, k: int) -> str:
+    """Return what to do where the k-th of the steps (N,) of a time, s, goes back."""
+    usual = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    for whole, advice in BEGIN_AGAIN.items():
+        if 30 * usual < whole and abs(whole + steps[k] - usual) <= 2 * usual + 1e-9 * whole:
+            return advice
+    return "sort the rows"
+
+
 def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
     if len(chunk) == 0 or faults.first_row is None:
         return chunk
@@ -181,8 +200,8 @@ def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) ->
         stop = np.floor((chunk.t[k] - step[k] - faults.first_row) * 1e3) / 1e3
         path, _, span = name.partition("::")
         raise TimeBackwards(
-            f"{name}: time runs backwards by {-step[k]:.6g} s at {faults.when(chunk.t[k])}; sort the rows, or cut it "
-            f"before that: {path}::{span.partition(':')[0]}:{stop:.3f}"
+            f"{name}: time runs backwards by {-step[k]:.6g} s at {faults.when(chunk.t[k])}; "
+            f"{advice_backwards(step, k)}, or cut it before that: {path}::{span.partition(':')[0]}:{stop:.3f}"
         )
     repeated = step == 0
     where = f"at {faults.when(chunk.t[np.argmax(repeated)])}"

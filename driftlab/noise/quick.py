@@ -108,7 +108,7 @@ def _curves(t: Array, T: Array) -> Iterator[Array]:
         return
     slow = T.copy()
     for k in range(1, len(T)):
-        slow[k] = slow[k - 1] + (T[k] - slow[k - 1]) * -np.expm1(-(t[k] - t[k - 1]) / LAG)
+        slow[k] = slow[k - 1] + (T[k] - slow[k - 1]) * -np.expm1(-max(t[k] - t[k - 1], 0.0) / LAG)
     cubic = _cubic(T, BEND, COLUMNS)
     yield _orthonormal(np.column_stack([cubic, (T - slow) / span]))
     yield _orthonormal(cubic)

@@ -89,6 +89,10 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
         stated = _stated(field, group, columns, given.units, written)
         counts = any(name.counts for name in group) and field in ("gyro", "temperature")
         guess = stated or (OF_COUNTS if counts else _by_values(field, values, channels, noise))
+        rivals = [name.path for name in others if name.quantity == field == "temperature"]
+        if rivals and field not in chosen:
+            why = f"of {1 + len(rivals)} temperatures; the map follows the sensor's own, and {rivals[0]} is another"
+            guess, stated = Guess(guess.unit, why), None
         axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
         paths = tuple(name.path for name in group)
         channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)

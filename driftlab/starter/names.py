@@ -13,16 +13,19 @@ from itertools import takewhile
 from fusion_core.contracts import USUAL
 from fusion_core.units import same_dimension
 
-WORDS = {
+WORDS = {  # of a name with words of two quantities, as `gyro_temp`, the first here is meant
+    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient",
+                    "temperatur"},
     "gyro": {"gyr", "gyro", "gyros", "gyroscope", "gyroscopes", "omega", "rate", "rates", "rot", "ars", "angvel",
              "angularvelocity", "angularrate", "rateofturn", "rotationrate", "drehrate"},
     "accel": {"acc", "accl", "accel", "accels", "accelerometer", "accelerometers", "acceleration", "specificforce",
               "linearacceleration", "beschleunigung"},
-    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient",
-                    "temperatur"},
     "time": {"time", "timestamp", "stamp", "sec", "secs", "seconds", "epoch", "utc", "ts", "elapsed", "tow", "micros",
              "millis", "date", "datetime", "zeit", "datum", "xvalue"},
 }  # fmt: skip
+SURROUNDINGS = {"oven", "ofen", "chamber", "kammer", "ambient", "room", "raum", "air", "bath", "bad", "setpoint",
+                "soll", "target", "outside"}  # fmt: skip
+"""Words of thermometers beside the sensor, whose bias they lead."""
 LETTERS = {"gyro": {"g", "w"}, "accel": {"a", "f"}}  # that mean so beside an axis
 NO_SENSOR = {"bias", "truth", "true", "std", "sigma", "cov", "covariance", "var", "variance", "delta", "mag", "offset",
              "orientation", "position", "velocities", "scale", "error", "seq", "rms", "count"}  # fmt: skip
@@ -78,6 +81,8 @@ def read_name(path: str) -> Name:
         for count in (3, 2, 1):  # `m_s2` and `rad_s` are several words
             suffix = UNITS.get("".join(words[-count:])) if len(words) >= count else None
             shorter = _meaning(words[:-count] if len(words) > count else words)
+            if suffix in ("degC", "degF") and len(words) > count and len("".join(words[-count:])) > 1:
+                shorter = "temperature", None, words[:-count]  # `imu_T_degC`: no other quantity has such a unit
             if suffix and shorter[0] and _fits(suffix, shorter[0]):
                 unit, (quantity, axis, rest) = suffix, shorter
                 break
@@ -109,8 +114,8 @@ def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str
 def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[Name]]:
     """Return the columns of a quantity, one list a sensor, in the order of axes.
 
-    Triads and known units come first, then those whose names begin most like the column `beside`. Three columns without
-    axes, all of one stated unit, are a triad in their order.
+    Triads come first, what is of the surroundings last; of alike ones known units come first, then those whose names
+    begin most like the column `beside`. Three columns without axes, all of one stated unit, are a triad in their order.
     """
     groups: dict[tuple[str, ...], list[Name]] = {}
     for name in names:
@@ -126,7 +131,15 @@ def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[N
         axes = [name.axis for name in group]
         if len(set(axes)) < len(axes):
             del group[1:]
-    return sorted(groups.values(), key=lambda group: (-len(group), group[0].unit is None, -_alike(group, beside)))
+    return sorted(
+        groups.values(),
+        key=lambda group: (-len(group), _beside(group), group[0].unit is None, -_alike(group, beside)),
+    )
+
+
+def _beside(group: list[Name]) -> bool:
+    """Return True for the column of a thermometer that is not the sensor's, by its name."""
+    return bool(SURROUNDINGS & set(re.findall("[a-zäöü]+", group[0].path.lower())))
 
 
 def _alike(group: list[Name], beside: str) -> int:

@@ -15,7 +15,7 @@ from driftlab.starter.reading import ROWS
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Source
 from fusion_core.errors import EmptyRecording
-from fusion_core.faults import Faults
+from fusion_core.faults import Faults, advice_backwards
 
 LOST = 0.05  # of the rows, without a number: more is reported
 WINDOW = 10  # s in which a unit has to be at rest once
@@ -47,10 +47,11 @@ def problems_of(config: Config) -> Iterator[str]:
     lasts = float(np.ptp(t)) if len(t) else 0.0
     steps = np.diff(t)
     if len(steps) and (back := float(np.min(steps))) < 0:
-        at = float(t[np.argmin(steps)] - t[0])
+        k = int(np.argmin(steps))
+        at = float(t[k] - t[0])
         yield (
-            f"time runs backwards by {-back:.6g} s, {at:.6g} s after the first row: sort the rows, or read a part, as "
-            f"in --input FILE::0:{np.floor(at * 1e3) / 1e3:.3f}"
+            f"time runs backwards by {-back:.6g} s, {at:.6g} s after the first row: {advice_backwards(steps, k)}, or "
+            f"read a part, as in --input FILE::0:{np.floor(at * 1e3) / 1e3:.3f}"
         )
     if len(steps) and getattr(source, "dates", None) and (jump := float(np.max(steps))) > DAY / 2:
         yield f"the date jumps by {jump / DAY:.3g} days: day and month may be the other way round, say it with --dates"

@@ -36,6 +36,7 @@ DATE = re.compile(
     re.I,
 )
 ZONE = r"(:\d\d[.\d]*)\s?(?:Z|UTC|GMT|[+-]\d\d:?\d\d)$"
+OFFSET = r":\d\d[.\d]*\s?([+-])(\d\d):?(\d\d)$"
 FRACTION = r"(\d:\d\d:\d\d)(?:,(\d)|:(\d{6}|\d{3})(\D|$))"  # of a second, behind no point
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",
         "%d-%b-%Y", "%d-%m-%Y", "%Y%m%d")  # fmt: skip
@@ -195,7 +196,8 @@ def _span(seconds: pl.Series) -> float:
 def seconds_of(texts: pl.Series, form: str) -> pl.Series:
     """Return dates as seconds since 1970, those without a day since midnight; null where a text is none.
 
-    Fractions of a second may stand behind a point or a comma, 3 or 6 digits behind a colon; a zone is left out.
+    Fractions of a second may stand behind a point or a comma, 3 or 6 digits behind a colon. With an offset from UTC
+    they are of UTC; the name of a zone is left out.
     """
     import polars as pl
 
@@ -205,7 +207,13 @@ def seconds_of(texts: pl.Series, form: str) -> pl.Series:
     if not has_day(form):
         plain, form = "1970-01-01 " + plain, f"%Y-%m-%d {form}"
     moments = plain.str.to_datetime(form.replace("%S", "%S%.f"), time_unit="ns", strict=False)
-    return moments.dt.timestamp("ns").cast(pl.Float64) / 1e9
+    seconds = moments.dt.timestamp("ns").cast(pl.Float64) / 1e9
+    zoned = texts.str.strip_chars()
+    if not zoned.str.contains(OFFSET).any():
+        return seconds
+    sign, hours, minutes = (zoned.str.extract(OFFSET, k).fill_null("0") for k in (1, 2, 3))
+    ahead = 3600 * hours.cast(pl.Float64) + 60 * minutes.cast(pl.Float64)
+    return seconds - ahead * (1 - 2 * (sign == "-").cast(pl.Float64))
 
 
 def has_day(form: str) -> bool:

@@ -12,9 +12,10 @@ import lzma
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import datetime, time, timedelta
+from datetime import date, datetime, time, timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -37,6 +38,7 @@ PLACE = re.compile(  # of a row or a cell, after the letter of its tag: column a
 )
 SHARED, ITEM = re.compile(rb"\bt\s*=\s*[\"']s[\"']"), re.compile(rb"<(?:[^\s<>/:]+:)?si[\s/>]")  # texts: cell, list
 CELL = 64.0  # bytes that one takes
+LOOKED_AT = 1000  # rows that tell which columns are moments
 
 
 @hookimpl
@@ -75,8 +77,9 @@ class Xlsx(Csv):
             raise MissingChannel(
                 f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet"
             )
-        rows = _rows(path, _sheet(path, book, self.sheet or names[0]))
-        with stream_of(path, ("\t".join(map(_text, row)) + "\n" for row in rows)) as text:
+        sheet = _sheet(path, book, self.sheet or names[0])
+        moments = {k for row in islice(_rows(path, sheet), LOOKED_AT) for k, cell in enumerate(row) if _is_moment(cell)}
+        with stream_of(path, ("\t".join(_texts(row, moments)) + "\n" for row in _rows(path, sheet))) as text:
             yield text
 
 
@@ -174,6 +177,17 @@ def _check_places(path: Path, part: str, content: bytes) -> None:
         count, width, height = count + 1, max(width, column), max(height, int(number) if number else row)
     what = f"a sheet of {height:,} rows and {width:,} columns"
     check_size(path, what, CELL * max(height * width, count), 2 * PIECE)
+
+
+def _is_moment(cell: Any) -> bool:
+    return isinstance(cell, datetime)
+
+
+def _texts(row: list[Any], moments: Collection[int]) -> Iterator[str]:
+    """Yield the cells of a row as texts; a day in a column of `moments` is its midnight, as which it comes."""
+    for k, cell in enumerate(row):
+        midnight = k in moments and isinstance(cell, date) and not _is_moment(cell)
+        yield _text(datetime.combine(cell, time()) if midnight else cell)
 
 
 def _text(cell: Any) -> str:

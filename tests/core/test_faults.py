@@ -5,7 +5,7 @@ import pytest
 
 from fusion_core.chunk import Chunk
 from fusion_core.errors import EmptyRecording, MissingChannel, TimeBackwards
-from fusion_core.faults import Faults, usable
+from fusion_core.faults import Faults, advice_backwards, usable
 
 
 def chunks(t, size=4, **channels):
@@ -76,3 +76,20 @@ def test_a_note_is_said_once_and_is_no_reason_why_nothing_is_left():
     assert faults.lines() == ["unit 7 was read", "torn rows: 2 (first line 3)"]
     with pytest.raises(EmptyRecording, match=r"has no usable row \(torn rows: 2 \(first line 3\)\);"):
         list(usable([], faults, "r"))
+
+
+@pytest.mark.parametrize(
+    ("whole", "usual", "said"),
+    [
+        (86_400.0, 1.0, "add 86,400 s to the rows behind each midnight"),
+        (2**32 * 1e-3, 0.01, "counter of 32 bits began again: add 4,294,967,296 ms"),
+        (2**32 * 1e-6, 1.0, "counter of 32 bits began again: add 4,294,967,296 µs"),
+        (2**16 * 1e-3, 0.1, "counter of 16 bits began again: add 65,536 ms"),
+        (7.0, 1.0, "sort the rows"),
+        (3600.0, 1.0, "sort the rows"),
+    ],
+)
+def test_a_time_that_begins_again_is_not_to_be_sorted(whole, usual, said):
+    steps = np.full(50, usual)
+    steps[30] = usual - whole
+    assert said in advice_backwards(steps, 30)

@@ -46,7 +46,7 @@ def test_a_dip_is_a_misfit_where_it_is_as_deep_as_beside_it():
     no, dip, none = ripples(T, left, 2.0)
     assert no is none is None
     assert dip.dip
-    assert dip.T == pytest.approx(HERE, abs=0.5)
+    assert pytest.approx(HERE, abs=0.5) == dip.T
     assert 1 < dip.rms < 5
     grid = np.linspace(-20, 60, 121)
     (mode,) = ripple_modes(dip, grid).T

@@ -16,7 +16,8 @@ from driftlab.starter.names import named, read_name
     ("ax", "accel", "x", None), ("acc_y_m_s2", "accel", "y", "m/s^2"), ("Accel_Z (g)", "accel", "z", "g"),
     ("accX [mg]", "accel", "x", "mg"), ("ay_g", "accel", "y", "g"), ("linear_acceleration_x", "accel", "x", None),
     ("T", "temperature", None, None), ("board_temp", "temperature", None, None),
-    ("temp_C", "temperature", None, "degC"),
+    ("temp_C", "temperature", None, "degC"), ("gyro_temp", "temperature", None, None),
+    ("imu_T_degC", "temperature", None, "degC"),
     ("Temperature (K)", "temperature", None, "K"), ("oven", "temperature", None, None),
     ("t", "time", None, None), ("time_ms", "time", None, "ms"), ("TimeUS", "time", None, "us"),
     ("t_s", "time", None, "s"),
@@ -49,3 +50,13 @@ def test_three_columns_of_one_rate_without_axes_are_a_triad_in_their_order():
     (group,) = named(map(read_name, paths), "gyro")
     assert [(name.path, name.axis) for name in group] == [("A (°/s)", "x"), ("B (°/s)", "y"), ("C (°/s)", "z")]
     assert len(named(map(read_name, ["A (°/s)", "B (°/s)", "C (deg/h)"]), "gyro")) == 3  # of three units: guessed alone
+
+
+@pytest.mark.parametrize(("outside", "own"), [
+    ("chamber_T_degC", "imu_T_degC"), ("oven_temp_C", "sensor_temp_C"), ("ambient_temp", "gyro_temp"),
+    ("T_chamber [degC]", "T_board [degC]"), ("Temp_Kammer [degC]", "Temp_Sensor [degC]"),
+])  # fmt: skip
+def test_the_thermometer_of_the_sensor_comes_before_that_of_the_chamber(outside, own):
+    """A map over the temperature of a chamber that the body follows is a hysteresis."""
+    found = named([read_name(outside), read_name(own)], "temperature", beside="gx_dps")
+    assert [group[0].path for group in found] == [own, outside]

@@ -3,7 +3,7 @@
 import io
 import re
 import zipfile
-from datetime import datetime
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -117,6 +117,17 @@ def test_a_damaged_workbook_is_one(tmp_path, damage):
     for use in (lambda: read(Xlsx(path=path, channels=CHANNELS)), lambda: Xlsx.settings_for(path, {})):
         with pytest.raises(UnreadableFile, match=r"r\.xlsx: is cut short or damaged \(.*\); copy or record it again$"):
             use()
+
+
+@pytest.mark.parametrize("begun", [datetime(2026, 3, 28, 23, 59, 58), datetime(2026, 3, 28)])
+def test_a_midnight_among_moments_is_a_moment(tmp_path, begun):
+    """A cell of 00:00:00 comes as the day alone."""
+    rows = [[begun + timedelta(seconds=k), k] for k in range(5)]
+    path = book(tmp_path, Data=[["t", "g"], *rows])
+    found = Xlsx.settings_for(path, {})
+    assert found["dates"] == {"t": "%Y-%m-%d %H:%M:%S"}
+    got = read(Xlsx(path=path, channels=CHANNELS, dates=found["dates"]))
+    np.testing.assert_allclose(np.diff(got.t), 1)
 
 
 def test_a_date_that_is_none_is_damage(tmp_path):
