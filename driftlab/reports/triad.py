@@ -11,7 +11,7 @@ from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, band
 from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.reports.tables import TextTable
-from driftlab.triad.consistency import excess
+from driftlab.triad.consistency import excess, untested
 from driftlab.triad.estimate import SURE, TriadFit
 from driftlab.triad.model import AXES, BIAS, GRAVITY, GROUPS, NARROW, PARABOLA, SCALE, TERMS
 from driftlab.units import BiasUnit, number
@@ -63,7 +63,7 @@ def verdict(fit: TriadFit) -> list[str]:
 
 
 def untested_lines(fit: TriadFit) -> list[str]:
-    """Return a sentence where segments contradict one another, and where no curve is tested between temperatures."""
+    """Return sentences: segments that contradict one another, a curve not tested between temperatures, one rate."""
     lines = excess(fit)
     k, names = fit.temperatures, [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
     said = f"{k} temperatures: the curve between them is not tested"
@@ -73,7 +73,7 @@ def untested_lines(fit: TriadFit) -> list[str]:
         )
     if k == PARABOLA + 1 and f"order {PARABOLA}" in names:
         lines.append(f"{said} where it has order {PARABOLA}, which meets any {k} points; add a temperature between")
-    return lines
+    return [*lines, *untested(fit)]
 
 
 def unit_of(term: int, unit: BiasUnit) -> tuple[str, float]:

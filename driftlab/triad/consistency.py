@@ -23,7 +23,8 @@ FALSE_ALARM = 1e-4  # probability, of a stimulus that is steady
 HALF = 0.5  # of the fastest rate: no scale factor and no mounting is off by so much
 SPREAD = 3  # times a usual bias, by which that may differ over temperature
 FAR = 3  # times the scatter of most segments
-EXCESS = 10  # times the noise within a segment
+EXCESS = 3  # times the noise within a segment
+ALIKE = 0.05  # of a rate: others within are the same
 NORMAL = 0.6745  # median of the size of a normal variable of deviation one
 NAMED = 5  # segments that are listed
 RADIAN = 180 / np.pi
@@ -63,8 +64,24 @@ def excess(fit: TriadFit) -> list[str]:
         return []
     return [
         f"the terms leave {fit.noise[0] / max(within, TINY):.0f} times as much of the segments or placements as noise "
-        "within them makes: they contradict one another, and sigma has it in it; see that the unit has the temperature "
-        "of its thermometer when each begins (wait for longer), and that no term jumps between"
+        "within them makes: they contradict one another, which sigma counts as if it were noise, so that it may be too "
+        "small; see that the unit has the temperature of its thermometer when each begins (wait for longer), and that "
+        "no term jumps between"
+    ]
+
+
+def untested(fit: TriadFit) -> list[str]:
+    """Return a sentence where one rate alone shows the scale factor, of which a change with the rate is not seen."""
+    if not isinstance(fit.stimulus, KnownRates):
+        return []
+    rates = np.linalg.norm(fit.stimulus.u, axis=1)
+    turning = rates[rates > HALF * rates.max()]
+    slower = rates[(rates > ALIKE * rates.max()) & (rates <= HALF * rates.max())]
+    if len(slower) or np.ptp(turning) > ALIKE * rates.max():
+        return []
+    return [
+        f"scale factor is that at {turning.max() * RADIAN:.4g} deg/s: whether it is the same at other rates is not "
+        "tested; turn at half of it too"
     ]
 
 

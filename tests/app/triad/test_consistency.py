@@ -133,3 +133,17 @@ def test_a_placement_whose_times_are_late_is_in_doubt(tmp_path, late):
     data = {"time": (t, "s"), "accel": (y, "m/s^2"), "gyro": (quiet, "rad/s"), "temperature": (T, "degC")}
     doubts = driftlab.fit_map(config, data, terms=TERMS).faults.doubts
     assert [text[:45] for text in doubts] == ["1 of 54 segments or placements (8) is not ste"] * (late > 0)
+
+
+def test_a_table_of_two_rates_says_nothing_of_rates(tmp_path):
+    """Of one rate alone the verdict says that no other is tested."""
+    t, y, T, table = turntable(0, [-20.0, 0.0, 20.0, 40.0, 60.0], hold=8.0)
+    rows = rows_of(table)
+    alone = fitted(tmp_path, t, y, T, rows).verdict()
+    for k, row in enumerate(rows):
+        if k % 3 == 0:
+            own = (t >= float(row[0]) - 1e-6) & (t < float(row[1]) - 1e-6)
+            y[own] /= 2
+            row[3] = str(float(row[3]) / 2)
+    both = fitted(tmp_path, t, y, T, rows).verdict()
+    assert [any("at other rates is not tested" in line for line in lines) for lines in (alone, both)] == [True, False]
