@@ -179,7 +179,7 @@ BEGIN_AGAIN = {
 
 
 def advice_backwards(steps: Array, k: int) -> str:
-    """Return what to do where the k-th of the steps (N,) of a time, s, goes back."""
+    """Return the advice on a time of which the k-th of the steps (N,), s, goes back."""
     usual = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
     for whole, advice in BEGIN_AGAIN.items():
         if 30 * usual < whole and abs(whole + steps[k] - usual) <= 2 * usual + 1e-9 * whole:

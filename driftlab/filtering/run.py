@@ -208,6 +208,7 @@ class Run:
                 k = int(np.argmax(beyond))
                 where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} °C"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
+                how += ": how the bias goes on there is not in the sigma of the bias"
                 of = "" if len(self.maps) == 1 else f"{fitted.record.channel} "
                 what = f"updates beyond the {of}{fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) °C, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)

@@ -24,6 +24,7 @@ from driftlab.family.record import figure_name
 from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.terms import fit_terms
+from driftlab.family.thermometers import with_odd_thermometers
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
@@ -90,8 +91,7 @@ def analyse(
     ConfigError, MapError
         If the known family cannot be used for these units.
     """
-    unit = tracked_unit(config.filter)
-    records = status.sound
+    unit, records = tracked_unit(config.filter), status.sound
     if known is None:
         family, common, apart, why = _fitted(units, status, progress)
     else:
@@ -119,8 +119,9 @@ def analyse(
         *about, *_judged_by(family, len(units), known), *outliers.remarks,
         *([] if known else _frozen_after_changes(line)),
     ]  # fmt: skip
+    odd |= with_odd_thermometers(outliers.odd, line.units, line.domains, before)
     judged = outliers.laws is not None and bool(outliers.laws.curves)
-    return FamilyAnalysis(family, common, {**odd, **outliers.odd}, line, lines, tuple(lots), judged)
+    return FamilyAnalysis(family, common, odd, line, lines, tuple(lots), judged)
 
 
 def _doubted(

@@ -76,7 +76,7 @@ class Blocks:
         return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
-        """Return which share of each of `count` groups is in each block (count, K), sparse; `group` (N,) of samples."""
+        """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples."""
         from scipy.sparse import csr_array
 
         K = len(self.T)

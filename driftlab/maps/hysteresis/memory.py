@@ -148,7 +148,7 @@ def _unseen(soak: SoakSummary) -> str:
 
 
 def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
-    """Return where up and down differ in one cell of temperature by more than beside it, as WHY has it; None: nowhere.
+    """Return the cell of temperature in which up and down differ by more than beside it, as WHY has it; None: no cell.
 
     Blocks of a soak are too wide for it. Differences of cells are as unsure as their samples' white noise and a robust
     deviation of all cells say. One recording alone is looked at: several have levels of their own.
