@@ -30,7 +30,7 @@ from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import Sheet, map_facts, sheet_of
 from driftlab.storage.json import plain
 from driftlab.storage.map_file import check_all, save, write_beside
-from driftlab.triad.consistency import contradictions, unsteady
+from driftlab.triad.consistency import contradictions, excess, unsteady
 from driftlab.triad.estimate import TriadFit
 from driftlab.triad.fit import fit_triad
 from driftlab.triad.model import BIAS, GROUPS, SENSITIVITIES, TERMS
@@ -235,7 +235,7 @@ def fit_triad_map(
         gathered.stimulus, settings, size, _wanted(names),
         None if walk is None else float(np.max(walk)), None if law is None else law.prior(),
     )  # fmt: skip
-    for text in [*contradictions(gathered.stimulus, size), *unsteady(fit, gathered.sensor.unit)]:
+    for text in [*contradictions(gathered.stimulus, size), *unsteady(fit, gathered.sensor.unit)] or excess(fit)[0]:
         faults.doubt(text)
     fit = fit if known is None else fit.without_bias()
     fitted = _map_of(own, gathered, fit, settings, known, recordings, faults.doubts)

@@ -68,7 +68,7 @@ class Outlier:
     ----------
     unit : str
     what : str
-        DOUBT; of a curve `sign`, `swap`, `scale`, `level` or `shape`; or one of `outlier_tests.FIGURES`.
+        DOUBT; `thermometer`; of a curve `sign`, `swap`, `scale`, `level` or `shape`; or one of `outlier_tests.FIGURES`.
     axis : str
     p : float
         Chance of a value as far out among units of the family.

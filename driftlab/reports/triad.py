@@ -64,7 +64,7 @@ def verdict(fit: TriadFit) -> list[str]:
 
 def untested_lines(fit: TriadFit) -> list[str]:
     """Return sentences: segments that contradict one another, a curve not tested between temperatures, one rate."""
-    lines = excess(fit)
+    lines = excess(fit)[1]
     k, names = fit.temperatures, [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
     said = f"{k} temperatures: the curve between them is not tested"
     if k == PARABOLA and names and "family" not in names:

@@ -23,7 +23,7 @@ FALSE_ALARM = 1e-4  # probability, of a stimulus that is steady
 HALF = 0.5  # of the fastest rate: no scale factor and no mounting is off by so much
 SPREAD = 3  # times a usual bias, by which that may differ over temperature
 FAR = 3  # times the scatter of most segments
-EXCESS = 3  # times the noise within a segment
+EXCESS, CONTRADICTED = 3, 10  # times the noise within a segment: worth a word, and a doubt
 ALIKE = 0.05  # of a rate: others within are the same
 NORMAL = 0.6745  # median of the size of a normal variable of deviation one
 NAMED = 5  # segments that are listed
@@ -55,19 +55,18 @@ def unsteady(fit: TriadFit, unit: str) -> list[str]:
     ]
 
 
-def excess(fit: TriadFit) -> list[str]:
-    """Return a sentence where segments differ from one another by far more than each does within itself."""
+def excess(fit: TriadFit) -> tuple[list[str], list[str]]:
+    """Return doubts, and sentences, where segments differ from one another by far more than each within itself."""
     if fit.stimulus.parts is None:
-        return []
+        return [], []
     within = float(np.median(np.abs(_differences(fit, fit.stimulus.parts)[0]))) / NORMAL / np.sqrt(16 / 3)
-    if fit.noise[0] <= EXCESS * within:
-        return []
-    return [
-        f"the terms leave {fit.noise[0] / max(within, TINY):.0f} times as much of the segments or placements as noise "
-        "within them makes: they contradict one another, which sigma counts as if it were noise, so that it may be too "
-        "small; see that the unit has the temperature of its thermometer when each begins (wait for longer), and that "
-        "no term jumps between"
-    ]
+    times = fit.noise[0] / max(within, TINY)
+    said = (
+        f"the terms leave {times:.0f} times as much of the segments or placements as noise within them makes: they "
+        "contradict one another, which sigma counts as if it were noise, so that it may be too small; see that the "
+        "unit has the temperature of its thermometer when each begins (wait for longer), and that no term jumps between"
+    )
+    return [said] if times > CONTRADICTED else [], [said] if EXCESS < times <= CONTRADICTED else []
 
 
 def untested(fit: TriadFit) -> list[str]:
