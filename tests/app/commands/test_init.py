@@ -567,3 +567,12 @@ def test_an_axis_with_far_less_noise_than_the_others_is_a_problem(tmp_path, fact
     quiet = [text for text in done.problems if "less noise than the others" in text]
     assert len(quiet) == problems
     assert all(text.startswith(("gyro y has 1,0", "gyro y has 9")) for text in quiet)
+
+
+def test_a_counter_that_begins_again_is_a_problem_with_its_remedy(tmp_path):
+    """In ms and of 32 bits, after 200 s: no sorting puts that in order."""
+    counted = (2**32 - 200_000 + np.round(1000 * (UNIT.t - UNIT.t[0]))) % 2**32
+    rows = {name: values for name, values in table(LOGS["short"]).items() if name != "t"}
+    done = written(tmp_path, {"t_ms": counted, **rows})
+    assert "time: {path: t_ms, unit: ms}" in done.text
+    assert "after the first row: its counter of 32 bits began again: add 4,294,967,296 ms" in done.problems[0]
