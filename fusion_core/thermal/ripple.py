@@ -64,14 +64,18 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
             continue
         total, scatter = products.sum(axis=0), np.sqrt(np.sum(products**2, axis=0))
         for axis in range(left.shape[1]):
-            candidates = [_dip(ways[:, inner, axis], noise[:, inner], where[inner], cell)]
+            dip, seen = _dip(ways[:, inner, axis], noise[:, inner], where[inner], cell), None
             if total[axis] > least * scatter[axis]:
                 rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
                 most = float(where[third][int(np.argmax(products[:, axis]))])
-                candidates.append(Ripple(float(rms), float(chance), most, cell))
-            known = [one for one in (found[axis], *candidates) if one is not None]
-            found[axis] = max(known, key=lambda one: one.rms, default=None)
+                seen = Ripple(float(rms), float(chance), most, cell)
+            # what repeats from cell to cell is everywhere, and a dip is not
+            found[axis] = max((one for one in (found[axis], dip, seen) if one is not None), key=_rank, default=None)
     return found
+
+
+def _rank(one: Ripple) -> tuple[bool, float]:
+    return not one.dip, one.rms
 
 
 def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Array, Integers]:
