@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3916
+    assert 0 < count <= 3918
 
 
 def imports():
@@ -263,7 +263,7 @@ BUDGET = {
     "driftlab/filtering": 1260,
     "driftlab/identification": 2254,
     "driftlab/live": 844,
-    "driftlab/maps": 1842,
+    "driftlab/maps": 1843,
     "driftlab/noise": 1253,
     "driftlab/planning": 1222,
     "driftlab/production": 3192,
@@ -272,7 +272,7 @@ BUDGET = {
     "driftlab/reports": 3539,
     "driftlab/soak": 693,
     "driftlab/spc": 1542,
-    "driftlab/starter": 888,
+    "driftlab/starter": 890,
     "driftlab/storage": 1275,
     "driftlab/triad": 712,
     "fusion_core": 1907,
@@ -280,7 +280,7 @@ BUDGET = {
     "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1204,
+    "fusion_core/thermal": 1205,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 246,
@@ -288,7 +288,7 @@ BUDGET = {
     "plugins/exporters": 1720,
     "plugins/framings": 625,
     "plugins/measurement_models": 733,
-    "plugins/sources": 5335,
+    "plugins/sources": 5341,
     "plugins/stimuli": 298,
     "plugins/thermal_maps": 886,
 }

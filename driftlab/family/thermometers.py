@@ -16,7 +16,7 @@ from fusion_core.chunk import Array
 
 THERMOMETER = "thermometer"
 MIN_UNITS = 8  # that say which program most go through
-NEAR = 1.0  # K, at least: ends that are as far apart are the same
+NEAR, ALONE = 1.0, 5.0  # K, at least: ends as far apart are the same; of too few units to show how the line's scatter
 FAR = 6.0  # times the robust deviation of the line's ends
 
 
@@ -41,7 +41,7 @@ def with_odd_thermometers(
         return dict(odd)
     ends = np.median(some, axis=0) if known is None else np.array(known)
     spread = 1.4826 * np.median(np.abs(some - np.median(some, axis=0)), axis=0) if len(some) >= MIN_UNITS else 0.0
-    near = np.maximum(FAR * spread, NEAR)
+    near = np.maximum(FAR * spread, NEAR if len(some) >= MIN_UNITS else ALONE) * np.ones(2)
     found = dict(odd)
     for k in np.flatnonzero(np.any(np.abs(domains - ends) > near, axis=1)).tolist():
         low, high = own = domains[k]

@@ -13,13 +13,13 @@ from itertools import takewhile
 from fusion_core.contracts import USUAL
 from fusion_core.units import same_dimension
 
-WORDS = {  # of a name with words of two quantities, as `gyro_temp`, the first here is meant
-    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient",
-                    "temperatur"},
+WORDS = {
     "gyro": {"gyr", "gyro", "gyros", "gyroscope", "gyroscopes", "omega", "rate", "rates", "rot", "ars", "angvel",
              "angularvelocity", "angularrate", "rateofturn", "rotationrate", "drehrate"},
     "accel": {"acc", "accl", "accel", "accels", "accelerometer", "accelerometers", "acceleration", "specificforce",
               "linearacceleration", "beschleunigung"},
+    "temperature": {"temp", "temperature", "temperatures", "tmp", "thermistor", "oven", "chamber", "ambient",
+                    "temperatur"},
     "time": {"time", "timestamp", "stamp", "sec", "secs", "seconds", "epoch", "utc", "ts", "elapsed", "tow", "micros",
              "millis", "date", "datetime", "zeit", "datum", "xvalue"},
 }  # fmt: skip
@@ -190,6 +190,8 @@ def _quantity(words: Sequence[str], *, axis: bool) -> str | None:
     if not words or NO_SENSOR & set(words):
         return None
     ends = {"".join(words[k:]) for k in range(len(words))}
+    if not axis and words[-1] in WORDS["temperature"]:  # of a sensor, as `gyro_temp`
+        return "temperature"
     spoken = (quantity for quantity, known in WORDS.items() if known & (set(words) | ends))
     lettered = (q for word in (words[-1], words[0]) for q, letters in LETTERS.items() if axis and word in letters)
     return next(spoken, None) or next(lettered, None) or ("time" if list(words) == ["t"] else None)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftlab.triad.estimate import TINY, TriadFit
-from driftlab.triad.model import AXES
+from driftlab.triad.model import AXES, SCALE
 from fusion_core.chunk import Array
 from fusion_core.contracts import KnownRates, TriadInput
 
@@ -71,7 +71,7 @@ def excess(fit: TriadFit) -> tuple[list[str], list[str]]:
 
 def untested(fit: TriadFit) -> list[str]:
     """Return a sentence where one rate alone shows the scale factor, of which a change with the rate is not seen."""
-    if not isinstance(fit.stimulus, KnownRates):
+    if not isinstance(fit.stimulus, KnownRates) or not np.any(fit.observable[list(SCALE)]):
         return []
     rates = np.linalg.norm(fit.stimulus.u, axis=1)
     turning = rates[rates > HALF * rates.max()]

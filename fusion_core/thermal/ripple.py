@@ -104,6 +104,7 @@ def _dip(ways: Array, noise: Array, where: Array, cell: float) -> Ripple | None:
     if np.sum(passed) < TRIPLES:
         return None
     ways, noise, where = ways[:, passed], noise[:, passed], where[passed]
+    noise = np.maximum(noise, np.median(noise) ** 2 / noise)  # white noise falls with the time in a cell, a walk grows
     z = ways / noise
     usual = 1.4826 * np.median(np.abs(z), axis=1)[:, None]
     beyond = np.min(np.abs(z) / np.maximum(usual, np.finfo(float).tiny), axis=0) * (ways[0] * ways[1] > 0)

@@ -12,7 +12,8 @@ import lzma
 import re
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import date, datetime, time, timedelta
 from itertools import islice
@@ -78,7 +79,7 @@ class Xlsx(Csv):
                 f"{path}: has no sheet '{self.sheet}', it has {', '.join(names)}; correct source.sheet"
             )
         sheet = _sheet(path, book, self.sheet or names[0])
-        moments = {k for row in islice(_rows(path, sheet), LOOKED_AT) for k, cell in enumerate(row) if _is_moment(cell)}
+        moments = _moments(islice(_rows(path, sheet), LOOKED_AT))
         with stream_of(path, ("\t".join(_texts(row, moments)) + "\n" for row in _rows(path, sheet))) as text:
             yield text
 
@@ -179,14 +180,20 @@ def _check_places(path: Path, part: str, content: bytes) -> None:
     check_size(path, what, CELL * max(height * width, count), 2 * PIECE)
 
 
-def _is_moment(cell: Any) -> bool:
-    return isinstance(cell, datetime)
+def _moments(rows: Iterable[list[Any]]) -> set[int]:
+    """Return the columns of moments: of their days most have a time, and a midnight has none."""
+    more = Counter[int]()
+    for row in rows:
+        for k, cell in enumerate(row):
+            if isinstance(cell, date):
+                more[k] += 1 if isinstance(cell, datetime) else -1
+    return {k for k, count in more.items() if count > 0}
 
 
 def _texts(row: list[Any], moments: Collection[int]) -> Iterator[str]:
     """Yield the cells of a row as texts; a day in a column of `moments` is its midnight, as which it comes."""
     for k, cell in enumerate(row):
-        midnight = k in moments and isinstance(cell, date) and not _is_moment(cell)
+        midnight = k in moments and isinstance(cell, date) and not isinstance(cell, datetime)
         yield _text(datetime.combine(cell, time()) if midnight else cell)
 
 

@@ -163,7 +163,8 @@ def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
     off = difference[BESIDE:-BESIDE] - np.median(sliding_window_view(difference, len(own), axis=0)[..., own], axis=2)
     white = (1 / n[both] + 1 / below_n[both])[BESIDE:-BESIDE, None] * soak.white**2
     usual = np.median(off**2, axis=0) / 0.455  # of chi-square with one degree of freedom
-    sigma = np.sqrt(white + np.maximum(usual - np.median(white, axis=0), 0.0))
+    long = (n + below_n)[both][BESIDE:-BESIDE, None]  # in a cell: a walk grows with it
+    sigma = np.sqrt(white + np.maximum(usual - np.median(white, axis=0), 0.0) * np.maximum(long / np.median(long), 1.0))
     beyond = np.abs(off) / np.maximum(sigma, np.finfo(float).tiny)
     cell, axis = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
     if not beyond[cell, axis] > NARROW:

@@ -47,3 +47,10 @@ def test_one_new_unit_is_held_against_its_family():
     assert set(with_odd_thermometers({}, ["new"], np.array([[-4.0, 140.0]]), FAMILY)) == {"new"}
     assert with_odd_thermometers({}, ["new"], np.array([[-4.0, 140.0]])) == {}, "one unit alone says nothing"
     assert with_odd_thermometers({}, ["new"], np.array([[np.nan, np.nan]]), FAMILY) == {}
+
+
+def test_one_unit_is_not_held_to_what_many_scatter_by():
+    """Of units whose thermometers scatter by 1.5 K, each alone against its family."""
+    rng = np.random.default_rng(1)
+    domains = np.array([-20.0, 60.0]) + 1.5 * rng.normal(size=(100, 1))
+    assert sum(bool(with_odd_thermometers({}, ["one"], own[None], FAMILY)) for own in domains) <= 1

@@ -130,6 +130,12 @@ def test_a_midnight_among_moments_is_a_moment(tmp_path, begun):
     np.testing.assert_allclose(np.diff(got.t), 1)
 
 
+def test_a_moment_above_a_column_of_days_leaves_them_days(tmp_path):
+    rows = [[k, datetime(2026, 3, 28), f"10:00:0{k}", k] for k in range(5)]
+    path = book(tmp_path, Data=[["Exported", datetime(2026, 4, 1, 10, 30)], ["n", "day", "clock", "g"], *rows])
+    assert Xlsx.settings_for(path, {})["dates"] == {"day + clock": "%Y-%m-%d %H:%M:%S"}
+
+
 def test_a_date_that_is_none_is_damage(tmp_path):
     path = book(tmp_path, Data=[["t", "g"], [datetime(2026, 1, 1), 0]])
     changed(path, SHEET, lambda data: re.sub(rb'(s="1"><v>)[^<]*', rb"\g<1>-1e300", data))
