@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.family.partitions import by_lot
 from driftlab.family.record import figure_name
 from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, numbers, without_spikes
 from driftlab.spc.capability import D2, Capability
@@ -274,11 +275,10 @@ def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> 
 
     `out` is where the lot's mean is beyond the limits of the line.
     """
-    low, high = span
-    factor, names, of_units = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at], chart.value
-    boxes = {}
+    (low, high), members = span, by_lot(line.lots[k] for k in chart.at.tolist())
+    factor, of_units, boxes = line.shown(chart.quantity).factor, chart.value, dict[str, dict[str, Any]]()
     for lot in chart.lots:
-        values = np.percentile(of_units[names == lot.name], SHARES)
+        values = np.percentile(of_units[members[lot.name]], SHARES)
         places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
         places = dict(zip(("low", "quarter", "half", "most", "high"), places, strict=True))
         boxes[lot.name] = {"n": lot.n, "text": number(values[2] * factor, zeros=True), "out": lot.out, **places}

@@ -137,7 +137,7 @@ def jacobian(theta: Array, h: int, x: Array) -> Array:
     np.multiply(1 - hidden_1**2, of_a_2 @ network[1][0].T, out=of_a_1)
     np.multiply(x[:, None], of_a_1, out=of_W_1)
     of_W_2[:] = (hidden_1[:, :, None] * of_a_2[:, None, :]).reshape(len(x), h * h)
-    return np.asarray(J)
+    return J
 
 
 Linear = Callable[[Array], tuple[Array, Array]]  # theta (p,) to r (m,) and its derivative J (m, p)

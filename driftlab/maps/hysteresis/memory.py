@@ -193,7 +193,6 @@ class _MemoryTest:
         seen = total > SEEN
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.bias, axis=0)
-        narrow = _narrow(self.contrasts.soak)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         sized = self if total <= HINT else self._following()
         noise = np.argmax(self.evidence.noises, axis=0)
@@ -203,15 +202,16 @@ class _MemoryTest:
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
             why = "slight"
-        if why != "seen" and narrow is not None:
-            why = "narrow"
+        narrow = None if why == "seen" else _narrow(self.contrasts.soak)
+        why = "narrow" if narrow is not None else why
         if why in ("brief", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        said = WHY[why] if narrow is None else WHY[why].format(**narrow)
-        reason = "; ".join([said, *(f"could not be tried: {text}" for text in self.shapes.broken)])
+        reason = "; ".join(
+            [WHY[why].format(**narrow or {}), *(f"could not be tried: {text}" for text in self.shapes.broken)]
+        )
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
         return MemoryVerdict(
