@@ -1,10 +1,11 @@
 """Memories in one soak, judged on soaks that share no code with the judgement: power, false alarms, sizes, X.
 
-    python benchmarks/memory_in_one_soak.py --nulls 600 --planted 600 --seed 0 --out soaks.jsonl
+    python benchmarks/memory_in_one_soak.py --nulls 600 --planted 600 --settling 200 --seed 0 --out soaks.jsonl
     python benchmarks/memory_in_one_soak.py --table soaks.jsonl ...
 
 Soaks are drawn at random from the whole design of `foreign_soaks`: memories, profiles, 2 to 12 h, three slow noises,
-sizes of 4 to 48 deg/h. Counts stand with 95 % limits of Clopper and Pearson, Biometrika 26 (1934) 404.
+sizes of 4 to 48 deg/h. Others have no memory, and settle with the time since they were switched on, in shapes that no
+effect has. Counts stand with 95 % limits of Clopper and Pearson, Biometrika 26 (1934) 404.
 """
 
 from __future__ import annotations
@@ -26,11 +27,17 @@ HOURS = (2.0, 4.0, 6.0, 8.0, 12.0)
 SLOW = ("walk", "flicker", "gauss_markov")
 TOLD = 15.0  # nats of the likelihood that knows the truth
 ROWS = 5.0  # s
+SETTLING: tuple[Callable[[np.ndarray], np.ndarray], ...] = (  # of the hours
+    lambda h: 1 - np.log1p(h / 0.05) / np.log1p(h[-1] / 0.05),
+    lambda h: 1 / (1 + h / 0.3),
+    lambda h: 1 - np.sqrt(h / h[-1]),
+    lambda h: (np.exp(-h / 0.1) + np.exp(-h / 0.8)) / 2,
+)
 
 
-def one(seed: int, *, planted: bool) -> dict[str, Any] | None:
-    """Draw one soak and judge it; None where its profile does not tell this memory."""
-    rng = np.random.default_rng([seed, 99])
+def one(seed: int, what: str) -> dict[str, Any] | None:
+    """Draw one soak of nulls, planted or settling, and judge it; None where its profile does not tell this memory."""
+    rng, planted = np.random.default_rng([seed, 99]), what == "planted"
     memory = str(rng.choice(foreign.MEMORIES)) if planted else "none"
     profile, hours, slow = str(rng.choice(foreign.PROFILES)), float(rng.choice(HOURS)), str(rng.choice(SLOW))
     size = float(np.exp(rng.uniform(*np.log([4.0, 48.0])))) * foreign.DEG_H
@@ -39,7 +46,11 @@ def one(seed: int, *, planted: bool) -> dict[str, Any] | None:
     except ValueError:
         return None
     told, fitted = (foreign.truth_gain(soak), foreign.truth_gain(soak, fitted=True)) if planted else (0.0, 0.0)
-    found = memory_of(brief(soak.T, soak.bias, [0], soak.interval))
+    bias = soak.bias
+    if what == "settling":
+        settled = SETTLING[rng.integers(len(SETTLING))](np.arange(len(soak.T)) * soak.interval / 3600)
+        bias, memory = bias + np.outer(settled, size * rng.uniform(-1, 1, size=bias.shape[1])), what
+    found = memory_of(brief(soak.T, bias, [0], soak.interval))
     names = ("size", "sigma", "none_larger_than")
     numbers = {name: (getattr(found, name) / foreign.DEG_H).tolist() for name in names}
     about = {"seed": seed, "memory": memory, "profile": profile, "hours": hours, "slow": slow}
@@ -58,13 +69,15 @@ def share(count: int, of: int) -> str:
 
 def table(rows: list[dict[str, Any]]) -> None:
     """Print power, false alarms, coverage of sizes, and whether X holds."""
-    nulls, planted = ([row for row in rows if (row["memory"] == "none") == none] for none in (True, False))
+    nulls, settling = ([row for row in rows if row["memory"] == name] for name in ("none", "settling"))
+    planted = [row for row in rows if row["memory"] not in ("none", "settling")]
     strong = [row for row in planted if row["told"] >= TOLD]
 
     def answers(which: list[dict[str, Any]], answer: str) -> str:
         return share(sum(row["answer"] == answer for row in which), len(which))
 
     print("nothing planted: seen", answers(nulls, "seen"), "| undecided", answers(nulls, "undecided"))
+    print("settling: seen", answers(settling, "seen"), "| undecided", answers(settling, "undecided"))
     print(f"told at least {TOLD:g} nats: seen", answers(strong, "seen"), "| denied", answers(strong, "none"))
     fair = [row for row in planted if row["fitted"] >= TOLD]
     print(f"  the same, its noise and law fitted: seen {answers(fair, 'seen')} | denied {answers(fair, 'none')}")
@@ -106,6 +119,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nulls", type=int, default=200)
     parser.add_argument("--planted", type=int, default=200)
+    parser.add_argument("--settling", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--table", type=Path, nargs="*", help="print the table of files that are there")
@@ -114,11 +128,11 @@ def main() -> None:
     if asked.table:
         rows = [json.loads(line) for path in asked.table for line in path.read_text().splitlines()]
     else:
-        jobs = [(asked.seed * 1_000_000 + k, False) for k in range(asked.nulls)]
-        jobs += [(asked.seed * 1_000_000 + 500_000 + k, True) for k in range(asked.planted)]
+        counts = {"nulls": asked.nulls, "planted": asked.planted, "settling": asked.settling}
+        first = {"nulls": 0, "planted": 500_000, "settling": 900_000}
+        jobs = [(asked.seed * 1_000_000 + first[what] + k, what) for what in counts for k in range(counts[what])]
         for k in np.random.default_rng(asked.seed).permutation(len(jobs)):
-            seed, planted = jobs[k]
-            row = one(seed, planted=planted)
+            row = one(*jobs[k])
             if row is not None:
                 rows.append(row)
                 if asked.out:

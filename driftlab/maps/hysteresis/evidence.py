@@ -192,6 +192,14 @@ class ShapeEvidence:
         whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(none[self._thin])
         return float(np.max(np.sum(np.maximum(each, whole), axis=1)))
 
+    def alone(self, which: NDArray[np.bool_]) -> float:
+        """Return the log evidence of one or two of some shapes (J,) alone, of which none is likelier than another."""
+        if not np.any(which):
+            return 0.0
+        both = which[self._both].all(axis=0)
+        each = [self.of_shapes[which], *([self.pairs[1][both]] if np.any(both) else [])]
+        return max(float(log_mean(logs)) for logs in each)
+
     @cached_property
     def left(self) -> Array:
         """Squares Q that are left (R, d): with the likeliest shape, or two, where a memory is seen; NaN: not tried."""

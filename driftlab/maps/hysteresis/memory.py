@@ -36,6 +36,8 @@ WHY = {
     "down again, by the same steps",
     "brief": "up and down differ as where the sensor follows its thermometer by less than a minute, which may be their "
     "places or when they are read: whether it remembers more is not known; go up and down faster, and slower",
+    "settles": "up and down differ as where the bias settles after the start, whatever the temperature: whether it "
+    "remembers more is not known; let it settle before the soak, or leave the first hours out with PATH::START:STOP",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
     "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
@@ -199,12 +201,15 @@ class _MemoryTest:
         pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
         brief = self.evidence.as_they_are(self.shapes.brief)
-        why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
+        settles = self.evidence.alone(self.shapes.settling)
+        why = "seen" if seen else "hint" if total > HINT else "none"
+        if seen and total - max(brief, settles) < SEEN:
+            why = "brief" if brief > settles else "settles"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
             why = "slight"
         narrow = None if why == "seen" else _narrow(self.contrasts.soak)
         why = "narrow" if narrow is not None else why
-        if why in ("brief", "slight", "narrow"):
+        if why in ("brief", "settles", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"

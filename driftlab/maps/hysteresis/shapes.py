@@ -45,6 +45,7 @@ class MemoryShapes:
     # (J,): which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
     # after the sensor, or stands beside it
     brief: NDArray[np.bool_]
+    settling: NDArray[np.bool_]  # (J,): which run with the time alone, as what settles after it was switched on
     broken: tuple[str, ...] = ()  # effects that could not be tried, and why
 
 
@@ -54,7 +55,7 @@ def shapes_of(soak: SoakSummary) -> MemoryShapes:
     added: list[tuple[str, Array]] = []
     inputs: list[tuple[str, Array]] = []
     spans: list[float] = []
-    broken = []
+    settling, broken = [], []
     for kind, cls in registry().classes(Effect).items():
         assert issubclass(cls, Effect)
         try:
@@ -65,6 +66,8 @@ def shapes_of(soak: SoakSummary) -> MemoryShapes:
         except ValueError as error:  # of a validation: settings without a default
             broken.append(f"{kind}: {str(error).splitlines()[0]}")
             continue
+        if cls(axes=("x",)).walks:  # type: ignore[call-arg]
+            settling.append(kind)
         if acting:
             inputs.extend((kind, column) for column in columns)
             spans += own
@@ -74,12 +77,13 @@ def shapes_of(soak: SoakSummary) -> MemoryShapes:
             if cls.unit == BEHIND and np.isinf(own[0]):
                 inputs.extend((kind, soak.T + column) for column in columns[-len(own) :: 2])
                 spans += own[::2]
-    S = len(soak.T)
+    S, kinds = len(soak.T), tuple(kind for kind, _ in (*added, *inputs))
     return MemoryShapes(
-        tuple(kind for kind, _ in (*added, *inputs)),
+        kinds,
         np.array([column for _, column in added]).reshape(-1, S).T,
         np.array([column for _, column in inputs]).reshape(-1, S).T,
         np.concatenate([np.zeros(len(added), dtype=bool), np.array(spans) < MINUTE]),
+        np.isin(kinds, settling),
         tuple(broken),
     )
 
@@ -88,10 +92,11 @@ def _offered(
     cls: type[Effect], forward: Sequence[Chunk], backward: Sequence[Chunk], way: Array
 ) -> tuple[list[Array], bool, list[float]]:
     """Return the proposals of a class on the slots, whether they act on the curve's input, and their spans in s."""
-    grid = [e for e in cls(axes=("x",)).proposals(forward) if tuple(e.requires) == (SUBJECT,)]  # type: ignore[call-arg]
+    grid = [e for e in cls(axes=("x",)).proposals(forward) if _may_open(e)]  # type: ignore[call-arg]
     if not grid:
         return [], False, []
-    acting, timeless = grid[0].acts_on_input, grid[0].memory_span is None and len(cls.continuous) == 1
+    acting = grid[0].acts_on_input
+    timeless = not grid[0].walks and grid[0].memory_span is None and len(cls.continuous) == 1
     if not remembers(_shown(grid[0], forward), _shown(grid[0], backward)):
         return [], acting, []  # whatever its hyper-parameters
     if timeless and not acting:
@@ -100,6 +105,14 @@ def _offered(
     columns = [column for effect in grid for column in np.vstack(_shown(effect, forward)).T]
     spans = [np.inf if effect.memory_span is None else effect.memory_span for effect in grid]
     return [way, np.sign(columns[0]), *columns] if timeless and not acting else columns, acting, spans
+
+
+def _may_open(effect: Effect) -> bool:
+    """Return True if what an effect shows may differ between up and down: of temperature, or what settles with time.
+
+    A steady drift is one of the laws of the slow noise.
+    """
+    return tuple(effect.requires) == (SUBJECT,) or (effect.walks and bool(effect.continuous))
 
 
 def remembers(forward: Sequence[Array], backward: Sequence[Array]) -> bool:
