@@ -65,14 +65,17 @@ def verdict(fit: TriadFit) -> list[str]:
 def untested_lines(fit: TriadFit) -> list[str]:
     """Return sentences: segments that contradict one another, a curve not tested between temperatures, one rate."""
     lines = excess(fit)[1]
-    k, names = fit.temperatures, [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
+    k, names = len(fit.temperatures), [c.name for c, own in zip(fit.terms.curves, fit.observable, strict=True) if own]
     said = f"{k} temperatures: the curve between them is not tested"
     if k == PARABOLA and names and "family" not in names:
         lines.append(
             f"{said}; a curvature of usual size (1 %, 10 mrad) counts in sigma there, add a temperature between"
         )
-    if k == PARABOLA + 1 and f"order {PARABOLA}" in names:
-        lines.append(f"{said} where it has order {PARABOLA}, which meets any {k} points; add a temperature between")
+    if k > PARABOLA and f"order {k - 1}" in names:
+        lines.append(
+            f"{said} where it has order {k - 1}, which meets any {k} points; what a term of usual size may do between "
+            "counts in sigma there, add a temperature between"
+        )
     return [*lines, *untested(fit)]
 
 

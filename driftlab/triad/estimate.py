@@ -119,20 +119,26 @@ class TriadFit:
         return np.concatenate([np.stack(parts, axis=2).transpose(1, 0, 2), self._untested_modes(T)])
 
     @cached_property
-    def temperatures(self) -> int:
-        """Number of temperatures of the stimulus that are apart."""
+    def temperatures(self) -> Array:
+        """The temperatures (k,) of the stimulus that are apart."""
         return distinct(self.stimulus.T)
 
     def _untested_modes(self, T: Array) -> Array:
-        """Return the modes (q, N, q) of terms between two temperatures, or about a single one, where nothing is seen.
+        """Return the modes (q, N, q) of terms between temperatures that any of their curves meets, where none is seen.
 
-        In the middle between two a term is off a straight line by its usual size, and moves by it over SPAN.
+        About a single one a term moves by its usual size over SPAN, and in the middle between two it is off a straight
+        line by it. Between more it is a Gaussian process of its usual size, alike over SPAN, given what it is there.
         """
-        low, high = self.domain
+        (low, high), seen = self.domain, self.temperatures
         x = T - (low + high) / 2
-        shape = x / SPAN if self.temperatures == 1 else np.clip(1 - (2 * x / (high - low)) ** 2, 0, 1)
+        shape = x / SPAN if len(seen) == 1 else np.clip(1 - (2 * x / (high - low)) ** 2, 0, 1)
+        if len(seen) > PARABOLA:
+            given, there = (np.exp(-(((a[:, None] - seen) / SPAN) ** 2) / 2) for a in (T, seen))
+            known = np.sum(given * np.linalg.lstsq(there, given.T, rcond=None)[0].T, axis=1)
+            shape = np.sign(np.prod(T[:, None] - seen, axis=1)) * np.sqrt(np.clip(1 - known, 0, None))
         lawless = np.array([curve.precision is None for curve in self.design])
-        sizes = self.usual * (self.observable & lawless) * (self.temperatures <= PARABOLA)
+        meets = np.array([curve.q >= len(seen) for curve in self.design]) | (len(seen) <= PARABOLA)
+        sizes = self.usual * (self.observable & lawless & meets)
         return np.asarray(shape[None, :, None] * np.diag(sizes)[:, None, :])
 
     def sigma(self, T: Array) -> Array:

@@ -111,7 +111,7 @@ def fit_triad(
     wanted = np.ones(len(TERMS), dtype=bool) if wanted is None else wanted
     free = np.concatenate([stimulus.free, np.ones(len(wanted) - len(TERMS), dtype=bool)]) & wanted
     usual = np.array([bias_size] * 3 + [0.01] * 9 + [USUAL_SENSITIVITY] * 9)[: len(free)]
-    curves = [curves_of(settings, domain, distinct(T))] * len(free)
+    curves = [curves_of(settings, domain, len(distinct(T)))] * len(free)
     if prior is not None:
         curves[len(BIAS) : len(TERMS)] = [[curve] for curve in prior.curves()]
     search = _Search(stimulus, curves, usual, free, walk)

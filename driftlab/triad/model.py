@@ -87,13 +87,13 @@ class TermPrior:
         return [TermCurve("family", values, flat, mean, precision) for mean, precision in laws]
 
 
-def distinct(T: Array) -> int:
-    """Return the number of temperatures among T (m,) that are apart: by NARROW, and by a tenth of the range."""
-    count, last, apart = 0, -np.inf, max(NARROW, float(np.ptp(T)) / 10)
+def distinct(T: Array) -> Array:
+    """Return the temperatures (k,) among T (m,) that are apart: by NARROW, and by a tenth of the range."""
+    found: list[float] = []
     for value in np.sort(T):
-        if value - last > apart:
-            count, last = count + 1, float(value)
-    return count
+        if not found or value - found[-1] > max(NARROW, float(np.ptp(T)) / 10):
+            found.append(float(value))
+    return np.array(found)
 
 
 def curves_of(settings: ThermalMap, domain: tuple[float, float], temperatures: int) -> list[TermCurve]:

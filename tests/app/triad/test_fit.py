@@ -290,6 +290,12 @@ def test_three_temperatures_have_no_curve_that_meets_more_and_say_so():
     fit = fit_triad(KnownRates(whole.u, whole.y, T, whole.times), POLYNOMIAL, 0.02)
     assert {curve.name for curve in fit.terms.curves} <= {"constant", "order 1", "order 2"}
     assert "3 temperatures: the curve between them is not tested where it has order 2" in untested_lines(fit)[0]
+    meets = np.array([curve.name == "order 2" for curve in fit.terms.curves])
+    between = fit.parts(np.array([0.0, 20.0]))["temperatures"]
+    np.testing.assert_allclose(between[:, ~meets], 0)
+    # of a Gaussian process of length 60 K, known at -20, 20 and 60, 4.31 % of its size is open at 0 degC
+    np.testing.assert_allclose(between[0, meets], 0.0431 * fit.usual[meets], rtol=0.02)
+    np.testing.assert_array_less(between[1, meets], 0.002 * fit.usual[meets])
     five = fit_triad(known_rates(), POLYNOMIAL, 0.02)
     (alone,) = untested_lines(five)
     assert alone == (
