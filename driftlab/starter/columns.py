@@ -241,6 +241,7 @@ def _seconds(time: GuessedChannel | None) -> Array | None:
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
 DAYS = {25569.0: "as Excel counts", 719529.0: "as MATLAB counts"}  # numbers of 1970-01-01 among days
 DAY = 86_400.0  # s
+SLOWEST = 5.0  # s, of days: 6e-5 of them, which no clock in seconds has for a step
 FALLS = 0.01  # of the steps of a time, where a clock was set
 RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
 TICKS = "SampleTimeFine"  # of Xsens: in us where its steps are those of a slow device
@@ -271,7 +272,7 @@ def of_time(t: Array, swing: float = 0.0) -> Guess:
         if len(finite) and YEARS[0] < finite[0] * factor < YEARS[1]:
             return Guess(unit, f"{finite[0]:.4g} is a date in {unit} since 1970")
     for epoch, why in DAYS.items():
-        if len(finite) and YEARS[0] < (finite[0] - epoch) * DAY < YEARS[1] and step * DAY <= RATES["s"][1]:
+        if len(finite) and YEARS[0] < (finite[0] - epoch) * DAY < YEARS[1] and step * DAY <= SLOWEST:
             return Guess("day", f"{finite[0]:.9g} is a date in days, {why}")
     for unit, (low, high) in RATES.items():
         if low <= step <= high:

@@ -169,6 +169,9 @@ def unread_of(columns: FileColumns, channels: Channels | None) -> list[str]:
     for path, why in columns.unread.items():
         name = read_name(path)
         channel = channels.found.get(name.quantity or "")
+        if name.quantity == "time":
+            cell = why.partition(" is not a number")[0]
+            why = f"{cell} is neither a number nor a date that is known; write dates as 2026-03-14 09:00:00"
         part = name.axis is not None and channel is not None and channel.values.shape[1] < 3
         if name.quantity is not None and (channel is None or part):
             found.append(why)
