@@ -99,12 +99,12 @@ def curve(
     for s in set(stride.tolist()) - {1}:
         rows, few = _thinned_rows(begins, s)
         thinned[s] = x[rows], few
-    parts = np.zeros((len(m), PARTS, 2))
-    each = zip(m, stride, parts, strict=True)
+    squares_of = np.zeros((len(m), PARTS, 2))
+    each = zip(m, stride, squares_of, strict=True)
     squares = np.array([_mean_squares(*thinned[int(s)], int(k // s), own) for k, s, own in each])
     tau: Array = np.asarray(m * dt, dtype=np.float64)
     deviations = np.sqrt(squares / [2.0, 6.0]) / tau[:, None]
-    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt, parts, tail(rate, stretches))
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt, squares_of, tail(rate, stretches))
 
 
 def _bridged(rate: Array, dt: float, m: Integers | None, grid: Grid) -> AllanCurve:
