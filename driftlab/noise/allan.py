@@ -30,6 +30,7 @@ from functools import partial
 import numpy as np
 
 from driftlab.noise.allan_model import PRESENT, AllanCurve, Bridge, octaves
+from driftlab.noise.allan_unsteady import PARTS, tail
 from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.fast import compiled
 
@@ -98,23 +99,27 @@ def curve(
     for s in set(stride.tolist()) - {1}:
         rows, few = _thinned_rows(begins, s)
         thinned[s] = x[rows], few
-    squares = np.array([_mean_squares(*thinned[int(s)], int(k // s)) for k, s in zip(m, stride, strict=True)])
+    squares_of = np.zeros((len(m), PARTS, 2))
+    each = zip(m, stride, squares_of, strict=True)
+    squares = np.array([_mean_squares(*thinned[int(s)], int(k // s), own) for k, s, own in each])
     tau: Array = np.asarray(m * dt, dtype=np.float64)
     deviations = np.sqrt(squares / [2.0, 6.0]) / tau[:, None]
-    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt)
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt, squares_of, tail(rate, stretches))
 
 
 def _bridged(rate: Array, dt: float, m: Integers | None, grid: Grid) -> AllanCurve:
     """Return the curve over spans with gaps."""
     wanted, whole = m is not None, grid[-1]
     m, stride = _sizes(factors(whole) if m is None else m, int(np.sum(whole)))
-    squares, bridge = bridged(rate, grid, m, stride)
+    squares, parts, bridge = bridged(rate, grid, m, stride)
     second, third = bridge.differences
     # where m was rounded to the stride it may be a little longer than `factors` has it
     enough = third > 0 if wanted else (second >= 0.8 * COVERED * m) & (third >= m / 2)
     deviations = np.sqrt(squares[enough] / [2.0, 6.0])
     tau: Array = np.asarray(m[enough] * dt, dtype=np.float64)
-    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[enough], whole, dt, bridge.of(enough))
+    deviation, third = deviations.T
+    stride, parts, index = stride[enough], parts[enough], tail(rate, grid[0])
+    return AllanCurve(tau, deviation, third, stride, whole, dt, parts, index, bridge.of(enough))
 
 
 def _sizes(m: Integers, N: int) -> tuple[Integers, Integers]:
@@ -163,27 +168,36 @@ def _thinned_rows(edges: Integers, stride: int) -> tuple[Integers, Integers]:
 
 
 @partial(compiled, fastmath={"reassoc"})
-def _mean_squares(x: Array, places: Integers, m: int) -> tuple[float, float]:
-    """Return the mean squares of the second and of the third differences of x over m samples."""
-    squares = cubes = 0.0
-    seconds = thirds = 0
+def _mean_squares(x: Array, places: Integers, m: int, parts: Array) -> tuple[float, float]:
+    """Return the mean squares of the second and of the third differences of x over m samples.
+
+    To `parts` (PARTS, 2) go the squares of the second ones in equal parts of x, and their number.
+    """
+    cubes, thirds = 0.0, 0
     for i in range(len(places) - 1):
         start, n = places[i], places[i + 1] - places[i]
         third, second = n - 3 * m, n - 2 * m
         if third < 1:
             continue
         own = x[start : start + n]
-        for k in range(third):
-            now = own[k + 2 * m] - 2 * own[k + m] + own[k]
-            later = own[k + 3 * m] - 2 * own[k + 2 * m] + own[k + m]
-            squares += now * now
-            cubes += (later - now) * (later - now)
-        for k in range(third, second):
-            now = own[k + 2 * m] - 2 * own[k + m] + own[k]
-            squares += now * now
-        seconds += second
+        at = 0
+        while at < second:
+            part = (start + at) * len(parts) // len(x)
+            end = min(second, -(-(part + 1) * len(x) // len(parts)) - start)
+            squares = 0.0
+            for k in range(at, min(end, third)):
+                now = own[k + 2 * m] - 2 * own[k + m] + own[k]
+                later = own[k + 3 * m] - 2 * own[k + 2 * m] + own[k + m]
+                squares += now * now
+                cubes += (later - now) * (later - now)
+            for k in range(max(at, third), end):
+                now = own[k + 2 * m] - 2 * own[k + m] + own[k]
+                squares += now * now
+            parts[part, 0] += squares
+            parts[part, 1] += end - at
+            at = end
         thirds += third
-    return squares / seconds, cubes / thirds
+    return np.sum(parts[:, 0]) / np.sum(parts[:, 1]), cubes / thirds
 
 
 def spans(lengths: Integers, missing: Integers) -> Integers:
@@ -217,8 +231,10 @@ def bridgeable(lengths: Integers, missing: Integers) -> tuple[Integers, Integers
     return parts[whole >= ORDER], whole[whole >= ORDER]
 
 
-def bridged(rate: Array, grid: Grid, m: Integers, stride: Integers) -> tuple[Array, Bridge]:
+def bridged(rate: Array, grid: Grid, m: Integers, stride: Integers) -> tuple[Array, Array, Bridge]:
     """Return mean squares (J, 2) of the differences of means over m places, second and third, and their basis.
+
+    Between them are the squares of second ones in parts of the grid, and their number (J, PARTS, 2).
 
     Rates (N,), stretches (S, 2) and `missing` (S - 1,) are those of `curve`, spans (P, 2) those of `spans`; m (J,) is a
     multiple of the `stride` (J,), which says which overlaps are taken.
@@ -230,11 +246,13 @@ def bridged(rate: Array, grid: Grid, m: Integers, stride: Integers) -> tuple[Arr
     for s in set(stride.tolist()) - {1}:
         rows, few = _thinned_rows(full[3], s)
         thinned[s] = full[0][rows], full[1][rows], full[2][rows], few
-    sums, stands = np.zeros((len(m), 2, 3)), np.zeros((len(m), 2))
+    sums, stands, parts_of = np.zeros((len(m), 2, 3)), np.zeros((len(m), 2)), np.zeros((len(m), PARTS, 2))
     taken = np.zeros((len(m), 2, 4, int(group.max()) + 1))
     for j, (size, s) in enumerate(zip(m.tolist(), stride.tolist(), strict=True)):
         least = int(np.ceil(PRESENT * size - 1e-9))
-        stands[j] = _window(thinned[s], (size // s, size, least, int(REACH * size / s)), group, sums[j], taken[j])
+        sizes = size // s, size, least, int(REACH * size / s)
+        stands[j] = _window(thinned[s], sizes, group, sums[j], taken[j], parts_of[j])
+    sums[:, 0, 0] = np.sum(parts_of[:, :, 0], axis=1)
     count = np.sum(taken[:, :, 0], axis=2)
     mean = sums / np.maximum(count, 1)[:, :, None]
     ratio = taken[:, :, ::2] / np.maximum(taken[:, :, 1::2], 1)
@@ -250,7 +268,7 @@ def bridged(rate: Array, grid: Grid, m: Integers, stride: Integers) -> tuple[Arr
         pieces=stands[:, 0].astype(np.int64),
         samples=stands[:, 1].astype(np.int64),
     )
-    return mean[:, :, 0], bridge
+    return mean[:, :, 0], parts_of, bridge
 
 
 @compiled
@@ -298,11 +316,12 @@ def _number(runs: Integers, a: int, b: int) -> int:
 
 
 @compiled
-def _window(grid: Sums, sizes: Sizes, group: Integers, sums: Array, taken: Array) -> tuple[int, int]:
+def _window(grid: Sums, sizes: Sizes, group: Integers, sums: Array, taken: Array, parts: Array) -> tuple[int, int]:
     """Add up the differences over m places; return the pieces that they cover without a break, and their samples.
 
-    To `sums` (2, 3) go squares, and the variances of white noise and of the angle's; to `taken` (2, 4, G) how many
-    differences count, how many there would be without a gap, and of both the pairs of them within `reach`.
+    To `sums` (2, 3) go squares of third ones, and the variances of white noise and of the angle's; to `taken` (2, 4, G)
+    how many differences count, how many there would be without a gap, and of both the pairs of them within `reach`; to
+    `parts` (PARTS, 2) the squares of second ones in equal parts of the grid, and their number.
     """
     x, count, runs, edges = grid
     m, size, least, reach = sizes
@@ -324,7 +343,7 @@ def _window(grid: Sums, sizes: Sizes, group: Integers, sums: Array, taken: Array
             now = (x[c] - x[b]) * second - (x[b] - x[a]) * first
             one, two = 2 * _number(runs, a, b) * first * first, 2 * _number(runs, b, c) * second * second
             shared = 2 * (runs[b] & 1) * first * second
-            sums[0, 0] += now * now
+            _add_square(parts[k * len(parts) // len(x)], now)
             sums[0, 1] += first + second
             sums[0, 2] += one + two + shared
             pieces += a > covered
@@ -343,6 +362,12 @@ def _window(grid: Sums, sizes: Sizes, group: Integers, sums: Array, taken: Array
         _add_pairs(seconds, reach, taken[0, :, group[i]])
         _add_pairs(thirds, reach, taken[1, :, group[i]])
     return pieces, samples
+
+
+@compiled
+def _add_square(part: Array, value: float) -> None:
+    part[0] += value * value
+    part[1] += 1
 
 
 @compiled

@@ -18,12 +18,13 @@ J averaging times, p <= 5 coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
 from driftlab.noise.allan_model import KEYS, RAMP, WALK, WHITE, WHITE_ALIKE, AllanCurve, Design, alike, design
+from driftlab.noise.allan_unsteady import Unsteady, unsteady_of
 from fusion_core.chunk import Array
 
 LEVEL = 0.95  # probability that an interval covers the true value
@@ -71,6 +72,8 @@ def fit(curve: AllanCurve) -> Coefficients:
     first = (_beyond if smooth else _begin)(whole, curve.allan**2, curve.dt)
     if smooth and first > len(curve.tau) - LEFT:
         return _unknown(curve, f"{SMOOTH}: too few averaging times are left beyond its reach, nothing is measured")
+    unsteady = _unsteady(curve, whole, first)
+    whole, other = replace(whole, unsteady=unsteady), replace(other, unsteady=unsteady)
     allan = _limits(whole.since(first), curve.allan[first:] ** 2, list(range(int(smooth), 5)))
     hadamard = _limits(other.since(first), curve.hadamard[first:] ** 2, [WALK])
     value, low, high = allan.value, allan.low, allan.high
@@ -89,10 +92,27 @@ def fit(curve: AllanCurve) -> Coefficients:
             "longer recording tells"
         )
     notes += _fit_notes(curve, first, allan.error, smooth=smooth)
+    notes += [unsteady.note] if unsteady else []
     best = np.sqrt(allan.theta)
     if smooth:
         high[0], best[0] = np.inf, -best[0]
-    return Coefficients(value, low, high, whole.spread(allan.theta) / 2, best, first, notes)
+    spread = whole.spread(allan.theta)
+    if unsteady:
+        spread = np.hypot(spread, unsteady.scatter * whole.shared(allan.theta))
+    return Coefficients(value, low, high, spread / 2, best, first, notes)
+
+
+def _unsteady(curve: AllanCurve, model: Design, first: int) -> Unsteady | None:
+    """Return what is unsteady in the noise, as averaging time number `first` tells it.
+
+    A term has as much of it as it has of the variance there.
+    """
+    theta = _model_error(model.since(first), curve.allan[first:] ** 2)[1]
+    terms, spread = (np.maximum(model.A[first], 0) * theta)[:RAMP], float(model.spread(theta)[first])
+    if spread == 0:
+        return None
+    part, sizes = terms * np.sum(terms) / np.sum(terms**2), curve.m / curve.stride[first]
+    return unsteady_of(curve.parts[first], sizes, first, (spread, part, curve.tail))
 
 
 def _unknown(curve: AllanCurve, why: str) -> Coefficients:

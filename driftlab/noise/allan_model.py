@@ -17,13 +17,13 @@ from functools import cached_property
 
 import numpy as np
 
+from driftlab.noise.allan_unsteady import DRAWS, Unsteady
 from fusion_core.chunk import Array, Flags, Integers
 
 KEYS = ("quantization", "white", "bias_instability", "rate_random_walk", "rate_ramp")
 WHITE = KEYS.index("white")
 WALK = KEYS.index("rate_random_walk")
 RAMP = KEYS.index("rate_ramp")
-DRAWS = 400
 ENDS = {2: 1.3, 3: 2.2}  # averaging times at the ends of a stretch that say nothing, by the order of the difference
 PRESENT = 0.9  # of a window's samples: with fewer, its mean may be that of another time
 WHITE_ALIKE, SURE = -0.5, 4.0  # correlation of neighbouring differences of white noise, and deviations that are sure
@@ -56,7 +56,8 @@ class AllanCurve:
 
     `stride` says that every so-manyth overlap was taken; `lengths` (S,) are the samples of each stretch without a gap,
     or where there is a `bridge` the places of each span whose gaps are bridged; `dt` is their interval, s. Only
-    those of three averaging times or more count for one (`counts`).
+    those of three averaging times or more count for one (`counts`). `parts` (J, PARTS, 2) are sums of squared second
+    differences in equal parts of the recording, and their numbers, `tail` is the index of their tail.
     """
 
     tau: Array
@@ -65,6 +66,8 @@ class AllanCurve:
     stride: Integers
     lengths: Integers
     dt: float
+    parts: Array
+    tail: float
     bridge: Bridge | None = None
 
     @property
@@ -146,6 +149,7 @@ class Design:
     A: Array  # (J, p) variance of each term at coefficient one
     # stretches of like lengths; their W sum to A over bands and classes, where that is no loss
     classes: tuple[Class, ...]
+    unsteady: Unsteady | None = None
 
     @cached_property
     def variates(self) -> list[Array]:
@@ -162,7 +166,7 @@ class Design:
     def since(self, first: int) -> Design:
         """Return the same without the averaging times before number `first`."""
         left = tuple(one.since(first) for one in self.classes if len(one.power) > first)
-        return Design(self.tau[first:], self.A[first:], left)
+        return replace(self, tau=self.tau[first:], A=self.A[first:], classes=left)
 
     def smoothed(self) -> Design:
         """Return the same with what a filter takes off in the place of the quantisation, averaging times beyond it.
@@ -180,6 +184,13 @@ class Design:
             variance[: len(one.power)] += np.sum(one.bands(theta) ** 2 / one.shape, axis=1) * one.power**2
         return np.asarray(np.sqrt(variance) / (np.maximum(self.A, 0) @ theta))
 
+    def shared(self, theta: Array) -> Array:
+        """Part of the variances (J,) under theta (p,) that is unsteady."""
+        if self.unsteady is None:
+            return np.zeros(len(self.tau))
+        terms = (np.maximum(self.A, 0) * theta)[:, :RAMP]
+        return np.asarray(terms @ self.unsteady.part / np.maximum(np.sum(terms, axis=1), np.finfo(float).tiny))
+
     def draw(self, theta: Array, model_error: float) -> Array:
         """Draw curves (J, DRAWS) under theta."""
         J = len(self.tau)
@@ -187,6 +198,8 @@ class Design:
         for one, variates in zip(self.classes, self.variates, strict=True):
             noise[: len(one.power)] += one.draw(theta, variates)
         mean = np.mean(noise, axis=1, keepdims=True)
+        if self.unsteady is not None:
+            noise = self.unsteady.scattered(noise, mean, self.shared(theta)[:, None])
         if self.A.shape[1] > RAMP and theta[RAMP] > 0:
             ramp = self.A[:, RAMP] * theta[RAMP]
             noise += ramp[:, None]
