@@ -33,7 +33,6 @@ from driftlab.family.partitions import SIZE, FamilyUnits, Partition, Partitions,
 from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
 from driftlab.family.reml import (
     ByLot,
-    Index,
     Means,
     OfAxes,
     RemlFit,
@@ -46,7 +45,7 @@ from driftlab.family.reml import (
 from driftlab.family.tail_law import TailLaws
 from driftlab.family.terms import TermsLaw
 from driftlab.family.unit_information import UnitInformation
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.thermal.fitted_map import COLDEST, HOTTEST
 from fusion_core.thermal.map_file import expect_covariance
 from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
@@ -110,7 +109,7 @@ def fit_family(
 
 def _survey(
     units: Partitions[Sequence[UnitOfLot]],
-) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Index, tuple[float, float]]:
+) -> tuple[SplineBasis, tuple[str, ...], dict[str, tuple[int, int]], Integers, tuple[float, float]]:
     """Return the knots over the temperatures that enough units saw, and the axes.
 
     And of each lot its number and its units; each unit's lot by number (n,); and these temperatures' ends, degC.
@@ -191,7 +190,7 @@ def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
 
 
 def _fit_of(
-    sample: Sequence[Partition[OfAxes]], lot: Index, peaks: Array, job: tuple[int, VarianceComponents | None]
+    sample: Sequence[Partition[OfAxes]], lot: Integers, peaks: Array, job: tuple[int, VarianceComponents | None]
 ) -> RemlFit:
     """Return the fit of an axis of a sample, of the lots `lot` (n,), from a law on, in parts of SIZE units."""
     axis, law = job
@@ -202,7 +201,7 @@ def _fit_of(
 
 
 def _means_of_all(
-    units: Partitions[Sequence[UnitOfLot]], knots: SplineBasis, fits: list[RemlFit], present: Index, lot: Index
+    units: Partitions[Sequence[UnitOfLot]], knots: SplineBasis, fits: list[RemlFit], present: Integers, lot: Integers
 ) -> list[Means]:
     """Return the means of all units, numbered by `lot`, of which the fits are a sample with the lots `present`."""
     d, q, G = len(fits), knots.q, int(lot.max()) + 1
@@ -218,7 +217,7 @@ def _means_of_all(
 
 
 def _of_their_lots(
-    knots: SplineBasis, L: Array, limits: Array, units: Sequence[UnitOfLot], lot: Index, centres: Mapping[int, Array]
+    knots: SplineBasis, L: Array, limits: Array, units: Sequence[UnitOfLot], lot: Integers, centres: Mapping[int, Array]
 ) -> dict[int, tuple[Array, Array]]:
     """Return the information of units on the means of their lots, and that times their values, by lot.
 

@@ -30,11 +30,11 @@ import numpy.typing as npt
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import TERM_FIGURES, UnitRecord
-from driftlab.family.reml import WEIGHT, Index
+from driftlab.family.reml import WEIGHT
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_records import at_places, figure_of, figures_in, of_units
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 KNOWN = 1e-2  # of the family's variance: a soak with less information on an axis has none
 WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
@@ -178,7 +178,7 @@ class Tests:
     laws: TailLaws
     off: dict[str, list[dict[str, float]]]
 
-    def p(self, units: Index) -> Array:
+    def p(self, units: Integers) -> Array:
         """Return the p-values (k, m) of some units, NaN where there is no test."""
         curves, records, lots = self.curves[units], at_places(self.records, units), self.of_lots[units]
         columns = [_chance(self.laws.curves.get(name), curves[:, k], name) for k, name in enumerate(CURVES)]

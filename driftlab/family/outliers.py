@@ -44,11 +44,10 @@ from driftlab.family.outlier_tests import (
 )
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
-from driftlab.family.reml import Index
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.family.unit_information import UnitInformation
 from driftlab.units import BiasUnit, axis_name, default_unit, number
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.faults import DOUBT, in_doubt
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
@@ -181,7 +180,9 @@ def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
     return f"unit {unit}: {'; '.join(one.sentence for one in odd)}{rest}"
 
 
-def chosen(p: Callable[[Index], Array], count: int, ordinary: int = 0) -> tuple[Index, Array, npt.NDArray[np.bool_]]:
+def chosen(
+    p: Callable[[Integers], Array], count: int, ordinary: int = 0
+) -> tuple[Integers, Array, npt.NDArray[np.bool_]]:
     """Return the units (k,) that stand out, the p-values (k, m) of their tests, and which of these are reported.
 
     `p` returns those of some of `count` units, NaN where there is no test; `ordinary` further units are known to be as

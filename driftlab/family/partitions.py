@@ -19,9 +19,9 @@ from secrets import token_hex
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.family.unit_information import UnitInformation
+from fusion_core.chunk import Integers
 
 SIZE = 50  # units of a partition
 A_FEW = 8  # of a partition of a sample, of which each takes its time
@@ -30,10 +30,9 @@ BLOCKS = 64  # of partitions, that a pass has at most: what a worker is given at
 R = TypeVar("R")
 C = TypeVar("C", covariant=True)
 UnitOfLot = tuple[UnitInformation, str]
-Index = NDArray[np.intp]
 
 
-def by_lot(lots: Iterable[str]) -> dict[str, Index]:
+def by_lot(lots: Iterable[str]) -> dict[str, Integers]:
     """Return the places of the units of each lot, in the order of the lots' first units; `lots` are of all units."""
     places: dict[str, list[int]] = {}
     for k, lot in enumerate(lots):

@@ -39,10 +39,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from driftlab.family.partitions import tree
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 TOLERANCE = 2e-3  # of the units' deviations in a step: far below their sampling error
 MAX_STEPS = 60
@@ -53,8 +52,6 @@ SMOOTH = 4  # steps in which Sigma is a smooth prior's: with nothing yet to say 
 FROZEN = 24  # steps, after which weights stay
 HYPER = 4  # steps of EM between two fits of the prior
 WEIGHT = 5.0  # of the prior, units
-
-Index = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,7 @@ class ByLot:
     """Values (G, ...) of lots, of which a partition of units, of the lots `lot` (n,), is sent its own."""
 
     values: Array
-    lot: Index
+    lot: Integers
 
     def __getitem__(self, units: slice) -> dict[int, Array]:
         """Return the values of the lots of some units, by lot."""
@@ -184,7 +181,7 @@ class UnitsUnderLaw:
     Sums are those of a tree over the parts (`driftlab.family.partitions`).
     """
 
-    def __init__(self, law: VarianceComponents, parts: Sequence[tuple[Array, Array, Index]]) -> None:
+    def __init__(self, law: VarianceComponents, parts: Sequence[tuple[Array, Array, Integers]]) -> None:
         self.law, (self.L, _, self.lots) = law, law.root()
         self.parts = [_PartUnderLaw(self.L, *part) for part in parts]
 
@@ -202,7 +199,7 @@ class _PartUnderLaw:
     V (n, q, q) is the covariance of z, and K (n, q, q) what z follows of an error of its mean.
     """
 
-    def __init__(self, L: Array, J: Array, h: Array, lot: Index) -> None:
+    def __init__(self, L: Array, J: Array, h: Array, lot: Integers) -> None:
         self.L, self.J, self.h, self.lot, self.one = L, J, h, lot, np.eye(len(L))
         self.A, self.a = inside(J, L), h @ L
         V = np.asarray(np.linalg.inv(self.A + self.one), dtype=np.float64)
@@ -291,7 +288,7 @@ class RemlFit:
 
 
 def fit_axis(
-    units: Sequence[tuple[Array, Array, Index]], peaks: Array, start: VarianceComponents | None = None
+    units: Sequence[tuple[Array, Array, Integers]], peaks: Array, start: VarianceComponents | None = None
 ) -> RemlFit:
     """Return the law of the units of an axis, as `UnitsUnderLaw` has them, at `peaks` (q,) degC.
 
@@ -346,7 +343,7 @@ def outlier_weights(share: Array, limit: float | Array) -> Array:
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, MIN_WEIGHT, 1.0))
 
 
-def initial_scale(units: Sequence[tuple[Array, Array, Index]]) -> float:
+def initial_scale(units: Sequence[tuple[Array, Array, Integers]]) -> float:
     """Return the scale of the units' spread: median over coefficients of the units' median deviation."""
     own, seen = (np.concatenate(part) for part in zip(*(_alone(J, h) for J, h, _ in units), strict=True))
     own = np.where(seen > 0.01 * np.median(seen), own, np.nan)

@@ -26,13 +26,13 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from driftlab.family.contrasts import EffectContrasts, UnitRows, columns_of, seen_temperatures
 from driftlab.family.partitions import Partitions, UnitOfLot, by_lot
 from driftlab.family.record import Numbers
-from driftlab.family.shared_effect_search import Indices, Offer, between, chances, mean_of, noise_of, together
+from driftlab.family.shared_effect_search import Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.acceptance import nats_of
 from driftlab.identification.result import described, parameters
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
@@ -279,7 +279,7 @@ def _laws(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, lots: 
     return LotEffects(**dict(law), others=others, lots=tuple(of_lots), differs=differs)
 
 
-def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> EffectDistribution:
+def _law(effect: Effect, c: Array, v: Array, units: Integers, *, lag: bool = True) -> EffectDistribution:
     """Return the law of some units; that of a lag is known, unless the measured one is asked for."""
     d, q = c.shape[1:]
     own, variance = c[units].reshape(len(units), -1), v[units].reshape(len(units), -1)
@@ -291,7 +291,7 @@ def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True
     return EffectDistribution(mean=mean, sigma=sigma, spread=spread)
 
 
-def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, units: Indices) -> float:
+def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, units: Integers) -> float:
     """Return - log of the probability that the coefficients of some units are noise, nats.
 
     Their means under their variances, or under their scatter where that is more; or, of as many as it takes, as the
@@ -310,7 +310,7 @@ def _evidence(effect: Effect, c: Array, v: Array, contrasts: EffectContrasts, un
     return max(means, weighed) - float(np.log(2))
 
 
-def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:
+def _differ(c: Array, v: Array, groups: Sequence[Integers]) -> float:
     """Return the probability that lots of one law differ as much: an F ratio an axis, weighted, all multiplied."""
     from scipy.special import chdtrc, fdtrc
 

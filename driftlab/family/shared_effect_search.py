@@ -40,7 +40,7 @@ from driftlab.identification.acceptance import nats_of
 from driftlab.identification.candidates import installed, offers_by_kind, proposals
 from driftlab.identification.records import with_residuals
 from driftlab.identification.state import name_of
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Effect
 from fusion_core.host.registry import kind_of
 
@@ -53,8 +53,6 @@ MAX_COEFFICIENTS = 3  # an axis: with more, an effect is a map, or one's guess
 HALVINGS = 36  # of the interval that holds s^2
 MIN_UNITS = 5  # for a mean and its scatter
 MIN_PLACEBOS = 3  # for the noise of a unit
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +211,7 @@ def deficit(first: Candidate, other: Candidate) -> float:
     return float(difference.sum()) / spread if spread > 0 else 0.0
 
 
-def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate, units: Indices) -> float:
+def nested(offers: Sequence[Offer], contrasts: EffectContrasts, taken: Candidate, units: Integers) -> float:
     """Return the gain on units that had no part in choosing the hyper-parameters either, nats."""
     of_kind = [k for k, offer in enumerate(offers) if offer.group == taken.offer.group]
     parts = [_part(offers, contrasts, k) for k in of_kind]
@@ -274,7 +272,7 @@ def _of_right_size(sample: Partitions[Sequence[UnitOfLot]], taken: Candidate, be
     return taken.effect.model_copy(update=longer)
 
 
-def chances(offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices) -> list[tuple[float, float, float]]:
+def chances(offers: Sequence[Offer], contrasts: EffectContrasts, units: Integers) -> list[tuple[float, float, float]]:
     """Return evidence of mean, of size and of both of each offer in some units, nats."""
     d, K = contrasts.c.shape[1:]
     c, information, placebos = contrasts.flat(units)
@@ -299,7 +297,7 @@ def _part(offers: Sequence[Offer], contrasts: EffectContrasts, k: int) -> Effect
 
 
 def _left_out(
-    offers: Sequence[Offer], contrasts: EffectContrasts, units: Indices, folds: NDArray[Any] | None = None
+    offers: Sequence[Offer], contrasts: EffectContrasts, units: Integers, folds: NDArray[Any] | None = None
 ) -> Array:
     """Return the gains (n, offers) of each of some units, predicted from the other folds (n,) of these."""
     folds = np.arange(len(units)) % FOLDS if folds is None else folds
@@ -315,7 +313,7 @@ def _scale(c: Array, v: Array) -> Array:
     return np.asarray(np.maximum((w * c).sum(axis=(0, 1)) / np.maximum(w.sum(axis=(0, 1)), 1e-300), 0.0))
 
 
-def _gains(offers: Sequence[Offer], contrasts: EffectContrasts, train: Indices, test: Indices) -> Array:
+def _gains(offers: Sequence[Offer], contrasts: EffectContrasts, train: Integers, test: Integers) -> Array:
     """Return gains (units of test, offers) with mean and spread from others, all axes together.
 
     A lag that is half as long as it is taken to be shows about half as much: its size is one for all units and

@@ -15,12 +15,12 @@ from typing import Annotated, ClassVar, Literal, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError
 
-from driftlab.identification.columns import EffectRegressors, Indices
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import Term
 from driftlab.identification.records import with_residuals
 from driftlab.identification.state import Search, name_of
 from driftlab.units import duration
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.plugin import built_in
 from fusion_core.contracts.table import auxiliary
@@ -140,7 +140,7 @@ def _same_span(columns: EffectRegressors, effect: Effect, other: Effect) -> bool
     return True
 
 
-def _spans(columns: EffectRegressors, effect: Effect, axis: int) -> tuple[Indices, Indices]:
+def _spans(columns: EffectRegressors, effect: Effect, axis: int) -> tuple[Integers, Integers]:
     """Return the columns of an effect, through the map too where it acts there, and those of its starts."""
     own, none = columns.of(effect), np.zeros(0, dtype=np.intp)
     of_map = columns.of_map([effect]) if effect.acts_on_input else none

@@ -21,15 +21,12 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from driftlab.identification.records import Evidence, map_inputs
-from fusion_core.chunk import Array, Flags
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import Basis, Effect
 from fusion_core.fast import compiled, inlined
-
-Indices = NDArray[np.intp]
 
 TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not determine stays small
 ROUNDING = 1e-14  # of the square of a column: what is left of it is nothing
@@ -58,7 +55,7 @@ class NormalEquations:
         A[:j, :j] += np.diag(ridge) if ridge.ndim == 1 else ridge
         return NormalEquations(A, self.b, self.yy)
 
-    def restricted(self, keep: Indices | Flags) -> NormalEquations:
+    def restricted(self, keep: Integers | Flags) -> NormalEquations:
         """Return those of some columns, the coefficients of the others being 0."""
         return NormalEquations(self.A[np.ix_(keep, keep)], self.b[keep], self.yy)
 
@@ -108,7 +105,7 @@ class NormalEquations:
 
 
 def free_starts(
-    equations: NormalEquations, first: int, starts: Sequence[Indices], rows: int, colour: float
+    equations: NormalEquations, first: int, starts: Sequence[Integers], rows: int, colour: float
 ) -> tuple[Array, float]:
     """Return the deviation of the starts of each term beyond what noise makes of them, and the noise's density S.
 
@@ -176,7 +173,7 @@ def _coefficients(L: Array, w: Array, first: int) -> tuple[Array, Array]:
 
 
 @compiled
-def left_with_starts(G: Array, V: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
+def left_with_starts(G: Array, V: Array, y: int, cols: Integers, sizes: Integers, rows: int, colour: float) -> float:
     """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
 
     G (K, K) holds inner products of all columns, V V' the part of them that the base explains (V (K, k)), y the
@@ -230,10 +227,10 @@ class EffectColumns:
     """Columns of an effect: on each axis, with the coefficients that they belong to, and of its start."""
 
     p: int  # number of coefficients
-    columns: tuple[Indices, ...]  # (k,) of each axis
-    places: tuple[Indices, ...]  # (k,) of each axis: the coefficients that the columns belong to
+    columns: tuple[Integers, ...]  # (k,) of each axis
+    places: tuple[Integers, ...]  # (k,) of each axis: the coefficients that the columns belong to
     # (R,) response to a start of 1 in each recording; None where the effect has no unknown start
-    starts: Indices | None
+    starts: Integers | None
 
 
 class EffectRegressors:
@@ -248,7 +245,7 @@ class EffectRegressors:
         self._gram = np.zeros((len(self.segments), 0, 0))
         self._sums: dict[tuple[int, ...], Array] = {}
         self._effects: dict[Effect, EffectColumns] = {}
-        self._maps: dict[tuple[Effect, ...], Indices] = {}
+        self._maps: dict[tuple[Effect, ...], Integers] = {}
         levels = np.zeros((n, R))
         for r, rows in enumerate(evidence.slices):
             levels[rows, r] = 1.0
@@ -279,7 +276,7 @@ class EffectRegressors:
         """All segments."""
         return tuple(range(len(self.segments)))
 
-    def gram(self, segments: Sequence[int], rows: Indices | None = None) -> Array:
+    def gram(self, segments: Sequence[int], rows: Integers | None = None) -> Array:
         """Return the inner products of all columns over some segments, or of `rows` alone."""
         self._complete()
         key, size = tuple(segments), self._known
@@ -294,7 +291,7 @@ class EffectRegressors:
             return np.asarray(self._sums[key][np.ix_(rows, rows)])
         return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, rows)].sum(axis=0))
 
-    def equations(self, segments: Sequence[int], cols: Indices, y: Indices) -> NormalEquations:
+    def equations(self, segments: Sequence[int], cols: Integers, y: Integers) -> NormalEquations:
         """Return the normal equations of columns (k,) over some segments, y (1,) the signal's column."""
         return NormalEquations.of(self.gram(segments, np.concatenate([cols, y])))
 
@@ -302,21 +299,21 @@ class EffectRegressors:
         """Return all segments but one."""
         return tuple(j for j in self.everything if j != k)
 
-    def raw(self, cols: Indices) -> Array:
+    def raw(self, cols: Integers) -> Array:
         """Return columns (n, k) as they were before they were centred and scaled."""
         values = self.W[:, cols].copy()
         for r, rows in enumerate(self.evidence.slices):
             values[rows] += self.means[r, cols]
         return np.asarray(values * self.scale[cols])
 
-    def within(self, inner: Indices, outer: Indices) -> bool:
+    def within(self, inner: Integers, outer: Integers) -> bool:
         """Return True if columns are combinations of others."""
         if not len(inner):
             return True
         A, b = self.W[:, outer], self.W[:, inner]
         return bool(np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) <= SAME * np.linalg.norm(b))
 
-    def of_map(self, effects: Sequence[Effect]) -> Indices:
+    def of_map(self, effects: Sequence[Effect]) -> Integers:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""
         if self.basis is None:
             return np.zeros(0, dtype=np.intp)
@@ -330,8 +327,8 @@ class EffectRegressors:
         """Return the columns of an effect."""
         if effect not in self._effects:
             whole = self.evidence.rows([effect.signature(chunk, None)[0] for chunk in self.evidence.chunks])
-            columns: list[Indices] = []
-            places: list[Indices] = []
+            columns: list[Integers] = []
+            places: list[Integers] = []
             for own in whole.swapaxes(0, 1):
                 place = np.flatnonzero(np.any(own != 0, axis=0))
                 if places and len(place) == len(places[0]) and np.array_equal(own[:, place], whole[:, 0][:, places[0]]):
@@ -342,7 +339,7 @@ class EffectRegressors:
             self._effects[effect] = EffectColumns(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
         return self._effects[effect]
 
-    def _starts(self, effect: Effect) -> Indices | None:
+    def _starts(self, effect: Effect) -> Integers | None:
         """Return a column for each recording: the response to a start of 1, row by row."""
         left = np.zeros((len(self.evidence), len(self.levels)))
         for r, (record, rows) in enumerate(zip(self.evidence.records, self.evidence.slices, strict=True)):
@@ -352,7 +349,7 @@ class EffectRegressors:
             left[rows, r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))
         return self._add(left, unit=False)
 
-    def _add(self, values: Array, *, centred: bool = True, unit: bool = True) -> Indices:
+    def _add(self, values: Array, *, centred: bool = True, unit: bool = True) -> Integers:
         k = values.shape[1]
         while self._size + k > len(self._W):
             self._W = np.vstack([self._W, np.zeros_like(self._W)])

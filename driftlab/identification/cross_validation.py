@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from driftlab.identification.columns import EffectRegressors, Indices
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
 from driftlab.noise.local_level import LocalLevel
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 MIN_ROWS = 8  # of a part that is predicted
 
@@ -42,9 +42,9 @@ class LeftOutPart:
 class Conditioned:
     """A model on one axis with everything but the starts of the part that is left out."""
 
-    cols: Indices  # (k,) columns of map and effects
+    cols: Integers  # (k,) columns of map and effects
     beta: Array  # (k,) their coefficients
-    starts: Indices  # (terms, R) columns of the free terms' starts
+    starts: Integers  # (terms, R) columns of the free terms' starts
     sd: Array  # (terms,) their deviations
     a: Array  # (terms, R) the starts, as all recordings show them
     levels: Array  # (R,) of the recordings, less map, effects and starts

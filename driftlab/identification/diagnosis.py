@@ -21,14 +21,14 @@ import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
-from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations
+from driftlab.identification.columns import EffectRegressors, NormalEquations
 from driftlab.identification.least_squares import Model, Term, without_term
 from driftlab.identification.records import Evidence, Progress, Record, row_starts
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import AS_GOOD, as_good, contains, is_copy, tried, with_uncertain_map
 from driftlab.noise.local_level import LocalLevel, one_step, whitened
 from driftlab.units import duration
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Effect
 from fusion_core.contracts.table import auxiliary
 from fusion_core.errors import FusionError
@@ -470,7 +470,7 @@ def _separation(search: Search, new: EffectRegressors, question: Question) -> fl
     return float(gain)
 
 
-def _predicted(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Indices) -> Array:
+def _predicted(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Integers) -> Array:
     """Return the columns of a fit (n, k) over a designed recording, in the scale of those over the old ones.
 
     Levels and starts of the old recordings are nothing there, and a memory begins in equilibrium.

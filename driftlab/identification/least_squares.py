@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from driftlab.identification.columns import EffectRegressors, Indices, NormalEquations, free_starts
-from fusion_core.chunk import Array, Flags
+from driftlab.identification.columns import EffectRegressors, NormalEquations, free_starts
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import Effect
 
 LOW = 8  # lowest frequencies of a recording whose power is that of slow noise
@@ -46,7 +46,7 @@ def without_term(model: Model, k: int) -> Model:
 class AxisFit:
     """A model fitted on one axis."""
 
-    cols: Indices  # (k,) columns
+    cols: Integers  # (k,) columns
     beta: Array  # (k,) their coefficients
     equations: NormalEquations  # of the columns, ridges added
     sd: Array  # (terms,) deviation of the starts of each term; 0 where it starts at equilibrium
@@ -85,7 +85,7 @@ class LeastSquares:
         W = self.columns.W[np.ix_(rows, cols)]
         return self._fit(axis, fixed, starts, NormalEquations.of(W.T @ W), len(W))
 
-    def _columns(self, model: Model, axis: int, segments: tuple[int, ...]) -> tuple[Indices, list[Indices]]:
+    def _columns(self, model: Model, axis: int, segments: tuple[int, ...]) -> tuple[Integers, list[Integers]]:
         """Return the fixed columns of a model, and those of each term's starts in the segments' recordings."""
         for term in model:
             self.columns.of(term.effect)
@@ -93,7 +93,7 @@ class LeastSquares:
         return self.fixed(model, axis), [self.starts(term, segments) for term in model]
 
     def _fit(
-        self, axis: int, fixed: Indices, starts: Sequence[Indices], equations: NormalEquations, rows: int
+        self, axis: int, fixed: Integers, starts: Sequence[Integers], equations: NormalEquations, rows: int
     ) -> AxisFit:
         """Solve the equations of the fixed columns and the starts of each term, over so many rows."""
         all_cols, k = np.concatenate([fixed, *starts]), len(fixed)
@@ -106,13 +106,13 @@ class LeastSquares:
         equations = equations.raised(np.concatenate([np.zeros(k), *weights])).restricted(some)
         return AxisFit(all_cols[some], equations.solution, equations, sd, slow, equations.left)
 
-    def fixed(self, model: Model, axis: int) -> Indices:
+    def fixed(self, model: Model, axis: int) -> Integers:
         """Return the columns of map, levels and effects: all but the starts."""
         effects = [term.effect for term in model]
         own = [self.columns.of(effect).columns[axis] for effect in effects]
         return np.concatenate([self.columns.of_map(effects), self.columns.levels, *own])
 
-    def ridge(self, axis: int, fixed: Indices, G: Array) -> Array:
+    def ridge(self, axis: int, fixed: Integers, G: Array) -> Array:
         """Return the map's penalty (q, q) on the first of the fixed columns, G the inner products of all of these."""
         q = len(self.columns.penalty)
         key = fixed[:q].tobytes()
@@ -122,7 +122,7 @@ class LeastSquares:
             self._penalties[key] = P / (float(np.trace(P)) or 1.0)
         return np.asarray(self.smoothing[axis] * float(np.trace(G[:q, :q])) * self._penalties[key])
 
-    def starts(self, term: Term, segments: Sequence[int]) -> Indices:
+    def starts(self, term: Term, segments: Sequence[int]) -> Integers:
         """Return the columns of a term's unknown starts in the recordings of the segments."""
         starts = self.columns.of(term.effect).starts
         if not term.free or starts is None:

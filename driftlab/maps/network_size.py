@@ -30,12 +30,11 @@ from itertools import product
 import numpy as np
 
 from driftlab.maps.kind_selection import Progress, side_by_side
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import FittedMap, NetworkMap, Target, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
 
 Key = tuple[Target, int]  # and the neurons
-Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 PARTS = {"training": 0.65, "validation": 0.20, "test": 0.15}
 BINS = 50  # of the temperatures of the soak
@@ -79,7 +78,7 @@ class BinnedPart:
 
     T: Array
     bias: Array
-    bin: Indices
+    bin: Integers
 
     def residual(self, fitted: FittedMap | None) -> BinResidual:
         """Return the means of a map's residual; None is a constant."""
@@ -131,7 +130,7 @@ class BinResidual:
         return float(np.sqrt(len(w) / w.sum()) * np.linalg.norm(self.sigma))
 
 
-def split(N: int, seed: int) -> list[Indices]:
+def split(N: int, seed: int) -> list[Integers]:
     """Return the indices of the samples of each part, in ascending order; together they are all of N."""
     cuts = np.round(np.cumsum(list(PARTS.values()))[:-1] * N).astype(int)
     return [np.sort(part) for part in np.split(np.random.default_rng(seed).permutation(N), cuts)]

@@ -20,7 +20,6 @@ import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, accept, matched_on_axes
 from driftlab.identification.candidates import candidates_of
-from driftlab.identification.columns import Indices
 from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.state import Search
@@ -29,7 +28,7 @@ from driftlab.noise.local_level import one_step
 from driftlab.planning.simulated_search import Body, Information, measured, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Effect
 from fusion_core.thermal.sweeps import one_way
 
@@ -255,7 +254,7 @@ class MonteCarlo:
 class _Fit:
     """Fit of a model to all signals on one axis, on some segments: coefficients (k, m + S) and residual squares."""
 
-    cols: Indices
+    cols: Integers
     beta: Array
     left: Array  # (m + S, m + S), with what the ridge adds
 

@@ -32,10 +32,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.spc.charts import huber
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 
 SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
 DECAY = np.sqrt(0.5)  # of the length from one layer of parts to the next
@@ -46,8 +45,6 @@ MOST = 0.95  # autocorrelation: what is nearer to 1 is a wandering line
 FAR = 3.0  # sigmas to which a residual counts
 PLACES = 50  # of a step, that are compared
 PHI = np.linspace(0.0, MOST, 96)
-
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -202,7 +199,7 @@ def least_alike(z: Array, a: Array, blocks: Iterable[tuple[int, int]] = ()) -> t
     return int(of[best, 0]), int(of[best, 1]), len(of) * _chance(r[best], len(z))
 
 
-def parts(L: int, blocks: Iterable[tuple[int, int]] = ()) -> Index:
+def parts(L: int, blocks: Iterable[tuple[int, int]] = ()) -> Integers:
     """Return begins and ends (P, 2) of the parts of a piece of L, at least 2 SHORTEST, that are looked at."""
     ends, length = np.arange(SHORTEST, L - SHORTEST + 1), float(DECAY * L)
     found = [np.column_stack([np.zeros_like(ends), ends])]
@@ -216,7 +213,7 @@ def parts(L: int, blocks: Iterable[tuple[int, int]] = ()) -> Index:
     return of[(lengths >= SHORTEST) & (lengths <= L - SHORTEST)]
 
 
-def shares(z: Array, a: Array, of: Index) -> Array:
+def shares(z: Array, a: Array, of: Integers) -> Array:
     """Return r (P,) of the parts `of` (P, 2) of values z (L,)."""
     y, (i, j) = scores(z), of.T
     A, W = (np.concatenate([[0.0], np.cumsum(v)]) for v in (a * y, a**2))

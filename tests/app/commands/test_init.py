@@ -201,7 +201,8 @@ def test_without_a_time_column_the_interval_is_asked_for(tmp_path):
 
 def test_dates_in_no_known_form_are_named_with_what_to_write(tmp_path):
     content = table(LOGS["short"])
-    done = written(tmp_path, content | {"t": [f"14. Mär 2025 09:{k // 60:02d}:{k % 60:02d}" for k in range(len(UNIT.t))]})
+    times = [f"14. Mär 2025 09:{k // 60:02d}:{k % 60:02d}" for k in range(len(UNIT.t))]
+    done = written(tmp_path, content | {"t": times})
     assert done.problems == (
         "line 2, column 't': '14. Mär 2025 09:00:00' is neither a number nor a date that is known; write dates as "
         "2026-03-14 09:00:00",
