@@ -20,7 +20,7 @@ from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
-from driftlab.soak.temperature import of_thermometer, soak_temperatures
+from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
@@ -205,10 +205,11 @@ class GatheredSoak:
     windows: tuple[Chunk, ...] = ()
     used: Used = field(default_factory=Used)  # share of the recordings that they are
     steps: Steps = NO_STEPS  # of the thermometer
+    off: Array | None = None  # (N,): how far T may be off between them (`between_steps`), K^2 s
 
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""
-        return brief(self.T, self.bias, self.starts, self.interval, self.t)
+        return brief(self.T, self.bias, self.starts, self.interval, self.t, self.off)
 
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
@@ -247,6 +248,8 @@ def gather(
     smooth, steps = soak_temperatures([(part.t, part.T) for part in parts])
     both = (smooth, [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
+    each = (between_steps(part.t, x, part.T, steps) for part, x in zip(parts, smooth, strict=True))
+    off = np.concatenate(list(each)) if steps.size else None
     interval = float(np.median([part.interval for part in parts]))
     names = [c.source.name for c in configs if c.source is not None]
     _compare(config, parts, names, faults)
@@ -269,6 +272,7 @@ def gather(
         windows,
         used,
         steps,
+        off,
     )
 
 

@@ -69,6 +69,30 @@ def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[A
     return [T for T, _ in smoothed], max((own for _, own in smoothed), default=NO_STEPS)
 
 
+def between_steps(t: Array, T: Array, readings: Array, steps: Steps) -> Array:
+    """Return how far a temperature T (N,) at times t (N,) may be off between the steps, as a density (N,) in K^2 s.
+
+    It is known where it passes from one level of the `readings` (N,) to the next. Between two such passages, L apart,
+    its rate walks by the density k^2 = 3 D^2 / (h + h') that the passages before and after show, D the change of the
+    rate and h, h' the times between them; so it is off by the variance k^2 L^3 / 192 in the middle, and by that of a
+    step at most. All this while it is off by the same: a mean over a time tau has the variance of L / tau of it.
+
+    Source: G. Wahba, Spline Models for Observational Data, SIAM (1990), section 1.5: an integrated walk between knots.
+    """
+    offset = _offset(readings, steps.size)
+    level = np.floor((T - offset) / steps.size + 0.5)
+    passed = np.flatnonzero(np.diff(level)) + 1
+    cuts = np.concatenate([[0], passed, [len(T) - 1]])
+    length = np.maximum(np.diff(t[cuts]), np.finfo(float).tiny)
+    rate = np.diff(T[cuts]) / length
+    walk = 3 * np.diff(rate[1:-1]) ** 2 / (length[2:-1] + length[1:-2])
+    either = np.full(len(length), np.inf)  # of the first and the last, which do not lie between two passages
+    either[1:-1] = np.maximum(np.append(walk, 0.0), np.append(0.0, walk))
+    stay = np.searchsorted(passed, np.arange(len(T)), side="right")
+    within = T - offset - steps.size * level
+    return np.asarray(np.minimum((either * length**3 / 192)[stay], steps.size**2 / 12 + within**2) * length[stay])
+
+
 def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
     """Return a map that knows the thermometer of its soak.
 
@@ -103,6 +127,7 @@ class _Levels:
         place = (means - self.offset) / steps.size
         below = np.floor(place)
         self.middle = self.offset + below * steps.size
+        count = np.maximum(count * min(steps.noise / self.sharp, 1.0), 1.0)
         self.weights = np.stack([(below + 1 - place) * count, (place - below) * count])
 
     def likeliest(self, at: Array, walk: float, first: Array) -> tuple[Array, float]:

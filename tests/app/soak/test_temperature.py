@@ -11,7 +11,7 @@ from driftlab.live.growing_map import GrowingMap
 from driftlab.maps.fit import fit_map, map_settings
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read as read_rows
-from driftlab.soak.temperature import of_thermometer, soak_temperature, soak_temperatures
+from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperature, soak_temperatures
 from fusion_core.faults import Faults
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, steps_of
 
@@ -143,3 +143,17 @@ def test_recordings_share_the_steps_of_their_thermometer():
     np.testing.assert_array_equal(first, soak_temperature(t, whole, steps_of(whole))[0])
     np.testing.assert_array_equal(second, soak_temperature(t[part], whole[part], steps_of(whole))[0])
     assert soak_temperatures([(t, RAMPS)])[1] == NO_STEPS
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 2.0])
+def test_how_far_the_temperature_may_be_off_between_the_steps(step):
+    """By next to nothing on a ramp, on holds by as much as it is off; sigma is that of a stay at one reading."""
+    for true in (RAMPS, STAIRS):
+        T = shown(true, step, 0.0)
+        found, steps = soak_temperature(t, T, steps_of(T))
+        cuts = np.array([0, *(np.flatnonzero(np.diff(T)) + 1), len(T)])
+        stay = np.repeat(np.diff(cuts), np.diff(cuts))
+        sigma = np.sqrt(between_steps(t, found, T, steps) / stay)
+        assert np.sqrt(np.mean(((found - true) / (sigma + 0.05 * step)) ** 2)) < 1.0
+        if true is RAMPS:
+            assert np.median(sigma) < 0.02 * step
