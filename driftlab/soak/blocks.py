@@ -201,7 +201,7 @@ def brief(
     cuts = runs(starts, N, -(-N // SLOTS))
     n, recording = np.diff(cuts, append=N), np.searchsorted(np.asarray(starts), cuts, side="right") - 1
     t, row_T = (cuts + (n - 1) / 2) * interval if times is None else means(times, cuts), means(T, cuts)
-    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(row_T))
+    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * scatter(row_T))
     way = np.concatenate([directions(row_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
     count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n), domain)
@@ -212,7 +212,7 @@ def brief(
     )  # fmt: skip
 
 
-def _scatter(T: Array) -> float:
+def scatter(T: Array) -> float:
     """Return the deviation of temperatures (S,) about straight lines between their neighbours."""
     if len(T) < 3:
         return 0.0
