@@ -26,7 +26,7 @@ from driftlab.maps.kind_selection import TURN
 from driftlab.planning.request import read_range
 from driftlab.soak.blocks import GrowingSoak
 from driftlab.soak.rest import Used, at_rest
-from driftlab.soak.temperature import soak_temperature
+from driftlab.soak.temperature import between_steps, soak_temperature
 from driftlab.storage.map_file import check_place, save
 from driftlab.units import RATE, BiasUnit, tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -175,10 +175,11 @@ class GrowingMap:
         """Fit the blocks as `fit-map` fits samples; the record is that of the samples."""
         blocks, n = self.blocks.rows(), self.blocks.n
         T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), n)
+        off = between_steps(blocks.t, T, blocks.T, steps) if steps.size else None
         interval = n * (self.config.filter.update_interval if self.config.filter else 1.0)
         domain = Used(low=self.used.low, high=self.used.high)
         name = self.config.source.name if self.config.source else ""
-        soak = GatheredSoak(blocks.t, T, blocks.bias, [name], [0], interval, used=domain, steps=steps)
+        soak = GatheredSoak(blocks.t, T, blocks.bias, [name], [0], interval, used=domain, steps=steps, off=off)
         fitted = fit_gathered(self.config, self.settings, soak)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:

@@ -20,7 +20,7 @@ from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
-from driftlab.soak.temperature import of_thermometer, soak_temperatures
+from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
@@ -87,7 +87,7 @@ def fit_gathered(
     """Fit a thermal map on samples; its provenance has `more` too."""
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
     try:
-        fitted = settings.fit(_with_ends_as_read(soak), soak.bias, about)
+        fitted = settings.fit(_to_fit(soak), soak.bias, about)
     except (SingularFit, SwingTooSmall) as error:
         unused = soak.used.sentence()
         raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
@@ -97,15 +97,19 @@ def fit_gathered(
         fitted = soak.placements.widened(fitted, settings.smoother(soak.T, soak.bias))
     residual = residual_of(fitted, settings, soak.T, soak.bias, soak.starts, soak.interval)
     fitted = fitted.noting(**residual.as_record(soak.interval * len(soak.T)))
-    return of_sensor(config, of_thermometer(fitted, soak.steps))
+    return of_sensor(config, of_thermometer(fitted, soak.steps, soak.T, soak.off, soak.interval))
 
 
-def _with_ends_as_read(soak: GatheredSoak) -> Array:
+def _to_fit(soak: GatheredSoak) -> Array:
     """Return the temperatures (N,) in degC, the coldest and the warmest as they were read if smoothing drew them in.
 
+    Of a thermometer without steps its noise is left out here: means of blocks, of which memories show, lose it anyway.
     Without the thermometer's steps they lie within half a step of their readings; a map of them would have to be
     continued by hundredths of a kelvin, over knots that no sample determines, for the readings of its own soak.
     """
+    if soak.steps.size == 0.0:
+        parts = [slice(*part) for part in pairwise([*soak.starts, len(soak.T)])]
+        return np.concatenate([without_noise(soak.t[part], soak.T[part]) for part in parts])
     T, near = soak.T.copy(), soak.steps.size / 2 + 3 * soak.steps.noise
     coldest, warmest = int(np.argmin(T)), int(np.argmax(T))
     if 0 < T[coldest] - soak.used.low <= near:
@@ -205,10 +209,11 @@ class GatheredSoak:
     windows: tuple[Chunk, ...] = ()
     used: Used = field(default_factory=Used)  # share of the recordings that they are
     steps: Steps = NO_STEPS  # of the thermometer
+    off: Array | None = None  # (N,): how far T may be off between them (`between_steps`), K^2 s
 
     def brief(self) -> SoakSummary:
         """Return the summary that an assessment needs."""
-        return brief(self.T, self.bias, self.starts, self.interval, self.t)
+        return brief(self.T, self.bias, self.starts, self.interval, self.t, self.off)
 
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
@@ -247,6 +252,8 @@ def gather(
     smooth, steps = soak_temperatures([(part.t, part.T) for part in parts])
     both = (smooth, [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
+    each = (between_steps(part.t, x, part.T, steps) for part, x in zip(parts, smooth, strict=True))
+    off = np.concatenate(list(each)) if steps.size else None
     interval = float(np.median([part.interval for part in parts]))
     names = [c.source.name for c in configs if c.source is not None]
     _compare(config, parts, names, faults)
@@ -269,6 +276,7 @@ def gather(
         windows,
         used,
         steps,
+        off,
     )
 
 

@@ -158,6 +158,7 @@ CELLS = 120
 TURN = 0.05  # of the range of temperature: less is no turn
 WAYS = {"warming": 1, "cooling": -1}
 CLEAR = 10  # times the scatter of the slots' temperatures: what is in no order, turns nowhere
+OFF = "temperature_off"  # channel of how far T may be off between the steps of a thermometer, K^2 s
 _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 
@@ -188,27 +189,30 @@ class SoakSummary(SoakRows):
         return self.count[row], self.cell_T[row], self.cell_bias[row]
 
 
-def brief(T: Array, bias: Array, starts: Sequence[int], interval: float, times: Array | None = None) -> SoakSummary:
+def brief(
+    T: Array, bias: Array, starts: Sequence[int], interval: float, times: Array | None = None, off: Array | None = None
+) -> SoakSummary:
     """Return the summary of samples T (N,), bias (N, d); each recording begins at one of `starts`, the first at 0.
 
     They are an `interval` apart, s, unless it is known at which `times` (N,) they were: what was not recorded, or was
-    not at rest, is a gap over which a bias wanders on.
+    not at rest, is a gap over which a bias wanders on. T may be `off` (N,) as `between_steps` says.
     """
     N, domain = len(T), (float(T.min()), float(T.max()))
     cuts = runs(starts, N, -(-N // SLOTS))
     n, recording = np.diff(cuts, append=N), np.searchsorted(np.asarray(starts), cuts, side="right") - 1
     t, row_T = (cuts + (n - 1) / 2) * interval if times is None else means(times, cuts), means(T, cuts)
-    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(row_T))
+    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * scatter(row_T))
     way = np.concatenate([directions(row_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
     count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n), domain)
     return SoakSummary(
         t, row_T, means(bias, cuts), n * interval, domain=domain, way=way, recording=recording,
         count=count, cell_T=cell_T, cell_bias=cell_bias, white=_white(bias),
+        channels={} if off is None else {OFF: means(off, cuts)},
     )  # fmt: skip
 
 
-def _scatter(T: Array) -> float:
+def scatter(T: Array) -> float:
     """Return the deviation of temperatures (S,) about straight lines between their neighbours."""
     if len(T) < 3:
         return 0.0

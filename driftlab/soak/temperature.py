@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from driftlab.soak.blocks import CELLS, scatter
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.thermal.curve_error import nested
@@ -31,6 +32,7 @@ GROUPS = 8, 8000  # at least and at most
 NEWTON = 50  # steps, at most
 NEAR = 1e-3  # of a step: no more is to be gained
 ROUNDING = 1e-13  # of the largest second derivative: of a step's direction only
+CLEAR = 3.29  # deviations: noise alone is beyond once in a thousand times
 HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
 
 
@@ -42,21 +44,50 @@ def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[A
     """
     if steps.size == 0.0 or np.ptp(T) == 0:
         return T, steps
-    moved = float(np.sum(np.abs(np.diff(T[:: max(1, len(T) // PASSAGES)])))) / len(T)
-    starts = np.arange(0, len(T), max(1, int(HARDLY * steps.size / moved), len(T) // GROUPS[1]))
-    if len(starts) < GROUPS[0]:
+    grouped = _grouped(t, T, HARDLY * steps.size)
+    if grouped is None:
         return T, steps
+    at, means, count = grouped
+    levels = _Levels(means, each * count, _offset(T, steps.size), steps)
+    smooth = np.interp(t, at, _likeliest(levels, at, means))
+    return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
+
+
+def without_noise(t: Array, T: Array) -> Array:
+    """Return the temperature (N,) in degC of readings T (N,) at times t (N,) in s of a thermometer without steps.
+
+    Where their noise reaches beyond the temperature by less than a cell of the soak, they stay as they are: a curve of
+    readings that are wider is flat at its ends, where there is noise alone.
+    """
+    noise = scatter(T)
+    beyond = noise * np.sqrt(2 * np.log(max(len(T), 2)))  # of the largest of N
+    grouped = _grouped(t, T, HARDLY * noise) if beyond * CELLS > np.ptp(T) > 0 else None
+    if grouped is None:
+        return T
+    at, means, count = grouped
+    return np.interp(t, at, _likeliest(_Noisy(means, count, noise), at, means))
+
+
+def _grouped(t: Array, T: Array, hardly: float) -> tuple[Array, Array, Array] | None:
+    """Return means (K,) of times and readings (N,) over which T moves by so many K, and how many each is of."""
+    moved = float(np.sum(np.abs(np.diff(T[:: max(1, len(T) // PASSAGES)])))) / len(T)
+    starts = np.arange(0, len(T), max(1, int(hardly / moved), len(T) // GROUPS[1]))
+    if len(starts) < GROUPS[0]:
+        return None
     count = np.diff(starts, append=len(T)).astype(np.float64)
     at, means = (np.add.reduceat(values, starts) / count for values in (t, T))
-    levels = _Levels(means, each * count, _offset(T, steps.size), steps)
-    path, evidence = levels.likeliest(at, WALKS[0], means)
+    return at, means, count
+
+
+def _likeliest(readings: _Readings, at: Array, first: Array) -> Array:
+    """Return the path (K,) in degC at times `at` (K,) of the walk of its rate that has the largest evidence."""
+    path, evidence = readings.likeliest(at, WALKS[0], first)
     for walk in WALKS[1:]:
-        tried, its_evidence = levels.likeliest(at, walk, path)
+        tried, its_evidence = readings.likeliest(at, walk, path)
         if its_evidence < evidence:
             break
         path, evidence = tried, its_evidence
-    smooth = np.interp(t, at, path)
-    return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
+    return path
 
 
 def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[Array], Steps]:
@@ -69,20 +100,54 @@ def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[A
     return [T for T, _ in smoothed], max((own for _, own in smoothed), default=NO_STEPS)
 
 
-def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
+def between_steps(t: Array, T: Array, readings: Array, steps: Steps) -> Array:
+    """Return how far a temperature T (N,) at times t (N,) may be off between the steps, as a density (N,) in K^2 s.
+
+    It is known where it passes from one level of the `readings` (N,) to the next. Between two such passages, L apart,
+    its rate walks by the density k^2 = 3 D^2 / (h + h') that the passages before and after show, D the change of the
+    rate and h, h' the times between them; so it is off by the variance k^2 L^3 / 192 in the middle, and by that of a
+    step at most. All this while it is off by the same: a mean over a time tau has the variance of L / tau of it.
+
+    Source: G. Wahba, Spline Models for Observational Data, SIAM (1990), section 1.5: an integrated walk between knots.
+    """
+    offset = _offset(readings, steps.size)
+    level = np.floor((T - offset) / steps.size + 0.5)
+    passed = np.flatnonzero(np.diff(level)) + 1
+    cuts = np.concatenate([[0], passed, [len(T) - 1]])
+    length = np.maximum(np.diff(t[cuts]), NEAR)
+    rate = np.diff(T[cuts]) / length
+    walk = 3 * np.diff(rate[1:-1]) ** 2 / (length[2:-1] + length[1:-2])
+    either = np.full(len(length), np.inf)  # of the first and the last, which do not lie between two passages
+    either[1:-1] = np.maximum(np.append(walk, 0.0), np.append(0.0, walk))
+    stay = np.searchsorted(passed, np.arange(len(T)), side="right")
+    within = T - offset - steps.size * level
+    return np.asarray(np.minimum((either * length**3 / 192)[stay], steps.size**2 / 12 + within**2) * length[stay])
+
+
+def of_thermometer(
+    fitted: FittedMap, steps: Steps, T: Array | None = None, off: Array | None = None, interval: float = 1.0
+) -> FittedMap:
     """Return a map that knows the thermometer of its soak.
 
-    Its two ends tell little: within a step of them no level is passed as a whole.
+    Its two ends tell little: within a step of them no level is passed as a whole. Misfits stay that are more than the
+    samples at T (N,) in degC, an `interval` in s apart, show where they are `off` (N,) as `between_steps` says.
     """
     fitted = fitted.noting(resolution=steps.size, dither=steps.noise)
     error = fitted.record.error
     if error is None or steps.size == 0.0:
         return fitted
     grid = np.asarray(error.T)
-    off = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
+    sawteeth = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
     depth = np.stack([grid[0] + steps.size - grid, grid - grid[-1] + steps.size]) / steps.size
-    modes = (*nested(np.maximum(depth, 0.0)[:, :, None] * off), *error.modes)
-    return fitted.noting(error=error.model_copy(update={"modes": modes}))
+    modes = (*nested(np.maximum(depth, 0.0)[:, :, None] * sawteeth), *error.modes)
+    misfits = []
+    for m in error.misfits:
+        near = np.zeros(0) if T is None or off is None else off[np.abs(T - m.T) <= steps.size / 2]
+        hidden = float(np.sum(near)) / (max(len(near), 1) ** 2 * interval)
+        noise = float(np.hypot(m.noise, fitted.slope(np.array([m.T]))[0, m.axis] * np.sqrt(hidden)))
+        if m.left > CLEAR * noise:
+            misfits.append(m.model_copy(update={"noise": noise}))
+    return fitted.noting(error=error.model_copy(update={"modes": modes, "misfits": tuple(misfits)}))
 
 
 def _offset(T: Array, size: float) -> float:
@@ -91,19 +156,10 @@ def _offset(T: Array, size: float) -> float:
     return near + float(np.median((T - near + size / 2) % size)) - size / 2
 
 
-class _Levels:
-    """The levels that readings show: how likely they are at a temperature.
+class _Readings:
+    """Readings of a temperature, and how likely they are; `size` in K is that of their steps, or of their noise."""
 
-    `means` (K,) in degC and `count` (K,) are of groups of readings, `offset` is one of the levels in degC.
-    """
-
-    def __init__(self, means: Array, count: Array, offset: float, steps: Steps) -> None:
-        self.size, self.offset = steps.size, offset
-        self.sharp = max(steps.noise, HARDLY * steps.size)
-        place = (means - self.offset) / steps.size
-        below = np.floor(place)
-        self.middle = self.offset + below * steps.size
-        self.weights = np.stack([(below + 1 - place) * count, (place - below) * count])
+    size: float
 
     def likeliest(self, at: Array, walk: float, first: Array) -> tuple[Array, float]:
         """Return the path (K,) in degC at times `at` (K,) whose rate walks so much, and the logarithm of its evidence.
@@ -134,7 +190,44 @@ class _Levels:
     def _cost(self, T: Array, smoothness: _Smoothness) -> tuple[float, Array, Array]:
         """Return the logarithm of the posterior, negative, its gradient (K,), and the second derivatives (K,)."""
         roughness, pull = smoothness.of(T)
-        total, slope, bend = roughness, pull, np.zeros(len(T))
+        value, first, second = self.of(T)
+        return roughness + value, pull + first, second
+
+    def of(self, T: Array) -> tuple[float, Array, Array]:
+        """Return -log P of all readings at T (K,), with its first and second derivatives (K,)."""
+        raise NotImplementedError
+
+
+class _Noisy(_Readings):
+    """Means (K,) in degC of so many readings, `count` (K,), of a thermometer with white noise of a deviation in K."""
+
+    def __init__(self, means: Array, count: Array, noise: float) -> None:
+        self.size, self.means, self.weights = noise, means, count / noise**2
+
+    def of(self, T: Array) -> tuple[float, Array, Array]:
+        """Return -log P of all readings at T (K,), with its first and second derivatives (K,)."""
+        off = T - self.means
+        return float(np.sum(self.weights * off**2)) / 2, self.weights * off, self.weights
+
+
+class _Levels(_Readings):
+    """The levels that readings show: how likely they are at a temperature.
+
+    `means` (K,) in degC and `count` (K,) are of groups of readings, `offset` is one of the levels in degC.
+    """
+
+    def __init__(self, means: Array, count: Array, offset: float, steps: Steps) -> None:
+        self.size, self.offset = steps.size, offset
+        self.sharp = max(steps.noise, HARDLY * steps.size)
+        place = (means - self.offset) / steps.size
+        below = np.floor(place)
+        self.middle = self.offset + below * steps.size
+        count = np.maximum(count * min(steps.noise / self.sharp, 1.0), 1.0)
+        self.weights = np.stack([(below + 1 - place) * count, (place - below) * count])
+
+    def of(self, T: Array) -> tuple[float, Array, Array]:
+        """Return -log P of all readings at T (K,), with its first and second derivatives (K,)."""
+        total, slope, bend = 0.0, np.zeros(len(T)), np.zeros(len(T))
         for k, weight in enumerate(self.weights):
             value, first, second = self._of_level(T, self.middle + k * self.size)
             total += float(np.sum(weight * value))

@@ -25,7 +25,8 @@ READINGS = ("temperature_step", "temperature_variance")
 """Channels of what a thermometer's samples showed up to an epoch: its steps in K, and their variance in K^2."""
 
 FINE = 2e-3  # K, of the histogram of the readings
-STEPS = (0.02, 1.5)  # K, that are looked for; set points of a chamber are seldom so close
+PADDED = 4  # times its length: over so many frequencies goes one period to either side
+STEPS = (0.02, 6.0)  # K, that are looked for
 LARGEST = 2.0  # K: a larger change is a jump of the temperature
 MIN_SPECTRUM = 0.15  # of the characteristic function: with less, no steps are seen
 CHANCE = 4.0  # times what so many readings of a fine thermometer have, in the mean
@@ -38,6 +39,10 @@ PART = 0.75  # of a step: a movement is taken over so much of it, to tell steps 
 MIN_WHILE_MOVING = 0.5  # of the characteristic function: where less of it is left then, holds were taken for steps
 NOISELESS = 0.1  # of a step: with less noise before the rounding, steps are jumps
 DIVIDED = 0.4  # of the squares of jumps: a mean of readings leaves two thirds of them
+NEAR = 0.25  # of a step: while the temperature moves so far, readings stay, unless noise makes a mean of several levels
+STAYING = 0.2  # of them
+SAME = 1e-6  # of a step: a difference that is rounding of numbers
+ONE = 1.1  # units, of a usual change: readings that change by one unit, on a ramp between holds too, have that step
 MEDIAN = 0.455  # of squares of normal numbers, of their mean
 AVERAGED = 100  # readings that a mean may be of
 RESTING = 3.0  # deviations of what noise makes of a rest: a larger difference is a movement
@@ -63,38 +68,54 @@ def steps_of(T: Array) -> Steps:
     if len(T) < 2 * PASSAGES or not np.ptp(T) > 2 * STEPS[0]:
         return NO_STEPS
     moved = _movement(T)
-    usual = float(np.average(moved, weights=moved))  # from one reading to the next
+    usual = _usual(moved)
     size = _period(T, moved, max(STEPS[0], PASSED * usual))
     if size == 0.0:
         return NO_STEPS
+    readings(T, memory := started())
+    unit, changes = memory[3], np.abs(np.diff(T))  # which says exactly what the spectrum says to half a frequency
+    if np.sum(changes**2) < ONE * unit * np.sum(changes):
+        size = float(unit)
+    elif unit > 0 and abs(size - round(size / unit) * unit) < size**2 / (2 * PADDED * np.ptp(T)):
+        size = float(round(size / unit) * unit)
+    over = moved  # a step at least: over less, it moves at the jumps alone
+    if usual * (len(T) // PASSAGES) < size:
+        over = _movement(T, int(size * len(T) / float(np.sum(moved))))
     # of means of readings between which it hardly moves: noise is averaged out, the sawtooth is not
     n = int(np.clip(STILL * size / usual, 1, len(T) // (2 * PASSAGES)))
     stop = len(T) // n * n
-    means, weights = T[:stop].reshape(-1, n).mean(axis=1), moved[:stop].reshape(-1, n).sum(axis=1)
+    means, weights = T[:stop].reshape(-1, n).mean(axis=1), over[:stop].reshape(-1, n).sum(axis=1)
     left = float(np.average(np.diff(means, n=2) ** 2, weights=weights[1:-1])) / 6
     passed = float(np.abs(np.average(np.exp(2j * np.pi * means / size), weights=weights)))
     spread = min(2 * (np.pi / size) ** 2 * left, ALL_NOISE)
     a = float(np.interp(passed * np.exp(spread), _characteristic(), ROUNDED))
-    unit = readings(T, started()).step[-1]  # which says exactly what the spectrum says to a part in a thousand
-    if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
-        size = float(round(size / unit) * unit)
     noise = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
     steps = Steps(size, max(noise, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
-    return steps if _jumps(T, steps, float(np.sum(moved))) else NO_STEPS
+    return steps if _jumps(T, steps, moved) else NO_STEPS
 
 
-def _jumps(T: Array, steps: Steps, path: float) -> bool:
+def _jumps(T: Array, steps: Steps, moved: Array) -> bool:
     """Return True if the readings jump and flicker as under such steps, or hold or rest at places that are alike.
 
-    On a path of so many K there is a jump for each step, which a mean may divide in two; with noise before the rounding
-    readings flicker instead, and a mean of AVERAGED of them still does.
+    On a path that `moved` (N,) so many K there is a jump for each step, which a mean may divide in two; a little noise
+    spreads it over several means, and those between the jumps stay the same while the temperature moves. With more
+    noise before the rounding readings flicker instead, and a mean of AVERAGED of them still does.
     """
     squares = np.diff(T) ** 2
     if steps.noise < NOISELESS * steps.size:
-        return float(np.sum(squares) - len(squares) * np.median(squares) / MEDIAN) > DIVIDED * steps.size * path
+        jumped = float(np.sum(squares) - len(squares) * np.median(squares) / MEDIAN)
+        return jumped > DIVIDED * steps.size * float(np.sum(moved)) or _stay(T, steps.size, moved) > STAYING
     noise, variance = _flicker()
     flicker = steps.size**2 * float(np.interp(steps.noise / steps.size, noise, variance))
     return float(np.mean(squares)) > 2 * flicker / AVERAGED
+
+
+def _stay(T: Array, size: float, moved: Array) -> float:
+    """Return the share of readings that are the same after the temperature moved by a part of a step of `size` K."""
+    passing = _while_passing(T, moved, size)
+    n = int(np.clip(NEAR * size / _usual(passing), 1, len(T) // 2))
+    same, moving = np.abs(T[n:] - T[:-n]) < SAME * size, passing[n:] > _usual(passing) / 2
+    return float(np.sum(same & moving)) / max(int(np.sum(moving)), 1)
 
 
 def _movement(T: Array, n: int = 0) -> Array:
@@ -114,33 +135,45 @@ def _movement(T: Array, n: int = 0) -> Array:
 def _period(T: Array, moved: Array, least: float) -> float:
     """Return the largest period of the readings that stands out, `least` K or more; 0 where none does."""
     place = np.rint((T - T.min()) / FINE).astype(np.int64)
-    count = 1 << int(np.ceil(np.log2(4 * (place.max() + 1))))
+    count = 1 << int(np.ceil(np.log2(PADDED * (place.max() + 1))))
     spectrum = np.abs(np.fft.rfft(np.bincount(place, moved, count))) / np.sum(moved)
     f = np.arange(len(spectrum)) / (count * FINE)
     spectrum[f < 1 / STEPS[1]] = 0.0
     enough = max(MIN_SPECTRUM, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
     for k in np.flatnonzero((spectrum > enough) & (f < 1 / least)):
         about = spectrum[int(0.8 * k) : int(1.25 * k) + 1]
-        prominent = spectrum[k] == about.max() and spectrum[k] > PROMINENT * np.sqrt(np.mean(about**2))
+        beside = np.concatenate([about[: k - int(0.8 * k) - PADDED], about[k - int(0.8 * k) + PADDED + 1 :]])
+        prominent = spectrum[k] == about.max() and spectrum[k] > PROMINENT * np.sqrt(np.mean(beside**2))
         if prominent and _while_moving(T, moved, 1 / float(f[k])) > max(MIN_SPECTRUM, MIN_WHILE_MOVING * spectrum[k]):
             return 1 / float(f[k])
     return 0.0
 
 
 def _while_moving(T: Array, moved: Array, size: float) -> float:
-    """Return the characteristic function at steps of `size` K, a movement taken over a part of one; 0: too short.
+    """Return the characteristic function at steps of `size` K, a movement taken over a part of one; 0: too short."""
+    moved = _while_passing(T, moved, size)
+    if size < PASSED * _usual(moved):
+        return 0.0
+    return float(np.abs(np.average(np.exp(2j * np.pi * T / size), weights=moved)))
+
+
+def _while_passing(T: Array, moved: Array, size: float) -> Array:
+    """Return the movement from one reading to the next (N,), taken over a part of a step of `size` K.
 
     Over more, a short ramp counts in part for the holds before and after it, and those of a staircase are alike: of 5 K
     they pass for steps of a third of that. What readings have of true steps, holds or not, stays.
     """
-    n, usual = len(T), float(np.average(moved, weights=moved))
+    n, usual = len(T), _usual(moved)
     noise = RESTING * float(np.sqrt(np.mean(np.diff(T, n=2) ** 2) / 3))
     while (shorter := max(3, int(PART * size / usual), int((noise / usual) ** (2 / 3)))) < n:
         n, moved = shorter, _movement(T, shorter)
-        usual = float(np.average(moved, weights=moved))
-    if size < PASSED * usual:
-        return 0.0
-    return float(np.abs(np.average(np.exp(2j * np.pi * T / size), weights=moved)))
+        usual = _usual(moved)
+    return moved
+
+
+def _usual(moved: Array) -> float:
+    """Return the usual movement (N,) from one reading to the next, where it moves."""
+    return float(np.average(moved, weights=moved))
 
 
 def _characteristic() -> Array:

@@ -25,8 +25,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.blocks import SoakRows, SoakSummary, means, runs
-from fusion_core.chunk import Array, Integers
+from driftlab.soak.blocks import CELLS, OFF, SoakRows, SoakSummary, means, runs
+from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about; half as many miss one more memory in a hundred
@@ -105,7 +105,12 @@ class SoakContrasts:
     def __init__(self, soak: SoakSummary) -> None:
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
         self._starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
-        self.blocks, self.soak, recording = soak.coarsened(self._starts), soak, soak.recording[self._starts]
+        blocks, self.soak = soak.coarsened(self._starts), soak
+        self.known = self._known(blocks, soak)
+        self.blocks, recording = blocks.part(self.known), soak.recording[self._starts][self.known]
+        self.laws: list[tuple[Array, Array]] = []
+        if len(self.blocks.T) < 2 * MIN_CONTRASTS:
+            return
         bias = self.blocks.bias
         self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
@@ -121,6 +126,20 @@ class SoakContrasts:
         self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
         self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
         self._fits: dict[int, tuple[Array, Array, Array]] = {}
+
+    def _known(self, blocks: SoakRows, soak: SoakSummary) -> Flags:
+        """Return the blocks (K,) in which the steps of the thermometer hide less than white noise does.
+
+        What T is off by there, times the slope, is alike on all axes, so that d of them tell no more than one.
+        """
+        off = blocks.channels.get(OFF)
+        if off is None:
+            return np.ones(len(blocks.T), dtype=bool)
+        curve, h = FreeCurve(soak.domain, KNOTS[0]), np.ptp(soak.domain) / CELLS
+        c = np.linalg.lstsq(curve(blocks.T), blocks.bias, rcond=RANK)[0]
+        slope = (curve(blocks.T + h) - curve(blocks.T - h)) @ c / (2 * h)
+        white = soak.white**2 * np.sum(soak.span) / np.sum(soak.count)
+        return np.asarray(np.all(len(white) * slope**2 * off[:, None] <= white, axis=1))
 
     def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
@@ -148,7 +167,7 @@ class SoakContrasts:
 
     def means(self, values: Array) -> Array:
         """Return the means (K, ...) of values of the slots (S, ...) over the blocks."""
-        return means(values, self._starts, self.soak.span)
+        return means(values, self._starts, self.soak.span)[self.known]
 
     @cached_property
     def u(self) -> Array:

@@ -29,6 +29,8 @@ WHY = {
     "no way": "the temperature goes neither up nor down in the order of the samples: hysteresis cannot be seen",
     "apart": "warming and cooling share too few temperatures: hysteresis cannot be seen; come back by the same steps",
     "short": "too short on its way up or down to distinguish hysteresis from noise; go slower, or up and down again",
+    "coarse": "the thermometer reads in steps too coarse for what is between up and down; go faster, so that the "
+    "temperature rests within no step, or take a finer thermometer",
     "levels": "each recording or placement goes one way and has a level of its own: a hysteresis that is alike at "
     "all temperatures cannot be seen; warm and cool within one",
     "weak": "only a hysteresis larger than all that the bias does here would be seen; go up and down again, or slower",
@@ -120,7 +122,7 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
     with _threads().limit(limits=1):  # of small matrices
         contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
         if not contrasts.laws or not shapes.kinds:
-            return MemoryVerdict.unknown(d, WHY["short"])
+            return MemoryVerdict.unknown(d, WHY["short" if np.all(contrasts.known) else "coarse"])
         added = np.repeat(shapes.added[:, :, None], d, axis=2)
         z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
         followed, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), None

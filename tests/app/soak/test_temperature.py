@@ -11,9 +11,16 @@ from driftlab.live.growing_map import GrowingMap
 from driftlab.maps.fit import fit_map, map_settings
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read as read_rows
-from driftlab.soak.temperature import of_thermometer, soak_temperature, soak_temperatures
+from driftlab.soak.temperature import (
+    between_steps,
+    of_thermometer,
+    soak_temperature,
+    soak_temperatures,
+    without_noise,
+)
 from fusion_core.faults import Faults
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, steps_of
+from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 t = np.arange(21_600.0)
 RAMPS = behind(np.interp(t, [0, 10_400, 11_200, 21_600], [-10.0, 50.0, 50.0, -10.0]), 240.0, 1.0)
@@ -143,3 +150,41 @@ def test_recordings_share_the_steps_of_their_thermometer():
     np.testing.assert_array_equal(first, soak_temperature(t, whole, steps_of(whole))[0])
     np.testing.assert_array_equal(second, soak_temperature(t[part], whole[part], steps_of(whole))[0])
     assert soak_temperatures([(t, RAMPS)])[1] == NO_STEPS
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 2.0])
+def test_how_far_the_temperature_may_be_off_between_the_steps(step):
+    """By next to nothing on a ramp, on holds by as much as it is off; sigma is that of a stay at one reading."""
+    for true in (RAMPS, STAIRS):
+        T = shown(true, step, 0.0)
+        found, steps = soak_temperature(t, T, steps_of(T))
+        cuts = np.array([0, *(np.flatnonzero(np.diff(T)) + 1), len(T)])
+        stay = np.repeat(np.diff(cuts), np.diff(cuts))
+        sigma = np.sqrt(between_steps(t, found, T, steps) / stay)
+        assert np.sqrt(np.mean(((found - true) / (sigma + 0.05 * step)) ** 2)) < 1.0
+        if true is RAMPS:
+            assert np.median(sigma) < 0.02 * step
+
+
+@pytest.mark.parametrize(("step", "noise"), [(2.0, 0.0), (5.0, 0.02), (0.0, 0.2), (0.0, 1.0)])
+def test_what_a_thermometer_hides_is_no_bend_of_the_map(step, noise):
+    """A parabola is fitted with one: noise of the readings flattens it at its ends, and steps shift it there."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        T = read(RAMPS, step, noise, rng)
+        bias = (8 * RAMPS + 0.1 * RAMPS**2)[:, None] + 10 * rng.normal(size=(len(t), 1))
+        bias += np.cumsum(0.03 * rng.normal(size=bias.shape), axis=0)
+        found, steps = soak_temperature(t, T, steps_of(T)) if step else (without_noise(t, T), NO_STEPS)
+        off = between_steps(t, found, T, steps) if step else None
+        fitted = of_thermometer(Polynomial(order=2).fit(found, bias, {}), steps, found, off)
+        assert fitted.record.error.misfits == ()
+        error = fitted.bias(found)[:, 0] - (8 * RAMPS + 0.1 * RAMPS**2)
+        assert np.std(error) < 2 * max(np.sqrt(np.mean(fitted.sigma(found) ** 2)), 1.0)
+
+
+def test_a_bend_that_is_there_is_told_with_a_coarse_thermometer():
+    T = read(RAMPS, 2.0, 0.0, np.random.default_rng(0))
+    bias = (20 * np.sin(RAMPS / 5))[:, None] + 10 * np.random.default_rng(1).normal(size=(len(t), 1))
+    found, steps = soak_temperature(t, T, steps_of(T))
+    off = between_steps(t, found, T, steps)
+    assert of_thermometer(Polynomial(order=2).fit(found, bias, {}), steps, found, off).record.error.misfits

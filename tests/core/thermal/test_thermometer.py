@@ -41,6 +41,19 @@ def test_steps_are_seen_through_noise_and_averages(step, noise, mean):
     assert left[0] == pytest.approx(left[1], rel=0.3)
 
 
+@pytest.mark.parametrize("mean", [1, 10])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize("step", [0.25, 2.0, 5.0])
+def test_coarse_steps_are_seen_on_a_slow_ramp(step, noise, mean):
+    """Passing a border takes some seconds: means of ten readings then show several levels between two steps."""
+    if noise > 0.1 * step:
+        return
+    T = 20 - 40 * np.abs(np.linspace(-1, 1, 14_400 * mean)) + 0.137
+    found = steps_of(shown(T, step, noise, mean))
+    assert found.size == pytest.approx(step, rel=1e-6)
+    assert found.noise < max(1.2 * noise, 0.02 * step)
+
+
 def test_steps_are_seen_through_long_averages():
     """Epochs of 10 s of means of ten, from -10 to 50 and back in six hours: a seventh of the sawtooth is left."""
     t = np.arange(0, 21_600, 0.1)

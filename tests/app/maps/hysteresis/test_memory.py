@@ -9,6 +9,8 @@ from loop_cases.signatures import dragged, late
 from driftlab.maps.hysteresis import memory as module
 from driftlab.maps.hysteresis.memory import memory_of
 from driftlab.soak.blocks import brief
+from driftlab.soak.temperature import between_steps, soak_temperature
+from fusion_core.thermal.thermometer import steps_of
 
 DT = 10.0
 TURNS = {"once": [-20, 50, -20], "twice": [-20, 50, -20, 50, -20], "room": [25, -20, 50, -20, 25]}
@@ -226,3 +228,39 @@ def test_a_walk_over_what_was_not_recorded_is_no_memory():
         bias = curve(T) + np.cumsum(0.03 * np.sqrt(DT) * walk, axis=0) + 2 / np.sqrt(DT) * white
         answers.append([memory_of(brief(T[kept], bias[kept], [0], DT, times)).answer for times in (t[kept], None)])
     assert all(timed != "seen" == untimed for timed, untimed in answers)
+
+
+def read_in_steps(seed, profile, step, rounded, play=0.0):
+    """Judge a soak of 5 h at 1 Hz whose thermometer rounds to a step in K."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(18_000.0)
+    levels = np.repeat([-20.0, -5, 10, 25, 40, 55, 40, 25, 10, -5, -20], 1637)[: len(t)]
+    T = {
+        "triangle": 57.3 - 78 * np.abs(t / 9000 - 1),
+        "sines": 18.3 - 39 * np.cos(4 * np.pi * t / 18_000),
+        "stairs": late(levels + 0.9, 300, 1.0),
+    }[profile]
+    bias = curve(T) + play * (T - dragged(T, 8.0))[:, None] / 8 * [1.0, -2 / 3, 0.0]
+    bias += np.cumsum(0.03 * rng.normal(size=bias.shape), axis=0) + 10 * rng.normal(size=bias.shape)
+    readings = rounded(T / step) * step
+    smooth, steps = soak_temperature(t, readings, steps_of(readings))
+    return memory_of(brief(smooth, bias, [0], 1.0, t, between_steps(t, smooth, readings, steps)))
+
+
+@pytest.mark.parametrize("rounded", [np.round, np.floor])
+@pytest.mark.parametrize("profile", ["triangle", "sines", "stairs"])
+@pytest.mark.parametrize("step", [0.5, 2.0, 5.0])
+def test_the_steps_of_a_thermometer_are_no_memory(step, profile, rounded):
+    """Between two steps it does not show where the temperature is, as at a turn or on a hold."""
+    assert not any(read_in_steps(seed, profile, step, rounded).answer == "seen" for seed in range(3))
+
+
+@pytest.mark.parametrize("step", [2.0, 5.0])
+def test_a_memory_is_seen_with_a_coarse_thermometer(step):
+    found = read_in_steps(0, "triangle", step, np.round, play=30.0)
+    assert found.answer == "seen"
+    assert abs(found.size[0] - 30) < 3 * found.sigma[0]
+
+
+def test_a_thermometer_that_is_too_coarse_is_the_reason_of_no_verdict():
+    assert "thermometer" in read_in_steps(0, "stairs", 5.0, np.round).why
