@@ -95,8 +95,9 @@ def _offered(
     grid = [e for e in cls(axes=("x",)).proposals(forward) if _may_open(e)]  # type: ignore[call-arg]
     if not grid:
         return [], False, []
-    acting = grid[0].acts_on_input
-    timeless = not grid[0].walks and grid[0].memory_span is None and len(cls.continuous) == 1
+    acting, settles = grid[0].acts_on_input, grid[0].walks
+    grid = grid[::2] if settles else grid  # one exponential is much like the next
+    timeless = not settles and grid[0].memory_span is None and len(cls.continuous) == 1
     if not remembers(_shown(grid[0], forward), _shown(grid[0], backward)):
         return [], acting, []  # whatever its hyper-parameters
     if timeless and not acting:
