@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence, of_a_jump
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array
@@ -38,6 +38,8 @@ WHY = {
     "down again, by the same steps",
     "brief": "up and down differ as where the sensor follows its thermometer by less than a minute, which may be their "
     "places or when they are read: whether it remembers more is not known; go up and down faster, and slower",
+    "jump": "up and down differ as where the bias jumped after {hours:.3g} h: whether it remembers is not known; go up "
+    "and down again, by the same steps",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
     "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
@@ -204,15 +206,20 @@ class _MemoryTest:
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
             why = "slight"
-        narrow = None if why == "seen" else _narrow(self.contrasts.soak)
-        why = "narrow" if narrow is not None else why
-        if why in ("brief", "slight", "narrow"):
+        about: dict[str, Any] | None = None
+        if why == "seen":
+            jump, when = of_a_jump(self.contrasts)
+            if total - jump < SEEN:
+                why, about = "jump", {"hours": (when - self.contrasts.soak.t[0]) / 3600}
+        elif (about := _narrow(self.contrasts.soak)) is not None:
+            why = "narrow"
+        if why in ("brief", "jump", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
         reason = "; ".join(
-            [WHY[why].format(**narrow or {}), *(f"could not be tried: {text}" for text in self.shapes.broken)]
+            [WHY[why].format(**about or {}), *(f"could not be tried: {text}" for text in self.shapes.broken)]
         )
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
