@@ -250,13 +250,11 @@ def gather(
     windows = tuple(window for part in parts for window in part.windows)
     starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
     smooth, steps = soak_temperatures([(part.t, part.T) for part in parts])
-    both = (smooth, [part.bias for part in parts])
-    T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
+    T, bias = (np.concatenate(arrays) for arrays in (smooth, [part.bias for part in parts]))
     each = (between_steps(part.t, x, part.T, steps) for part, x in zip(parts, smooth, strict=True))
     off = np.concatenate(list(each)) if steps.size else None
     interval = float(np.median([part.interval for part in parts]))
-    names = [c.source.name for c in configs if c.source is not None]
-    _compare(config, parts, names, faults)
+    _compare(config, parts, names := [c.source.name for c in configs if c.source is not None], faults)
     placements, unknown = None, None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is not None and np.ptp(T) > 0:
         first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]

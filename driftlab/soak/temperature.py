@@ -101,7 +101,7 @@ def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[A
 
 
 def between_steps(t: Array, T: Array, readings: Array, steps: Steps) -> Array:
-    """Return how far a temperature T (N,) at times t (N,) may be off between the steps, as a density (N,) in K^2 s.
+    """Return the density (N,) in K^2 s by which a temperature T (N,) at times t (N,) may be off between the steps.
 
     It is known where it passes from one level of the `readings` (N,) to the next. Between two such passages, L apart,
     its rate walks by the density k^2 = 3 D^2 / (h + h') that the passages before and after show, D the change of the
@@ -127,7 +127,7 @@ def between_steps(t: Array, T: Array, readings: Array, steps: Steps) -> Array:
 def of_thermometer(
     fitted: FittedMap, steps: Steps, T: Array | None = None, off: Array | None = None, interval: float = 1.0
 ) -> FittedMap:
-    """Return a map that knows the thermometer of its soak.
+    """Return the map with what the thermometer of its soak hides.
 
     Its two ends tell little: within a step of them no level is passed as a whole. Misfits stay that are more than the
     samples at T (N,) in degC, an `interval` in s apart, show where they are `off` (N,) as `between_steps` says.

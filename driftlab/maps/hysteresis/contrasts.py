@@ -104,10 +104,10 @@ class SoakContrasts:
 
     def __init__(self, soak: SoakSummary) -> None:
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
-        self._starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
-        blocks, self.soak = soak.coarsened(self._starts), soak
+        self.starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
+        blocks, self.soak = soak.coarsened(self.starts), soak
         self.known = self._known(blocks, soak)
-        self.blocks, recording = blocks.part(self.known), soak.recording[self._starts][self.known]
+        self.blocks, recording = blocks.part(self.known), soak.recording[self.starts][self.known]
         self.laws: list[tuple[Array, Array]] = []
         if len(self.blocks.T) < 2 * MIN_CONTRASTS:
             return
@@ -167,7 +167,7 @@ class SoakContrasts:
 
     def means(self, values: Array) -> Array:
         """Return the means (K, ...) of values of the slots (S, ...) over the blocks."""
-        return means(values, self._starts, self.soak.span)[self.known]
+        return means(values, self.starts, self.soak.span)[self.known]
 
     @cached_property
     def u(self) -> Array:

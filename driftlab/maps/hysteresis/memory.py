@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence, of_a_jump
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array
@@ -40,6 +40,8 @@ WHY = {
     "places or when they are read: whether it remembers more is not known; go up and down faster, and slower",
     "settles": "up and down differ as where the bias settles after the start, whatever the temperature: whether it "
     "remembers more is not known; let it settle before the soak, or leave the first hours out with PATH::START:STOP",
+    "jump": "up and down differ as where the bias jumped after {hours:.3g} h: whether it remembers is not known; go up "
+    "and down again, by the same steps",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
     "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
@@ -202,28 +204,39 @@ class _MemoryTest:
         noise = np.argmax(self.evidence.noises, axis=0)
         pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
-        brief = self.evidence.as_they_are(self.shapes.brief)
-        settles = self.evidence.alone(self.shapes.settling)
-        why = "seen" if seen else "hint" if total > HINT else "none"
-        if seen and total - max(brief, settles) < SEEN:
-            why = "brief" if brief > settles else "settles"
-        if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
-            why = "slight"
-        narrow = None if why == "seen" else _narrow(self.contrasts.soak)
-        why = "narrow" if narrow is not None else why
-        if why in ("brief", "settles", "slight", "narrow"):
+        why, about = self._why(bool(np.any(np.abs(size) > CLEAR * sigma)))
+        if why in ("brief", "settles", "jump", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        reason = "; ".join(
-            [WHY[why].format(**narrow or {}), *(f"could not be tried: {text}" for text in self.shapes.broken)]
-        )
+        reason = "; ".join([WHY[why].format(**about), *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
         return MemoryVerdict(
             answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread, over
         )
+
+    def _why(self, clear: bool) -> tuple[str, dict[str, Any]]:
+        """Return the reason, a key of WHY, with what it names; `clear`: whether the size is beyond its uncertainty.
+
+        What is much likelier with a memory may be as likely with another cause.
+        """
+        total, contrasts, why = self.evidence.total, self.contrasts, "none"
+        if total > SEEN:
+            jump, when = of_a_jump(contrasts)
+            brief, settles = self.evidence.as_they_are(self.shapes.brief), self.evidence.alone(self.shapes.settling)
+            rivals = {"brief": brief, "settles": settles, "jump": jump}
+            rival = max(rivals, key=rivals.__getitem__)
+            if total - rivals[rival] < SEEN:
+                return rival, {"hours": (when - contrasts.soak.t[0]) / 3600}
+            if clear:
+                return "seen", {}
+            why = "slight"
+        elif total > HINT:
+            why = "hint"
+        narrow = _narrow(contrasts.soak)
+        return (why, {}) if narrow is None else ("narrow", narrow)
 
     def _following(self) -> _MemoryTest:
         """Return the same of shapes whose curves follow their inputs, estimated from the soak: for their sizes."""
