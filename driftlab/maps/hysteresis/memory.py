@@ -200,11 +200,14 @@ class _MemoryTest:
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.bias, axis=0)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
+        settles = self.evidence.alone(self.shapes.settling)
         sized = self if total <= HINT else self._following()
+        if not (settles > HINT and total - settles < SEEN):  # how far it would open says nothing of a memory
+            sized = replace(sized, added=np.where(self.shapes.settling[:, None], 0.0, sized.added))
         noise = np.argmax(self.evidence.noises, axis=0)
         pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
-        why, about = self._why(bool(np.any(np.abs(size) > CLEAR * sigma)))
+        why, about = self._why(settles, clear=bool(np.any(np.abs(size) > CLEAR * sigma)))
         if why in ("brief", "settles", "jump", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
@@ -217,16 +220,15 @@ class _MemoryTest:
             answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread, over
         )
 
-    def _why(self, clear: bool) -> tuple[str, dict[str, Any]]:
+    def _why(self, settles: float, *, clear: bool) -> tuple[str, dict[str, Any]]:
         """Return the reason, a key of WHY, with what it names; `clear`: whether the size is beyond its uncertainty.
 
-        What is much likelier with a memory may be as likely with another cause.
+        What is much likelier with a memory may be as likely with another cause, as where the bias `settles`.
         """
         total, contrasts, why = self.evidence.total, self.contrasts, "none"
         if total > SEEN:
             jump, when = of_a_jump(contrasts)
-            brief, settles = self.evidence.as_they_are(self.shapes.brief), self.evidence.alone(self.shapes.settling)
-            rivals = {"brief": brief, "settles": settles, "jump": jump}
+            rivals = {"brief": self.evidence.as_they_are(self.shapes.brief), "settles": settles, "jump": jump}
             rival = max(rivals, key=rivals.__getitem__)
             if total - rivals[rival] < SEEN:
                 return rival, {"hours": (when - contrasts.soak.t[0]) / 3600}
@@ -270,7 +272,7 @@ class _MemoryTest:
             size = np.maximum(np.diag(gram), 1e-300)
             alike[:, :, axis] = gram**2 / size / size[:, None]
         sizes = self.evidence.would_show(np.minimum(alike, 1.0)) * np.abs(self._openings[0])
-        return np.asarray(np.max(sizes, axis=0) * self.contrasts.scale)
+        return np.asarray(np.max(sizes[~self.shapes.settling], axis=0) * self.contrasts.scale)
 
     def _kinds(self, pairs: Pairs) -> tuple[tuple[str, ...], bool]:
         """Return the kinds that are likely, the likeliest first, and whether two of them are there together."""

@@ -64,7 +64,7 @@ def test_a_memory_is_seen_with_its_kind_and_its_size(profile, kind, effect):
     if kind != "relax":  # whose difference at one temperature is less than that over time
         np.testing.assert_allclose(np.abs(found.size[:2]), [24, 16], atol=4 * found.sigma[:2].max())
     assert found.size[0] * found.size[1] < 0
-    assert found.sigma[:2].max() < 4
+    assert found.sigma.max() < 4
     assert abs(found.size[2]) < 4 * found.sigma[2]
 
 
@@ -255,12 +255,12 @@ def test_the_steps_of_a_thermometer_are_no_memory(step, profile, rounded):
     assert not any(read_in_steps(seed, profile, step, rounded).answer == "seen" for seed in range(3))
 
 
-@pytest.mark.parametrize(("step", "profile"), [(2.0, "triangle"), (5.0, "sines")])
-def test_a_memory_is_seen_with_a_coarse_thermometer(step, profile):
-    """What a step hides at a single turn may be a jump of the bias there, and not at each of several."""
-    found = read_in_steps(0, profile, step, np.round, play=30.0)
+def test_a_memory_is_seen_with_a_coarse_thermometer():
+    """What a step of 5 K hides at a single turn may be a jump of the bias there: it is not denied."""
+    found = read_in_steps(0, "triangle", 2.0, np.round, play=30.0)
     assert found.answer == "seen"
     assert abs(found.size[0] - 30) < 3 * found.sigma[0]
+    assert read_in_steps(0, "triangle", 5.0, np.round, play=30.0).why.startswith("up and down differ as where the bias")
 
 
 def test_a_thermometer_that_is_too_coarse_is_the_reason_of_no_verdict():
