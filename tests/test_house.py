@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3918
+    assert 0 < count <= 3941
 
 
 def imports():
@@ -259,28 +259,28 @@ BUDGET = {
     "driftlab": 631,
     "driftlab/commands": 3797,
     "driftlab/evaluation": 1509,
-    "driftlab/family": 3351,
+    "driftlab/family": 3347,
     "driftlab/filtering": 1260,
-    "driftlab/identification": 2254,
-    "driftlab/live": 844,
-    "driftlab/maps": 1843,
-    "driftlab/noise": 1253,
-    "driftlab/planning": 1222,
+    "driftlab/identification": 2252,
+    "driftlab/live": 845,
+    "driftlab/maps": 1909,
+    "driftlab/noise": 1374,
+    "driftlab/planning": 1221,
     "driftlab/production": 3192,
     "driftlab/products": 6,
     "driftlab/recordings": 656,
-    "driftlab/reports": 3539,
-    "driftlab/soak": 693,
-    "driftlab/spc": 1542,
-    "driftlab/starter": 890,
+    "driftlab/reports": 3542,
+    "driftlab/soak": 751,
+    "driftlab/spc": 1540,
+    "driftlab/starter": 894,
     "driftlab/storage": 1275,
-    "driftlab/triad": 712,
+    "driftlab/triad": 717,
     "fusion_core": 1907,
     "fusion_core/contracts": 1963,
     "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1205,
+    "fusion_core/thermal": 1228,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 246,

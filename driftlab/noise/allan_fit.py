@@ -103,7 +103,7 @@ def fit(curve: AllanCurve) -> Coefficients:
 
 
 def _unsteady(curve: AllanCurve, model: Design, first: int) -> Unsteady | None:
-    """Return what is unsteady in the noise, as averaging time number `first` tells it.
+    """Return the unsteady part of the noise, by averaging time number `first`; None where there surely is none.
 
     A term has as much of it as it has of the variance there.
     """

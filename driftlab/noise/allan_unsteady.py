@@ -73,7 +73,7 @@ class Unsteady:
 
     @property
     def note(self) -> str:
-        """What is found, for the user."""
+        """Sentence for the user."""
         return (
             "single samples stand out, or the noise is stronger at some times than at others: the mean squares of "
             f"equal parts of the recording scatter {self.times:.2g} times as much as those of steady Gaussian noise, "
@@ -99,7 +99,7 @@ def tail(rate: Array, stretches: Integers) -> float:
 
 
 def unsteady_of(parts: Array, m: Array, first: int, steady: tuple[float, Array, float]) -> Unsteady | None:
-    """Return what is unsteady in noise; None where it surely is not.
+    """Return the unsteady part of noise; None where there surely is none.
 
     Parameters
     ----------
