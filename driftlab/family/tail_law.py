@@ -111,13 +111,14 @@ class TailLaws(BaseModel):
 
 
 def _widths(off: Array) -> tuple[Array, Array]:
-    """Return the widths (m,) below and above of values (n, m) about their medians.
+    """Return the widths (m,) below and above of values (n, m) in their own deviations, about their medians.
 
-    As far apart as more than chance has them (James and Stein): a width of one side is of half the values.
+    As far apart as more than chance has them (James and Stein): a width of one side is of half the values. Where most
+    are the same, as where a walk or a loop does not show, it is that deviation.
     """
     # a column at a time: a million units need no table more
     sides = [np.array([1.4826 * np.median(np.abs(x[s * x >= 0])) for x in off.T]) for s in (-1, 1)]
-    both = np.array([1.4826 * np.nanmedian(np.abs(x)) for x in off.T])
+    both = np.array([1.4826 * np.nanmedian(np.abs(x)) or 1.0 for x in off.T])
     tiny = 1e-6 * both + np.finfo(float).tiny
     apart = np.log(np.maximum(sides[1], tiny) / np.maximum(sides[0], tiny))
     chance = OF_SIDES / np.sum(np.isfinite(off), axis=0)

@@ -16,7 +16,8 @@ s' is the mean moving range over 1.128, which is worth 0.6 of the degrees of fre
 An index counts units beyond the limit by the tail of a normal law. There is none where the Anderson-Darling test
 rejects that law, mean and deviation being estimated (Stephens, Journal of the American Statistical Association 69
 (1974) 730; p-values of D'Agostino and Stephens, Goodness-of-Fit Techniques (1986), table 4.9), nor of fewer units than
-could show another law. The share of units beyond the limit (Clopper and Pearson) needs no law.
+could show another law, nor where units resemble those before them: n of them tell less than n that are independent. The
+share of units beyond the limit (Clopper and Pearson) needs no law.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from fusion_core.chunk import Array
 
 ENOUGH = 25  # units of an index; of fewer the test of normality sees little (AIAG: 25 subgroups)
 NORMAL = 0.01  # p-value below which values are not taken for normal
+RESEMBLING = 2.326  # deviations (1 / sqrt(n)) of an autocorrelation, which one of a hundred independent lines exceeds
 WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
 D2 = float(2 / np.sqrt(np.pi))  # mean moving range of normal values over their deviation: 1.128
 
@@ -119,10 +121,11 @@ def _with_interval(index: float, n: int, nu: float) -> tuple[float, float, float
     return index, float(low), float(high)
 
 
-def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float) -> tuple[float, str]:
+def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float, *, trend: bool) -> tuple[float, str]:
     """Return the p-value of normality of values x (n,), and why there is no index of them; empty where there is.
 
-    `odd` (n,) marks values so far out that they may be the reason by themselves: Ppk of the others is said then.
+    `odd` (n,) marks values so far out that they may be the reason by themselves: Ppk of the others is said then. Of a
+    `trend` that is known there is an index: its remark says of what.
     """
     n = len(x)
     if np.ptp(x) == 0:
@@ -131,7 +134,12 @@ def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float) -> tuple[float,
     if n < ENOUGH:
         return p, f"{n} units; {ENOUGH} are needed to see whether they are normal"
     if p >= NORMAL:
-        return p, ""
+        off = x - np.mean(x)
+        phi = float(off[1:] @ off[:-1]) / float(off @ off)
+        phi += (1 + 3 * phi) / n  # which few values show as less (Kendall, Biometrika 41 (1954) 403)
+        if trend or phi < RESEMBLING / np.sqrt(n):
+            return p, ""
+        return p, f"units resemble those before them (autocorrelation {phi:.2g}): so many tell less than they are"
     why = f"not normal (Anderson-Darling, p {'< 0.0001' if p < 1e-4 else f'= {p:.2g}'})"
     rest, count = x[~odd], int(np.sum(odd))
     if count and len(rest) >= ENOUGH and np.ptp(rest) > 0 and (without := anderson_darling(rest)[1]) >= NORMAL:

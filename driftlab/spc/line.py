@@ -316,7 +316,7 @@ def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tu
             values = chart.value[part]
             x, n, beyond = chart.scale.to(values), len(values), int(np.sum(values > limit))
             limit_x = float(chart.scale.to(np.array(limit)))
-            normal, why_not = why_no_index(x, far_out(x), limit_x)
+            normal, why_not = why_no_index(x, far_out(x), limit_x, trend=chart.trend is not None)
             found = (np.nan,) * 6 if why_not else indices(x, limit_x)
             rows.append(
                 Capability(

@@ -54,6 +54,7 @@ def _changes(line: LineReport) -> list[str]:
 
 MANY = 4  # times more alarms of a line in control where few units or long tails made the limits
 NAMED = 5  # units that a sentence names
+CHANCE = 0.05  # probability that units that are independent are said to resemble one another
 ALIKE = 0.3  # autocorrelation from which on limits by neighbours are too narrow by a fifth
 
 
@@ -181,6 +182,8 @@ def _called(chart: ControlChart) -> str:
 
 def _now(line: LineReport, *, counted: bool) -> list[str]:
     """Return the present state; `counted`: with the number of values beyond three sigma."""
+    from scipy.special import ndtri
+
     out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
@@ -190,7 +193,9 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
             f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would, "
             "its sigma being known no better than from these units."
         )
-    alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(line.controls, key=lambda c: -c.phi) if c.phi >= ALIKE]
+    chance = float(-ndtri(CHANCE / max(len(line.controls), 1)))  # of any of so many charts
+    charts = [c for c in line.controls if c.phi >= max(ALIKE, chance / np.sqrt(len(c.at)))]
+    alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(charts, key=lambda c: -c.phi)]
     if alike:
         more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
         lines.append(

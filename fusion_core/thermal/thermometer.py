@@ -141,8 +141,10 @@ def _period(T: Array, moved: Array, least: float) -> float:
     spectrum[f < 1 / STEPS[1]] = 0.0
     enough = max(MIN_SPECTRUM, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
     for k in np.flatnonzero((spectrum > enough) & (f < 1 / least)):
-        about = spectrum[int(0.8 * k) : int(1.25 * k) + 1]
-        beside = np.concatenate([about[: k - int(0.8 * k) - PADDED], about[k - int(0.8 * k) + PADDED + 1 :]])
+        low = int(0.8 * k)
+        about = spectrum[low : int(1.25 * k) + 1]
+        beside = np.delete(about, slice(max(k - low - PADDED, 0), k - low + PADDED + 1))
+        beside = beside if len(beside) else about  # of few steps in all
         prominent = spectrum[k] == about.max() and spectrum[k] > PROMINENT * np.sqrt(np.mean(beside**2))
         if prominent and _while_moving(T, moved, 1 / float(f[k])) > max(MIN_SPECTRUM, MIN_WHILE_MOVING * spectrum[k]):
             return 1 / float(f[k])

@@ -69,6 +69,16 @@ def test_a_law_that_ends_on_one_side_has_no_heavy_tail_there() -> None:
     assert np.median(high) > 1e-3
 
 
+def test_where_most_values_are_the_same_others_are_judged_by_their_own_deviations() -> None:
+    """Of most units a walk does not show: one that shows by a deviation is like them, one by eight is not."""
+    x = np.concatenate([np.zeros((12, 1)), [[0.9], [1.2], [1.5], [8.0]]])
+    tails = TailLaw.of(x)
+    assert tails is not None
+    p = tails.p(x, upper=True)[:, 0]
+    assert np.all(p[:-1] > 0.04)
+    assert p[-1] < 1e-3
+
+
 @pytest.mark.parametrize(("times", "what"), [(-1.0, "sign"), (-0.45, "scale"), (0.45, "scale")])
 def test_a_curve_is_negated_only_where_its_sign_is_all(times: float, what: str) -> None:
     rng, u = np.random.default_rng(31), (made.GRID - 20) / 40

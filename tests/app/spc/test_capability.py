@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from lines import SPREAD, TYPICAL, line, record
 from scipy import stats
+from scipy.signal import lfilter
 
 from driftlab.config import Limits
-from driftlab.spc.capability import ENOUGH, NORMAL, anderson_darling, indices, share_beyond
+from driftlab.spc.capability import ENOUGH, NORMAL, anderson_darling, indices, share_beyond, why_no_index
 from driftlab.spc.line import line_of
 
 NOISE = Limits.model_validate({"noise": "2.5 deg/h/sqrt(Hz)"})
@@ -148,3 +149,19 @@ def test_the_worst_axis_is_the_one_with_most_units_above_where_it_has_no_index()
     found = line_of(line(200, 5, planted=every_second), NOISE)
     assert "x is worst, 102 of 200 units above (95 %: 43.9 to 58.1 %)" in found.sentences[-1]
     assert "no index of x: not normal" in found.sentences[-1]
+
+
+@pytest.mark.parametrize(("phi", "size"), [(0.0, 1), (0.7, 1), (0.0, 10)])
+def test_there_is_no_index_of_units_that_resemble_those_before_them(phi, size):
+    """Of 60 units that each resemble the one before, or come in lots of ten, intervals would be half as wide as needed.
+
+    Of independent ones nearly all have an index: one of a hundred is refused for this, one for not being normal.
+    """
+    refused = []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, size])
+        x = lfilter([np.sqrt(1 - phi**2)], [1, -phi], rng.normal(size=200))[-60:]
+        x = np.repeat(rng.normal(size=6), size) + 0.5 * x if size > 1 else x
+        p, why = why_no_index(x, np.zeros(60, dtype=bool), 5.0, trend=False)
+        refused.append("resemble" in why or p < 0.01)
+    assert np.mean(refused) > 0.95 if phi or size > 1 else np.mean(refused) < 0.1
