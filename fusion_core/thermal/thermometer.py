@@ -104,7 +104,9 @@ def _jumps(T: Array, steps: Steps, moved: Array) -> bool:
     squares = np.diff(T) ** 2
     if steps.noise < NOISELESS * steps.size:
         jumped = float(np.sum(squares) - len(squares) * np.median(squares) / MEDIAN)
-        return jumped > DIVIDED * steps.size * float(np.sum(moved)) or _stay(T, steps.size, moved) > STAYING
+        same = float(np.mean(squares < (SAME * steps.size) ** 2))  # those of a fine thermometer on a staircase are not
+        jumps = same > STAYING and jumped > DIVIDED * steps.size * float(np.sum(moved))
+        return jumps or _stay(T, steps.size, moved) > STAYING
     noise, variance = _flicker()
     flicker = steps.size**2 * float(np.interp(steps.noise / steps.size, noise, variance))
     return float(np.mean(squares)) > 2 * flicker / AVERAGED
