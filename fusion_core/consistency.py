@@ -14,6 +14,8 @@ from fusion_core.chunk import Array, Integers
 from fusion_core.fast import compiled
 
 PIECE = 4096  # rows multiplied at once: they stay in the cache
+BLOCKS = 4096  # sums of equal blocks that are kept, at most
+FEWEST = 16  # blocks whose sums are a test
 
 
 @dataclass(frozen=True)
@@ -69,19 +71,22 @@ def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:
 
 
 class Whiteness:
-    """The sums behind a test of whiteness, taken stretch by stretch: m components at lags up to `lags`.
+    """The sums behind tests of whiteness, taken stretch by stretch: m components at lags up to `lags`, and in blocks.
 
     ::
 
         r_l = sum_k (w_k - mean)(w_{k+l} - mean) = sum_k w_k w_{k+l} - mean (head_l + tail_l) + (N - l) mean^2
 
-    with head_l and tail_l the sums of all w but the last and the first l.
+    with head_l and tail_l the sums of all w but the last and the first l. Sums of equal blocks are joined two by two
+    where they are more than BLOCKS.
     """
 
     def __init__(self, m: int, lags: int = 20) -> None:
         self.lags, self.N = lags, 0
         self._total, self._products = np.zeros(m), np.zeros((lags + 1, m))
         self._first = self._last = np.empty((0, m))  # up to `lags` rows at either end
+        self._size, self._filled = 1, 0  # rows of a block, and of the one that is not full yet
+        self._sums, self._part = np.empty((0, m)), np.zeros(m)
 
     def add(self, white: Array) -> None:
         """Count the next innovations (N, m)."""
@@ -91,6 +96,51 @@ class Whiteness:
         count = max(0, len(rows) - self.lags)
         _lagged(rows, count, self._products, self._total)
         self._last = rows[count:]
+        self._add_to_blocks(white)
+
+    def _add_to_blocks(self, white: Array) -> None:
+        if not len(white):
+            return
+        cuts = np.arange(self._size - self._filled, len(white), self._size)
+        sums = np.add.reduceat(white, np.concatenate([[0], cuts]), axis=0, dtype=np.float64)
+        sums[0] += self._part
+        self._filled = (self._filled + len(white)) % self._size
+        whole = len(sums) - (self._filled > 0)
+        self._sums, self._part = np.concatenate([self._sums, sums[:whole]]), np.sum(sums[whole:], axis=0)
+        while len(self._sums) > BLOCKS:
+            even = len(self._sums) // 2 * 2
+            self._filled += self._size * (len(self._sums) - even)
+            self._part = self._part + np.sum(self._sums[even:], axis=0)
+            self._sums, self._size = self._sums[0:even:2] + self._sums[1:even:2], 2 * self._size
+
+    def slow(self) -> tuple[Array, Array, Array]:
+        """Return how many times as large as those of white innovations sums over blocks are, where that is surest.
+
+        Returns
+        -------
+        ratio : (m,) array
+            Mean square of a block's sum over that of as many independent innovations of the same size.
+        rows : (m,) array
+            Rows of that block.
+        p : (m,) array
+            Probability of so much, or more, in white innovations, for all sizes that were tried; NaN where N is too
+            small. A slow error, which is far below the innovations of single updates, adds up (A. W. Lo and A. C.
+            MacKinlay, Review of Financial Studies 1 (1988) 41: variance ratios).
+        """
+        from scipy import special
+
+        m = len(self._total)
+        best = np.ones(m), np.ones(m), np.full(m, np.nan)
+        square = self.covariances()[0] / self.N if self.N else np.ones(m)
+        sums, size, tried = self._sums, self._size, 0
+        while len(sums) >= FEWEST:
+            ratio = np.mean(sums**2, axis=0) / (size * np.where(square > 0, square, 1.0))
+            p, tried = special.chdtrc(len(sums), len(sums) * ratio), tried + 1
+            better = ~(p >= best[2])
+            for own, values in zip(best, (ratio, np.full(m, float(size)), p), strict=True):
+                own[better] = values[better]
+            sums, size = sums[0 : len(sums) // 2 * 2 : 2] + sums[1 : len(sums) // 2 * 2 : 2], 2 * size
+        return best[0], best[1], np.minimum(best[2] * max(tried, 1), 1.0)
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""

@@ -129,7 +129,7 @@ class RunResult(Result):
     def _certificate(self, sheet: Sheet) -> Certificate:
         overview, T, fitted = self.overview, self.overview.curves.get("temperature_raw"), map_of(self.config)
         bias = Measured(overview.bias, self.model.tracked.axes, otherwise="the filter's deviations are not confirmed")
-        if is_trusted(overview.nis):
+        if is_trusted(self.run):
             bias = normal(bias, overview.sigma, np.nan)
         measured = None if T is None else (float(np.min(T)), float(np.max(T)))
         return Certificate(

@@ -62,6 +62,7 @@ class Overview:
     yardsticks: Scores  # scores of the run
     nis: NisTest  # of the used updates after the first alignment
     whiteness_p: Array  # (m,) of the same
+    slow: tuple[Array, Array, Array]  # (m,) each, of the same (`Whiteness.slow`)
     # at most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores
     curves: Columns
     errors: Columns  # `t`, and the error of `bias` and `coast`, with every spike of it
@@ -152,6 +153,7 @@ class OverviewAccumulator:
             yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
             nis=nis_test_of(found.nis_total, int(np.sum(found.sums[:, 0])), model.m),
             whiteness_p=self._whiteness.p(),
+            slow=self._whiteness.slow(),
             curves=self._curves.curves(self._last),
             errors=found.curves(),
             nis_curve=found.nis_curve(),

@@ -15,13 +15,14 @@ from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_remarks
 from driftlab.units import axis_name
 from fusion_core.chunk import Array
-from fusion_core.consistency import NisTest
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
 COMPLETE = 0.9  # of the time: a score that stands on less says why
 FAR_OFF = 4.0  # deviations of a prediction: a right model is off by more in one axis of 10,000
+CHANCE = 1e-3  # probability that innovations of a right model are said to add up
+SMALL = 1.3  # times that a deviation of the bias is too small: with less nothing is said
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
 Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
@@ -82,6 +83,7 @@ def remarks(run: ScoredRun) -> list[str]:
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
+    lines += wandering(run)
     noises = (noise_remarks(sensor, first.noise_ratio[sensor.channel]) for sensor in model.sensors)
     return [*lines, *chain.from_iterable(noises), *_seen(run)]
 
@@ -99,9 +101,35 @@ def in_sample(fitted: FittedMap | None, recordings: Iterable[str]) -> list[str]:
     return [name for name in (Path(path).name for path in recordings) if name.partition("::")[0] in seen]
 
 
-def is_trusted(nis: NisTest) -> bool:
-    """Return True if the deviations of a run are large enough for its innovations."""
-    return nis.consistent or nis.mean < 1 + NOTICED
+def wandering(run: ScoredRun) -> list[str]:
+    """Return a remark where innovations add up, since the bias moves by more than its walk allows; none where not.
+
+    An error e of the bias is e^2 tau / N^2 of the square of an innovation, N the white noise and tau the update's
+    length, so the sums say by how much the deviation of the bias is too small.
+    """
+    overview, sensor = run.overview, run.sensor
+    d = len(sensor.axes)
+    ratio, rows, p = (column[-d:] for column in overview.slow)
+    tau = run.alignment.dt
+    excess = np.maximum(ratio - 1, 0) / rows * sensor.noise**2 / tau
+    small = np.sqrt(1 + np.divide(excess, overview.sigma**2, out=np.zeros(d), where=overview.sigma > 0))
+    seen = (p < CHANCE / d) & (small > SMALL)
+    if not np.any(seen):
+        return []
+    k = int(np.argmax(np.where(seen, small, 0)))
+    names = ", ".join(name for name, one in zip(sensor.axes, seen, strict=True) if one)
+    return [
+        f"innovations of {sensor.channel} {names} add up: over {rows[k] * tau:.3g} s {sensor.axes[k]} has "
+        f"{ratio[k]:.2g} times the square that the model says, so the bias moves by more than its walk allows, and its "
+        f"sigma is about {small[k]:.2g} times too small; measure the walk with `driftlab allan`, or look for what "
+        "moves the bias with `driftlab explain`"
+    ]
+
+
+def is_trusted(run: ScoredRun) -> bool:
+    """Return True if the deviations of a run are large enough for its innovations, one by one and added up."""
+    nis = run.overview.nis
+    return (nis.consistent or nis.mean < 1 + NOTICED) and not wandering(run)
 
 
 def inconsistency(mean: float) -> str:

@@ -100,6 +100,7 @@ def work(task: Task) -> UnitResult:
         try:
             recordings = task.placed(until_done.enter_context(local(task.names)))
             _check_regular(recordings)
+            _check_copies(recordings)
             described = _described(task, recordings)
             key = _key_of(task, recordings)
             outcome, files = _calibrated(task, recordings)
@@ -233,6 +234,21 @@ def _check_regular(recordings: Recordings) -> None:
     for path in paths_of(name for names in recordings.values() for name in names):
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
+
+
+def _check_copies(recordings: Recordings) -> None:
+    """Raise ConfigError where one soak stands in for two, or judges a map or a model that it was fitted on."""
+    for fitted in (CALIBRATION, TRAIN):
+        names = [(role, name) for role in (fitted, HOLDOUT) for name in recordings.get(role, ())]
+        seen: dict[tuple[str, str], tuple[str, str]] = {}
+        for role, name in names if len(names) > 1 else ():
+            content = _hash(name)
+            first, other = seen.setdefault((content, str(part_of(name)[1])), (role, name))
+            if content and other != name:
+                raise ConfigError(
+                    f"{name} ({role}): has the content of {other} ({first}), another recording was expected; correct "
+                    "the path, or take one of them out of the manifest"
+                )
 
 
 def _excess_walk(soaked: UnitInformation, densities: Densities) -> list[str]:

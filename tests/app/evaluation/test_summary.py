@@ -23,8 +23,8 @@ SCORES = Scores(
 )  # fmt: skip
 QUIET = Overview(
     count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, yardsticks=SCORES,
-    nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, curves={}, errors={}, nis_curve=np.zeros((0, 3)),
-    nis_highest=0.0, swing=0.0,
+    nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, slow=(ONES, ONES, ONES), curves={}, errors={},
+    nis_curve=np.zeros((0, 3)), nis_highest=0.0, swing=0.0,
 )  # fmt: skip
 
 
@@ -47,6 +47,16 @@ def said(overview, log):
 
 def test_bounds_that_only_a_long_run_can_miss_are_no_news():
     assert said(replace(QUIET, nis=nis(1.03)), journal()) == []
+
+
+def test_innovations_that_add_up_say_by_how_much_sigma_is_too_small():
+    """An error of twice its sigma is 4 sigma^2 tau / N^2 of an innovation's square, of which 3 are too much."""
+    noise, tau = MODEL.tracked.noise, 0.1
+    excess = 3 * ONES**2 * tau / noise**2
+    adding = replace(QUIET, slow=(1 + 100 * excess, np.full(3, 100.0), np.array([1e-9, 0.5, 1e-9])))
+    (line,) = said(adding, journal())
+    assert line.startswith("innovations of gyro x, z add up: over 10 s x has ")
+    assert "its sigma is about 2 times too small; measure the walk with `driftlab allan`" in line
 
 
 def test_a_quiet_run_has_nothing_to_say():

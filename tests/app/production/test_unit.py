@@ -195,6 +195,16 @@ def test_a_pipe_is_a_failed_unit_and_nobody_waits_for_it(tmp_path) -> None:
     assert key_of(task(tmp_path))
 
 
+@pytest.mark.parametrize(("roles", "said"), [
+    ({"calibration": ("soak.h5", "copy.h5")}, "copy.h5 (calibration): has the content of {}/soak.h5 (calibration)"),
+    ({"calibration": "soak.h5", "holdout": "copy.h5"}, "copy.h5 (holdout): has the content of {}/soak.h5 (cal"),
+])  # fmt: skip
+def test_a_copy_of_a_soak_is_no_other_soak(folder, tmp_path, roles, said) -> None:
+    for name in ("soak.h5", "copy.h5"):
+        (tmp_path / name).write_bytes((folder / "again.h5").read_bytes())
+    assert said.format(tmp_path) in work(task(tmp_path, **roles)).record.error
+
+
 def test_a_wrong_config_and_a_unit_without_a_soak_are_failed_units(folder) -> None:
     assert "nois" in work(task(folder, TEXT.replace("noise: 2", "nois: 2"))).record.error
     assert work(task(folder, test="soak.h5")).record.error.endswith("name one in the manifest")
