@@ -114,7 +114,7 @@ class Whiteness:
             self._sums, self._size = self._sums[0:even:2] + self._sums[1:even:2], 2 * self._size
 
     def slow(self) -> tuple[Array, Array, Array]:
-        """Return how many times as large as those of white innovations sums over blocks are, where that is surest.
+        """Return the ratio of sums over blocks to those of white innovations, at the size of block where it is surest.
 
         Returns
         -------

@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3941
+    assert 0 < count <= 3978
 
 
 def imports():
@@ -258,29 +258,29 @@ def test_tests_mirror_the_tree():
 BUDGET = {
     "driftlab": 631,
     "driftlab/commands": 3797,
-    "driftlab/evaluation": 1509,
+    "driftlab/evaluation": 1532,
     "driftlab/family": 3347,
-    "driftlab/filtering": 1260,
-    "driftlab/identification": 2252,
+    "driftlab/filtering": 1264,
+    "driftlab/identification": 2266,
     "driftlab/live": 845,
     "driftlab/maps": 1909,
     "driftlab/noise": 1374,
     "driftlab/planning": 1221,
-    "driftlab/production": 3192,
+    "driftlab/production": 3205,
     "driftlab/products": 6,
     "driftlab/recordings": 656,
-    "driftlab/reports": 3542,
+    "driftlab/reports": 3545,
     "driftlab/soak": 751,
-    "driftlab/spc": 1540,
+    "driftlab/spc": 1550,
     "driftlab/starter": 894,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,
-    "fusion_core": 1907,
+    "fusion_core": 1940,
     "fusion_core/contracts": 1963,
     "fusion_core/fast": 824,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1228,
+    "fusion_core/thermal": 1232,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 246,

@@ -222,7 +222,9 @@ class Run:
                     f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds is held "
                     "there, and its sigma grows"
                 )
-                self.journal.faults.add(what, int(np.sum(outside)), f"at {self.journal.faults.when(chunk.t[k])}")
+                count = int(np.sum(outside))
+                self.journal.beyond[effect.kind, name] += count
+                self.journal.faults.add(what, count, f"at {self.journal.faults.when(chunk.t[k])}")
 
     def _never_at_rest(self, waiting: Chunk | None) -> str:
         align_s = self.model.align

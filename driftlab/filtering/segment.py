@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -132,3 +133,5 @@ class RunLog:
     alignments: list[Alignment] = field(default_factory=list)
     moving: Stretches = field(default_factory=Stretches)
     refused: Stretches = field(default_factory=Stretches)
+    # updates with a channel beyond what an effect was fitted on, by the effect's kind and the channel
+    beyond: Counter[tuple[str, str]] = field(default_factory=Counter)

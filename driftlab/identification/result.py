@@ -95,14 +95,31 @@ def closed(
     """Return the identification with its errors on test recordings; `recordings` are each role's identities."""
     change = change_of(outcomes)
     verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
+    untested = _untested(outcomes)
+    if untested and verdict.word == "explained":
+        verdict = replace(verdict, word="unexplained")
     first = sentence(change, outcomes)
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
-    lines = (*([first] if first else []), *identified.lines, *remarks)
+    lines = (*untested, *([first] if first else []), *identified.lines, *remarks)
     whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
     return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
 
 
+def _untested(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return sentences on effects that no test recording tests: their channels are mostly beyond what they fitted."""
+    runs = [outcome.runs[1] for outcome in outcomes]
+    shares = [{own: n / run.overview.count for own, n in run.journal.beyond.items()} for run in runs]
+    everywhere = [own for own in (shares[0] if shares else {}) if all(s.get(own, 0.0) > UNTESTED for s in shares)]
+    return [
+        f"{kind} of {channel} is not tested: at {min(share[kind, channel] for share in shares):.0%} of the updates of "
+        "each test recording the channel is beyond what it was fitted on; correct its unit there, or test by a "
+        "recording within"
+        for kind, channel in everywhere
+    ]
+
+
 NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
+UNTESTED = 0.5  # of the updates beyond what an effect was fitted on: more test nothing of it
 MAX_MEANS = 4096  # of a prediction that are compared
 SURE = 1.645  # deviations: one-sided, 95 %
 

@@ -112,8 +112,8 @@ def _cell(fit: Coefficients, k: int, scale: float) -> str:
 def config_lines(analysis: Analysis) -> str:
     """Return the lines to paste into a config: `noise` and `bias` of each triad, one value or one an axis.
 
-    Where the walk cannot be seen it is the largest that the floor allows, sqrt(3)/2 floor^2 / noise, or the fit's upper
-    limit where that is lower.
+    Where the walk cannot be seen it is the fit's upper limit, or where there is none what makes the floor of the curve,
+    sqrt(3)/2 floor^2 / noise.
     """
     lines = ["filter:"]
     for channel, fits in analysis.coefficients.items():
@@ -123,11 +123,11 @@ def config_lines(analysis: Analysis) -> str:
         axes, units = analysis.axes[channel], units_of(analysis, channel)
         noise = [float(fit.value[WHITE] or fit.high[WHITE]) for fit in fits]
         walk = [
-            float(fit.value[WALK] or min(np.sqrt(3) / 2 * np.min(c.allan) ** 2 / n, fit.high[WALK]))
+            float(fit.value[WALK] or (fit.high[WALK] if np.isfinite(fit.high[WALK]) else _of_floor(c, n)))
             for fit, c, n in zip(fits, analysis.curves[channel], noise, strict=True)
         ]
         unseen = _unseen(axes, fits, WHITE, "white noise not seen: its upper limit")
-        floor = _unseen(axes, fits, WALK, "walk not seen: at most this, by the floor of the curve")
+        most = _unseen(axes, fits, WALK, f"walk not seen: at most this, with {100 * LEVEL:.0f} %")
         where = "" if axes in (["x", "y", "z"], [axis_of(channel)]) else f", axes: [{', '.join(axes)}]"
         # a sensor whose section is the filter itself has no section of its own
         bare = channel in analysis.sensors and analysis.sensors[channel].section == "filter"
@@ -135,9 +135,14 @@ def config_lines(analysis: Analysis) -> str:
         lines += [
             f"  channel: {channel}" if bare else f"  {channel}:",
             f"{indent}noise: {_value_text(noise, units, 'white')}{unseen}",
-            f"{indent}bias: {{kind: random_walk, walk: {_value_text(walk, units, 'rate_random_walk')}{where}}}{floor}",
+            f"{indent}bias: {{kind: random_walk, walk: {_value_text(walk, units, 'rate_random_walk')}{where}}}{most}",
         ]
     return "\n".join(lines) + "\n" if any("noise: " in line for line in lines[1:]) else ""
+
+
+def _of_floor(curve: AllanCurve, noise: float) -> float:
+    """Return the walk with which white noise `noise` has the lowest Allan deviation of a curve."""
+    return float(np.sqrt(3) / 2 * np.min(curve.allan) ** 2 / noise)
 
 
 def _unseen(axes: list[str], items: list[Coefficients], k: int, text: str) -> str:

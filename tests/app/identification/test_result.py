@@ -1,7 +1,10 @@
 """Worse beyond chance: with power where an effect is wrong, and rarely where it is right or noise decides."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
+from driftlab.identification import result
 from driftlab.identification.result import Outcome, change_of, sentence
 from driftlab.units import BiasUnit
 
@@ -57,3 +60,13 @@ def test_what_gets_worse_by_chance_is_said():
             assert "but not beyond chance" in sentence(change, both)
             return
     raise AssertionError("none was drawn")
+
+
+def test_an_effect_whose_channel_is_elsewhere_in_each_test_recording_is_not_tested():
+    def outcome(supply, fan):
+        journal = SimpleNamespace(beyond={("channel", "supply"): supply, ("channel", "fan"): fan})
+        return SimpleNamespace(runs=(None, SimpleNamespace(journal=journal, overview=SimpleNamespace(count=100))))
+
+    (line,) = result._untested([outcome(100, 60), outcome(70, 40)])
+    assert line.startswith("channel of supply is not tested: at 70% of the updates of each test recording")
+    assert result._untested([]) == []
