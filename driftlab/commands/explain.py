@@ -21,7 +21,7 @@ from driftlab.config import Config, load_config, part_of, paths_of, with_recordi
 from driftlab.evaluation.limits import LimitResult, least_kept, verdict
 from driftlab.evaluation.overview import ScoredRun, scored
 from driftlab.evaluation.scores import moving_average
-from driftlab.evaluation.summary import remarks
+from driftlab.evaluation.summary import mispredicted, remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.identification.candidates import check_kinds
@@ -293,6 +293,7 @@ def outcome_of(compared: Sequence[Config], recording: str, progress: Progress) -
         after_sigma=second["coast_sigma"][coasting],
         runs=(before, after),
         remarks=tuple(remarks(after)),
+        off=tuple(mispredicted(after)),
     )
 
 

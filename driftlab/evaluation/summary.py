@@ -65,7 +65,7 @@ def summarise(run: ScoredRun) -> dict[str, Any]:
 def remarks(run: ScoredRun) -> list[str]:
     """Return the remarks on a run for its user, one sentence each."""
     overview, model, journal = run.overview, run.model, run.journal
-    lines = [*journal.faults.lines(), *_rejected(run), *_scored(run), *_mispredicted(run)]
+    lines = [*journal.faults.lines(), *_rejected(run), *_scored(run), *mispredicted(run)]
     first, *again = journal.alignments
     if again:
         when = f"at {moment(again[0].t, journal.faults.first_row)}"
@@ -205,7 +205,7 @@ def _scored(run: ScoredRun) -> list[str]:
     return lines
 
 
-def _mispredicted(run: ScoredRun) -> list[str]:
+def mispredicted(run: ScoredRun) -> list[str]:
     """Return the longest prediction that is off by far more than its deviation, and what may be the cause.
 
     The white noise of the reference, a mean over WINDOW, counts too.

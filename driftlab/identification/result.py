@@ -95,12 +95,14 @@ def closed(
     """Return the identification with its errors on test recordings; `recordings` are each role's identities."""
     change = change_of(outcomes)
     verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
-    untested = _untested(outcomes)
-    if untested and verdict.word == "explained":
+    untested, nothing = _untested(outcomes), verdict.word == "nothing_missing"
+    off = [f"{Path(o.name).name}: {line}" for o in outcomes for line in o.off if nothing]
+    if off or (untested and verdict.word == "explained"):
         verdict = replace(verdict, word="unexplained")
     first = sentence(change, outcomes)
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
-    lines = (*untested, *([first] if first else []), *identified.lines, *remarks)
+    others = (remark for remark in remarks if remark not in off)
+    lines = (*untested, *off, *([first] if first else []), *identified.lines, *others)
     whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
     return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
 
@@ -139,6 +141,7 @@ class Outcome:
     after_sigma: Array
     runs: tuple[ScoredRun, ScoredRun]
     remarks: tuple[str, ...] = ()  # on the second
+    off: tuple[str, ...] = ()  # of these, on a prediction that is off by far more than its deviation
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,12 @@ def test_where_nothing_is_added_the_declared_map_stays_to_the_byte(tmp_path):
     out = tmp_path / "out"
     assert (out / "explained.json").read_bytes() == (out / "declared.json").read_bytes()
     np.testing.assert_array_equal(error["after"], error["before"])
+    with h5py.File(tmp_path / "holdout.h5", "a") as file:  # a jump that no other recording has
+        file["gyro"][len(file["gyro"]) // 3 :, 1] += 12 / 3600  # deg/s
+    names = [[str(tmp_path / f"{name}.h5")] for name in ("soak", "train", "holdout")]
+    again = explain(load_config(tmp_path / "declared.yaml"), *names, out=tmp_path / "again").closed
+    assert again.verdict.word == "unexplained"
+    assert again.lines[0].startswith("holdout.h5: prediction, ")
 
 
 def test_the_standard_filter_can_be_explained_too(hysteresis, tmp_path):
