@@ -103,10 +103,12 @@ class Whiteness:
             return
         cuts = np.arange(self._size - self._filled, len(white), self._size)
         sums = np.add.reduceat(white, np.concatenate([[0], cuts]), axis=0, dtype=np.float64)
-        sums[0] += self._part
+        sums[0] += self._part  # of the block that was not full
         self._filled = (self._filled + len(white)) % self._size
         whole = len(sums) - (self._filled > 0)
-        self._sums, self._part = np.concatenate([self._sums, sums[:whole]]), np.sum(sums[whole:], axis=0)
+        self._part = np.sum(sums[whole:], axis=0)
+        if whole:  # one sample at a time, sums are not copied for each
+            self._sums = np.concatenate([self._sums, sums[:whole]])
         while len(self._sums) > BLOCKS:
             even = len(self._sums) // 2 * 2
             self._filled += self._size * (len(self._sums) - even)
