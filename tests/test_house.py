@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3978
+    assert 0 < count <= 3998
 
 
 def imports():
@@ -275,7 +275,7 @@ BUDGET = {
     "driftlab/starter": 894,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,
-    "fusion_core": 1940,
+    "fusion_core": 1942,
     "fusion_core/contracts": 1963,
     "fusion_core/fast": 824,
     "fusion_core/host": 745,

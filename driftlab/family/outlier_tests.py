@@ -281,7 +281,7 @@ def figure_law(name: str, columns: Array, lots: Texts) -> tuple[FigureLaw | None
         u[:, axis] = z
         off.append(shifts)
         rows.append((usual, sure, centre, width))
-    law = TailLaw.of(u)
+    law = TailLaw.of(u, same=1.0)
     if law is None:
         return None, off
     usual_of, sure_of, centre_of, width_of = (tuple(map(float, column)) for column in zip(*rows, strict=True))

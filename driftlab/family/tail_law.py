@@ -46,15 +46,18 @@ class TailLaw(BaseModel):
     most: float
 
     @classmethod
-    def of(cls, values: Array) -> TailLaw | None:
-        """Return the law of values (n, m), NaN where there is none; None where every column has less than MIN_UNITS."""
+    def of(cls, values: Array, same: float = 0.0) -> TailLaw | None:
+        """Return the law of values (n, m), NaN where there is none; None where every column has less than MIN_UNITS.
+
+        A column of which most values are the same has the width `same`: 1 where they are in their own deviations.
+        """
         known = np.sum(np.isfinite(values), axis=0)
         if not np.any(known >= MIN_UNITS):
             return None
         x = values[:, known >= MIN_UNITS]
         centre = np.nanmedian(x, axis=0)
         off = x - centre
-        below, above = _widths(off)
+        below, above = _widths(off, same)
         wide = np.minimum(below, above) > WIDTH * np.nanmax(np.abs(off), axis=0, initial=0.0)  # most are not the same
         off = off[:, wide]
         off /= np.where(off > 0, above[wide], below[wide])
@@ -110,15 +113,15 @@ class TailLaws(BaseModel):
     figures: dict[str, FigureLaw]
 
 
-def _widths(off: Array) -> tuple[Array, Array]:
-    """Return the widths (m,) below and above of values (n, m) in their own deviations, about their medians.
+def _widths(off: Array, same: float) -> tuple[Array, Array]:
+    """Return the widths (m,) below and above of values (n, m) about their medians.
 
     As far apart as more than chance has them (James and Stein): a width of one side is of half the values. Where most
-    are the same, as where a walk or a loop does not show, it is that deviation.
+    are the same, as where a walk or a loop does not show, it is `same`.
     """
     # a column at a time: a million units need no table more
     sides = [np.array([1.4826 * np.median(np.abs(x[s * x >= 0])) for x in off.T]) for s in (-1, 1)]
-    both = np.array([1.4826 * np.nanmedian(np.abs(x)) or 1.0 for x in off.T])
+    both = np.array([1.4826 * np.nanmedian(np.abs(x)) or same for x in off.T])
     tiny = 1e-6 * both + np.finfo(float).tiny
     apart = np.log(np.maximum(sides[1], tiny) / np.maximum(sides[0], tiny))
     chance = OF_SIDES / np.sum(np.isfinite(off), axis=0)
