@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3998
+    assert 0 < count <= 3980
 
 
 def imports():
@@ -271,7 +271,7 @@ BUDGET = {
     "driftlab/recordings": 656,
     "driftlab/reports": 3545,
     "driftlab/soak": 751,
-    "driftlab/spc": 1550,
+    "driftlab/spc": 1551,
     "driftlab/starter": 894,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,

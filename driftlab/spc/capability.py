@@ -31,8 +31,7 @@ from numpy.typing import NDArray
 from fusion_core.chunk import Array
 
 ENOUGH = 25  # units of an index; of fewer the test of normality sees little (AIAG: 25 subgroups)
-NORMAL = 0.01  # p-value below which values are not taken for normal
-RESEMBLING = 2.326  # deviations (1 / sqrt(n)) of an autocorrelation, which one of a hundred independent lines exceeds
+NORMAL = 0.01  # p-value below which values are not taken for normal, nor for independent
 WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
 D2 = float(2 / np.sqrt(np.pi))  # mean moving range of normal values over their deviation: 1.128
 
@@ -127,6 +126,8 @@ def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float, *, trend: bool)
     `odd` (n,) marks values so far out that they may be the reason by themselves: Ppk of the others is said then. Of a
     `trend` that is known there is an index: its remark says of what.
     """
+    from scipy.special import ndtri
+
     n = len(x)
     if np.ptp(x) == 0:
         return 1.0, "the values do not vary"
@@ -135,9 +136,8 @@ def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float, *, trend: bool)
         return p, f"{n} units; {ENOUGH} are needed to see whether they are normal"
     if p >= NORMAL:
         off = x - np.mean(x)
-        phi = float(off[1:] @ off[:-1]) / float(off @ off)
-        phi += (1 + 3 * phi) / n  # which few values show as less (Kendall, Biometrika 41 (1954) 403)
-        if trend or phi < RESEMBLING / np.sqrt(n):
+        phi = without_bias(float(off[1:] @ off[:-1]) / float(off @ off), n)
+        if trend or phi < -ndtri(NORMAL) / np.sqrt(n):
             return p, ""
         return p, f"units resemble those before them (autocorrelation {phi:.2g}): so many tell less than they are"
     why = f"not normal (Anderson-Darling, p {'< 0.0001' if p < 1e-4 else f'= {p:.2g}'})"
@@ -147,6 +147,11 @@ def why_no_index(x: Array, odd: NDArray[np.bool_], limit: float, *, trend: bool)
         ppk, low, high = indices(rest, limit)[3:]
         why += f", by {far} far out; of the others p = {without:.2g}, Ppk {ppk:.2f} ({low:.2f} to {high:.2f})"
     return p, why
+
+
+def without_bias(phi: float, n: int) -> float:
+    """Return an autocorrelation of n values, which few show as less (Kendall, Biometrika 41 (1954) 403)."""
+    return phi + (1 + 3 * phi) / n
 
 
 def anderson_darling(x: Array) -> tuple[float, float]:

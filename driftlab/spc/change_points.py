@@ -33,6 +33,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from driftlab.spc.capability import without_bias
 from driftlab.spc.charts import huber
 from fusion_core.chunk import Array, Integers
 
@@ -100,8 +101,7 @@ def course_of(x: Array, sigma: Array, alpha: float, blocks: Iterable[tuple[int, 
     models = [_residuals(x, sigma, np.full(len(x), np.median(x))), _residuals(x, sigma, line)]
     models += [_residuals(x, sigma, _levels(x, sigma, found))] if found else []
     costs = [_cost(e, p) for e, p in zip(models, (0, 1, 3 * len(found)), strict=False)]
-    phi = min(costs)[1]
-    phi = min(phi + (1 + 3 * phi) / len(x), MOST)  # which few values show as less (Kendall, Biometrika 41 (1954) 403)
+    phi = min(without_bias(min(costs)[1], len(x)), MOST)
     if phi < RESEMBLING / np.sqrt(len(x)):
         phi = 0.0
     if found and phi:

@@ -89,9 +89,9 @@ class TermPrior:
 
 def distinct(T: Array) -> Array:
     """Return the temperatures (k,) among T (m,) that are apart: by NARROW, and by a tenth of the range."""
-    found: list[float] = []
+    found, apart = list[float](), max(NARROW, float(np.ptp(T)) / 10)
     for value in np.sort(T):
-        if not found or value - found[-1] > max(NARROW, float(np.ptp(T)) / 10):
+        if not found or value - found[-1] > apart:
             found.append(float(value))
     return np.array(found)
 
