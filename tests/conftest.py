@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # files that take longest, though most have few tests; the campaigns of bad input last minutes, wait for one another,
 # and begin when the loops are compiled, which each of their processes would do by itself
@@ -22,6 +23,8 @@ def pytest_configure(config):
     Commands are interrupted by tests, also where the suite runs in the background and shells have Ctrl-C ignored.
     """
     config.option.loadscopereorder = False
+    settings.register_profile("untimed", deadline=None)  # a slow hour fails no test
+    settings.load_profile("untimed")
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

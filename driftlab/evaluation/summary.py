@@ -117,9 +117,10 @@ def wandering(run: ScoredRun) -> list[str]:
     if not np.any(seen):
         return []
     k = int(np.argmax(np.where(seen, small, 0)))
-    names = ", ".join(name for name, one in zip(sensor.axes, seen, strict=True) if one)
+    names = [axis_name(sensor.channel, axis) for axis in sensor.axes]
+    wandering_axes = ", ".join(name for name, one in zip(names, seen, strict=True) if one)
     return [
-        f"innovations of {sensor.channel} {names} add up: over {rows[k] * tau:.3g} s {sensor.axes[k]} has "
+        f"innovations of {wandering_axes} add up: over {rows[k] * tau:.3g} s {names[k]} has "
         f"{ratio[k]:.2g} times the square that the model says, so the bias moves by more than its walk allows, and its "
         f"sigma is about {small[k]:.2g} times too small; measure the walk with `driftlab allan`, or look for what "
         "moves the bias with `driftlab explain`"

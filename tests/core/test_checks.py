@@ -204,7 +204,7 @@ def test_inputs_are_refused_or_mean_the_same_with_every_method():
 
 
 @given(pattern=st.lists(st.lists(st.booleans(), min_size=m, max_size=m), min_size=1, max_size=30), full=st.booleans())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_component_that_is_not_used_is_no_part_of_its_sample(pattern, full):
     """Garbage in z there changes nothing, and the sample is what it is with H, R and z of the others alone."""
     used = np.array(pattern)

@@ -26,7 +26,7 @@ def test_regular_time_stamps_have_one_step(start, step):
 
 
 @given(cuts=st.lists(st.integers(1, 4999), max_size=6), step=st.sampled_from([0.01, 1 / 300, 0.0123, 7.5]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_steps_do_not_depend_on_where_a_recording_is_cut(cuts, step):
     whole = Chunk(1000.0 + np.arange(5000) * step)
     edges = sorted({0, 5000, *cuts})

@@ -39,7 +39,7 @@ def fed(ends, **options):
 
 
 @given(ends=st.lists(st.booleans(), min_size=N, max_size=N))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_of_a_linear_system_it_is_the_filter_wherever_it_is_fed_back(ends):
     direct = estimate(PRIOR, Transition(F, Q, U), Measurement(Z, H, R, USED))
     parts, error = fed(np.array(ends))

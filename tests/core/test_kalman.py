@@ -260,7 +260,7 @@ def test_likelihood_equals_the_joint_density():
 
 
 @given(cuts=st.lists(st.integers(1, 399), max_size=5), missing=st.integers(0, 399))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_any_split_gives_the_same_estimates(cuts, missing):
     F, Q, H, R = twelve()
     P0 = np.diag([0.0] * 3 + [1e-6] * 3 + [0.0] * 3 + [1e-4] * 3)

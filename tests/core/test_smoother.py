@@ -74,7 +74,7 @@ def test_smoothed_states_are_the_joint_least_squares_solution(varying, gate, res
 
 
 @given(cuts=st.lists(st.integers(1, 199), max_size=5), block=st.sampled_from([1, 7, 64, 8192]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_stretch_by_stretch_it_is_the_same(cuts, block):
     state, step, measurement = problem(200, varying=True)
     whole = estimate(state, step, measurement)

@@ -175,7 +175,7 @@ def random_system(n, scale=1.0):
 
 
 @given(n=st.integers(1, 6), a=st.floats(1e-9, 2.0), b=st.floats(1e-9, 2.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_two_steps_are_one(n, a, b):
     A, Q_c = random_system(n)
     (F_a, Q_a), (F_b, Q_b), (F, Q) = (van_loan(A, Q_c, dt) for dt in (a, b, a + b))

@@ -190,11 +190,8 @@ class LogFile:
             for end in ends:
                 while at < end:
                     at, n, lost, first, stopped = _walk(self.data[:end], at, at + BLOCK, self._lengths, out, *TYPES)
-                    numbers = records(self.data, out[:n] + 3, U16)
-                    order = np.argsort(numbers, kind="stable")
-                    rows, (which, first_of) = out[order].astype(small), np.unique(numbers[order], return_index=True)
-                    for number, part in zip(which.tolist(), np.split(rows, first_of[1:]), strict=False):
-                        places.setdefault(number, []).append(part)
+                    if n:
+                        _collect(places, records(self.data, out[:n] + 3, U16), out[:n].astype(small))
                     self._lost, self._first_lost = self._lost + lost, self._first_lost if self._lost else first
                     clock.check(n + stopped)
                     if not stopped:
@@ -255,6 +252,14 @@ class LogFile:
                     yield path, NUMBERS[kind]
                 else:
                     yield from self._flat(topic, kind, f"{path}.", depth + 1)
+
+
+def _collect(places: dict[int, list[Integers]], numbers: Integers, rows: Integers) -> None:
+    """Add places of rows to those of the subscriptions of these numbers."""
+    order = np.argsort(numbers, kind="stable")
+    which, first = np.unique(numbers[order], return_index=True)
+    for number, part in zip(which.tolist(), np.split(rows[order], first[1:]), strict=False):
+        places.setdefault(number, []).append(part)
 
 
 def _declared(field: str) -> tuple[str, int | None, str]:

@@ -79,7 +79,7 @@ def integrated(rows, error, known, start, horizon, length):
 
 
 @given(seeds)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_scores_are_the_integrals_over_time(seed):
     rows, reference = recording(seed)
     tally = ScoreAccumulator(3)
@@ -109,7 +109,7 @@ def test_scores_are_the_integrals_over_time(seed):
 
 
 @given(seeds, st.lists(st.integers(0, 700), max_size=8))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_rows_may_come_in_any_blocks(seed, cuts):
     rows, reference = recording(seed)
     whole, split = ScoreAccumulator(3), ScoreAccumulator(3)
@@ -129,7 +129,7 @@ def test_rows_may_come_in_any_blocks(seed, cuts):
 
 
 @given(seeds, st.floats(0, 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_refusing_data_never_changes_a_score(seed, part):
     """The mask of used samples is a column that the scores do not read, in a run's overview too."""
     rows, _ = recording(seed)

@@ -55,7 +55,7 @@ def test_innovations_that_add_up_say_by_how_much_sigma_is_too_small():
     excess = 3 * ONES**2 * tau / noise**2
     adding = replace(QUIET, slow=(1 + 100 * excess, np.full(3, 100.0), np.array([1e-9, 0.5, 1e-9])))
     (line,) = said(adding, journal())
-    assert line.startswith("innovations of gyro x, z add up: over 10 s x has ")
+    assert line.startswith("innovations of gyro x, gyro z add up: over 10 s gyro x has ")
     assert "its sigma is about 2 times too small; measure the walk with `driftlab allan`" in line
 
 

@@ -52,7 +52,7 @@ def part(step, start, stop):
 
 
 @given(st.integers(0, 10_000), st.booleans(), st.booleans(), st.lists(st.integers(0, 40), max_size=5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_spread_is_the_plain_recursion_and_can_be_cut_anywhere(seed, diagonal, varying, cuts):
     P, F, Q, C = drawn(seed, diagonal, varying)
     step = Transition(F, Q, np.zeros(len(P)), C)

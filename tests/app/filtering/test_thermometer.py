@@ -61,7 +61,7 @@ def test_a_perfect_thermometer_has_no_error_and_no_lag():
 
 
 @given(st.lists(st.integers(0, 2000), max_size=8), st.sampled_from([1.0, 0.1]), st.sampled_from([0.0, 0.02]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_any_split_gives_the_same_thermometer_to_the_last_bit(cuts, q, noise):
     rng = np.random.default_rng(1)
     true = 20 + 5 * np.sin(np.arange(2000) / 300)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -29,7 +29,6 @@ def test_a_body_without_lag_is_the_chamber():
     np.testing.assert_allclose(profile.body(t, 1e-3), profile.chamber(t), atol=1e-4)
 
 
-@settings(deadline=None)
 @given(
     hours=st.floats(0.2, 200), low=st.floats(-60, 10), swing=st.floats(3, 150), start=st.floats(-60, 100),
     rate=st.floats(0.002, 0.5), lag=st.floats(0, 3600),

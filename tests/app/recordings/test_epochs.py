@@ -56,7 +56,7 @@ def test_a_gap_is_no_ones_time():
 
 
 @given(size=st.integers(1, 700), interval=st.sampled_from([0.01, 0.1, 0.25, 3.0]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_epochs_do_not_depend_on_the_chunks(size, interval):
     rng = np.random.default_rng(3)
     t = np.cumsum(rng.choice([0.01, 0.012, 0.5], size=600, p=[0.9, 0.09, 0.01]))

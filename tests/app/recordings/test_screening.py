@@ -79,7 +79,7 @@ def test_without_a_range_nothing_is_saturated():
 
 
 @given(size=st.integers(1, 500))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_chunks_do_not_matter(size):
     one, other = Faults(), Faults()
     whole, split = concatenate(list(read(config(), one))), concatenate(list(read(config(), other, rows=size)))
@@ -109,7 +109,7 @@ def test_no_measured_recording_is_taken_for_stuck(recordings):
 
 
 @given(seed=st.integers(0, 2**32 - 1), first=st.booleans(), level=st.sampled_from([1.0, 2.5, 1e9]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
     """Few values, so that they repeat; also one that is not a number, which equals nothing."""
     rng = np.random.default_rng(seed)
@@ -125,7 +125,7 @@ def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
 
 
 @given(seed=st.integers(0, 2**32 - 1), epochs=st.integers(1, 20))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_means_over_epochs_are_weighted_averages(seed, epochs):
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[0], np.sort(rng.choice(np.arange(1, 100), epochs - 1, replace=False))]).astype(np.int64)

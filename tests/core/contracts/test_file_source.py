@@ -62,7 +62,7 @@ def test_all_kinds_give_the_same_bits(tmp_path):
             np.testing.assert_array_equal(a[name], b[name])
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 @given(size=st.integers(1, 200), start=st.none() | st.floats(0, 40), block=st.integers(30, 5000))
 def test_any_size_gives_the_same_samples(recording, size, start, block):
     source = recording.model_copy(update={"start": start, "stop": 48.0})

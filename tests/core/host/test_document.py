@@ -4,7 +4,7 @@ import time
 from contextlib import suppress
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from driftlab.config import Config, products
@@ -115,7 +115,6 @@ def test_a_quarter_of_a_megabyte_of_anything_is_answered_at_once(tmp_path, char,
     assert time.process_time() - begun < 5.0
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.sampled_from([*"abc:,-?[]{}&*!|>'\"%#\n \t", "\n  ", ": ", "- ", "&a ", "*a", "<<", "!!int ", "1e9"]),

@@ -40,7 +40,7 @@ def test_a_temperature_that_stalls_has_no_rate(estimator):
 
 
 @given(cut_at=st.integers(1, 499))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @pytest.mark.parametrize("estimator", [Regression(), Kalman()], ids=lambda e: e.kind)
 def test_a_rate_estimator_can_be_cut_anywhere(estimator, cut_at):
     rng = np.random.default_rng(0)

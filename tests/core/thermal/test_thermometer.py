@@ -98,7 +98,7 @@ def test_the_step_of_single_readings_is_what_all_changes_are_multiples_of():
 
 
 @given(st.lists(st.integers(0, 3000), max_size=8), st.sampled_from([1.0, 0.1, 0.0]), st.sampled_from([0.0, 0.02]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_any_split_shows_the_same_to_the_last_bit(cuts, step, noise):
     T = shown(TRUE[:3000], step, noise)
     whole, memory = readings(T, started()), started()

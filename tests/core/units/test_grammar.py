@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pint
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fusion_core.errors import UnitError
@@ -124,7 +124,6 @@ def test_a_temperature_is_no_difference():
         to_si("5 degC", "delta_degC")
 
 
-@settings(deadline=None)
 @given(st.one_of(st.text(max_size=2 * LONGEST), st.lists(st.sampled_from(PIECES), max_size=60).map("".join)))
 def test_any_text_is_a_quantity_or_a_unit_error_in_bounded_time(text):
     for read in (read_quantity, read_scaled_unit, si_unit_of, lambda text: to_si(text, "rad/s")):
@@ -148,7 +147,6 @@ units = st.lists(st.tuples(rooted, st.sampled_from(["*", "/", " "])), min_size=1
 numbers = st.one_of(st.floats(1e-6, 1e6), st.floats(-1e6, -1e-6), st.integers(1, 10**6)).map(repr)
 
 
-@settings(deadline=None)
 @given(numbers, units)
 def test_the_value_is_that_of_pint(number, unit):
     """pint evaluates the text as an expression; where the text is of valid parts, the two agree."""

@@ -96,7 +96,7 @@ def methods(effect):
     cuts=st.lists(st.integers(1, 119), unique=True, max_size=12).map(sorted),
     steps=st.sampled_from(["irregular", "regular"]),
 )
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_any_split_of_a_recording_gives_the_same(kind, cuts, steps):
     effect = KINDS[kind]()
     chunk = record(effect, steps=steps)

@@ -68,7 +68,7 @@ FLIPPED = st.tuples(st.integers(0, 65535), st.integers(0, 8 * SIZE - 1)).map(
 FALSE_SYNC = st.binary(max_size=20).map(lambda tail: SYNC + tail)
 
 
-@settings(max_examples=draws(60, 300), deadline=None)
+@settings(max_examples=draws(60, 300))
 @given(
     st.lists(st.one_of(INTACT, INTACT, WITH_SYNC_INSIDE, GARBLED, TORN, HEADLESS, FLIPPED, FALSE_SYNC), max_size=25),
     st.lists(st.integers(0, 2500), max_size=30),
@@ -90,7 +90,7 @@ def test_the_intact_frames_come_out_and_nothing_else(pieces, cuts):
         np.testing.assert_array_equal(channels[name], values)
 
 
-@settings(max_examples=draws(60, 200), deadline=None)
+@settings(max_examples=draws(60, 200))
 @given(st.binary(max_size=60).map(lambda b: b.replace(b"\x00", b"\xa5")), st.lists(st.integers(0, 400), max_size=8))
 def test_weak_checksums_are_scanned_as_defined(noise, cuts):
     """An eight-bit sum lets some noise through; which, is said by the definition, walked here byte by byte."""
@@ -222,7 +222,7 @@ TEXT = {
 }
 
 
-@settings(max_examples=draws(60, 200), deadline=None)
+@settings(max_examples=draws(60, 200))
 @given(
     st.lists(st.one_of(
         st.integers(0, 255),

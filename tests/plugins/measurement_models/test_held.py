@@ -55,7 +55,7 @@ def test_estimates_are_those_of_a_local_level_model():
 
 
 @given(seed=st.integers(0, 50), gap=st.integers(0, 300))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_the_last_estimate_is_that_of_joint_least_squares(seed, gap):
     """All biases at once: weighted differences of neighbours, and the readings; with a gap in the middle."""
     N = 300
@@ -98,7 +98,7 @@ def test_what_coasts_says_how_far_off_it_is():
 
 
 @given(size=st.integers(1, 900))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_any_split_gives_the_same_run(size):
     chunk, _ = resistor(1000)
     parts = [chunk.part(k, min(k + size, 1000)) for k in range(0, 1000, size)]

@@ -226,7 +226,7 @@ def test_one_axis_without_accelerometers_is_watched():
 
 
 @given(cuts=st.lists(st.integers(1, 4000), max_size=12), seed=st.integers(0, 3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_any_split_gives_the_same_flags_to_the_last_bit(cuts, seed):
     chunk, _ = disturbed(*MOTIONS[list(MOTIONS)[seed]])
     t = chunk.t.copy()

@@ -63,7 +63,7 @@ def test_lost_and_damaged_frames_leave_gaps_and_are_counted(tmp_path):
     assert faults == {GARBAGE: 3 + SIZE, DAMAGED: 1, LOST: 4}
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(st.sampled_from(["good", "lost", "torn", "noise"]), min_size=1, max_size=40),
     st.integers(1, 700), st.integers(1, 50),

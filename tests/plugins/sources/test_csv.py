@@ -176,7 +176,7 @@ def test_headers(tmp_path):
         read(simple(text(tmp_path, "t,g,g\n0,1,2\n")))
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(st.lists(st.floats(), min_size=1, max_size=20), st.sampled_from(["{!r}", "{:.17g}", "{:.6f}", '"{!r}"']))
 def test_polars_and_the_slow_road_agree(tmp_path, numbers, form):
     lines = ["t,g"] + [f"{k}," + form.format(value) for k, value in enumerate(numbers)]

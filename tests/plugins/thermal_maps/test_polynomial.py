@@ -36,7 +36,7 @@ def test_least_squares_and_its_deviation_are_those_of_numpy():
         np.testing.assert_allclose(found.sigma(at, T_0)[:, axis], np.sqrt(spread), rtol=0.2, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     order=st.integers(1, 15),
     low=st.floats(-60, 20),

@@ -131,7 +131,7 @@ def expected(message, path):
     return [value.x, value.y, value.z] if hasattr(value, "x") else np.asarray(value, float)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.booleans(),
     st.lists(

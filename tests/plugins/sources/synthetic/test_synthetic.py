@@ -51,7 +51,7 @@ def test_two_lines_are_a_config_and_give_the_paper_ramp():
 # the samples do not depend on how they are read
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(size=st.integers(1, 1500), seed=st.integers(0, 2**40), hold=st.floats(0, 20).map(lambda s: round(s, 6)))
 def test_chunks_of_any_size_are_the_same_samples(size, seed, hold):
     source = Synthetic.model_validate({
@@ -263,7 +263,7 @@ def test_hysteresis_closes_its_loop_and_cooling_less_warming_is_gain_times_width
     assert np.abs(bias[:, 0]).max() <= 10 + 1e-9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     T=st.lists(st.integers(-40, 60), min_size=2, max_size=12),
     width=st.floats(0.1, 30),
