@@ -59,6 +59,7 @@ class Overview:
     first_row: float  # time of the recording's first row, s; of the first update where it is not known
     bias: Array  # (d,) at the end, SI
     sigma: Array  # (d,) its deviation
+    deviations: tuple[Array, Array]  # (d,) least and root mean square of the bias's, of the updates that NIS is of
     yardsticks: Scores  # scores of the run
     nis: NisTest  # of the used updates after the first alignment
     whiteness_p: Array  # (m,) of the same
@@ -88,6 +89,7 @@ class OverviewAccumulator:
         self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
         self._scores, self._envelope = ScoreAccumulator(d), Envelope(d)
         self._whiteness = whiteness or Whiteness(model.m)
+        self._least, self._squares, self._counted = np.full(d, np.inf), np.zeros(d), 0
         self._curves, self._last = _Thinned(), Columns()
         self._parts: list[Mapping[str, Array]] = []  # of the next block
         self._waiting: list[Columns] = []  # blocks whose reference is not known yet
@@ -128,6 +130,9 @@ class OverviewAccumulator:
         self._last = _rows(block, len(used) - 1, None)
         errors = errors_of(block, block["reference"])
         self._scores.add(block, errors)
+        sigma = block["bias_sigma"][after]
+        self._least = np.minimum(self._least, np.min(sigma, axis=0, initial=np.inf))
+        self._squares, self._counted = self._squares + np.sum(sigma**2, axis=0), self._counted + len(sigma)
         if "white" in block:
             self._whiteness.add(block["white"][after])
         self._envelope.add(block, errors, after)
@@ -150,6 +155,7 @@ class OverviewAccumulator:
             first_row=self.start if first_row is None else first_row,
             bias=self._last["bias"][-1],
             sigma=self._last["bias_sigma"][-1],
+            deviations=(self._least, np.sqrt(self._squares / max(self._counted, 1))),
             yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
             nis=nis_test_of(found.nis_total, int(np.sum(found.sums[:, 0])), model.m),
             whiteness_p=self._whiteness.p(),

@@ -105,14 +105,16 @@ def wandering(run: ScoredRun) -> list[str]:
     """Return a remark where innovations add up, since the bias moves by more than its walk allows; none where not.
 
     An error e of the bias is e^2 tau / N^2 of the square of an innovation, N the white noise and tau the update's
-    length, so the sums say by how much the deviation of the bias is too small.
+    length, so the sums say how large the error is beside the filter's own, which is that of the least deviation: what
+    deviations have of thermometer and map adds up as well.
     """
     overview, sensor = run.overview, run.sensor
     d = len(sensor.axes)
     ratio, rows, p = (column[-d:] for column in overview.slow)
     tau = run.alignment.dt
     excess = np.maximum(ratio - 1, 0) / rows * sensor.noise**2 / tau
-    small = np.sqrt(1 + np.divide(excess, overview.sigma**2, out=np.zeros(d), where=overview.sigma > 0))
+    own, deviation = overview.deviations
+    small = np.sqrt(np.divide(own**2 + excess, deviation**2, out=np.zeros(d), where=deviation > 0))
     seen = (p < CHANCE / d) & (small > SMALL)
     if not np.any(seen):
         return []

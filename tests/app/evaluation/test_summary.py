@@ -22,7 +22,7 @@ SCORES = Scores(
     {**dict.fromkeys(("first 30 s", "whole", *HORIZONS), 1.0), "10 min": 0.9}, 0.0,
 )  # fmt: skip
 QUIET = Overview(
-    count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, yardsticks=SCORES,
+    count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, deviations=(ONES, ONES), yardsticks=SCORES,
     nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, slow=(ONES, ONES, ONES), curves={}, errors={},
     nis_curve=np.zeros((0, 3)), nis_highest=0.0, swing=0.0,
 )  # fmt: skip
@@ -57,6 +57,12 @@ def test_innovations_that_add_up_say_by_how_much_sigma_is_too_small():
     (line,) = said(adding, journal())
     assert line.startswith("innovations of gyro x, gyro z add up: over 10 s gyro x has ")
     assert "its sigma is about 2 times too small; measure the walk with `driftlab allan`" in line
+
+
+def test_what_the_deviations_have_of_the_thermometer_adds_up_and_is_no_walk():
+    excess = 3 * ONES**2 * 0.1 / MODEL.tracked.noise**2
+    adding = replace(QUIET, slow=(1 + 100 * excess, np.full(3, 100.0), np.full(3, 1e-9)), deviations=(ONES, 2 * ONES))
+    assert said(adding, journal()) == []
 
 
 def test_a_quiet_run_has_nothing_to_say():
