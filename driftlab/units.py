@@ -14,6 +14,7 @@ from fusion_core.units import convert
 if TYPE_CHECKING:
     from fusion_core.contracts import MeasurementModel, Sensor
 
+EARTH = 7.292115e-5  # rad/s
 YEARS = (8e8, 4e9)  # s since 1970, 1995 to 2096: a time between them is a date
 
 

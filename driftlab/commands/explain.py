@@ -21,7 +21,7 @@ from driftlab.config import Config, load_config, part_of, paths_of, with_recordi
 from driftlab.evaluation.limits import LimitResult, least_kept, verdict
 from driftlab.evaluation.overview import ScoredRun, scored
 from driftlab.evaluation.scores import moving_average
-from driftlab.evaluation.summary import mispredicted, remarks
+from driftlab.evaluation.summary import jumps, mispredicted, remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.identification.candidates import check_kinds
@@ -281,6 +281,7 @@ def outcome_of(compared: Sequence[Config], recording: str, progress: Progress) -
         runs = [pool.submit(_run, with_recording(c, recording), stream, deepcopy(faults)) for c in compared]
         (first, before), (second, after) = runs[0].result(), runs[-1].result()
     coasting = np.isfinite(first["coast"][:, 0])
+    off = jumps(after, second)
     return Outcome(
         name=recording,
         unit=tracked_unit(config.filter),
@@ -292,8 +293,8 @@ def outcome_of(compared: Sequence[Config], recording: str, progress: Progress) -
         before_sigma=first["coast_sigma"][coasting],
         after_sigma=second["coast_sigma"][coasting],
         runs=(before, after),
-        remarks=tuple(remarks(after)),
-        off=tuple(mispredicted(after)),
+        remarks=(*off, *remarks(after)),
+        off=(*off, *mispredicted(after)),
     )
 
 

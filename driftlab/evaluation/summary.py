@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from driftlab.evaluation.overview import ScoredRun, map_of
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, WINDOW, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_remarks
-from driftlab.units import axis_name
+from driftlab.units import EARTH, axis_name, number
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import moment
@@ -23,6 +23,10 @@ COMPLETE = 0.9  # of the time: a score that stands on less says why
 FAR_OFF = 4.0  # deviations of a prediction: a right model is off by more in one axis of 10,000
 CHANCE = 1e-3  # probability that innovations of a right model are said to add up
 SMALL = 1.3  # times that a deviation of the bias is too small: with less nothing is said
+AXES, GAP = (
+    3,
+    1.5,
+)  # of a gyro whose turns are seen; epochs further apart than so many times their length: they may not be
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
 Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
@@ -227,6 +231,37 @@ def mispredicted(run: ScoredRun) -> list[str]:
                 "and see with driftlab explain what is missing"
             ]
     return []
+
+
+def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:
+    """Return a sentence on each rest of a gyro triad that is at another bias, and at no other attitude, than the last.
+
+    Its readings since that rest add up to the angle of a turn, which moves an Earth rate by less than they are off.
+    """
+    sensor, lines = run.sensor, []
+    if not sensor.integral or len(sensor.axes) != AXES:
+        return []
+    for again in run.journal.alignments[1:]:
+        stop = int(np.searchsorted(columns["t"], again.t, side="right"))
+        before = int(np.flatnonzero(columns["used"][:stop])[-1]) if np.any(columns["used"][:stop]) else stop
+        rows = slice(before + 1, stop)
+        t, tau = columns["t"][before:stop], columns["tau"][rows]
+        if before + 2 > stop or np.any(np.diff(t) > GAP * tau):
+            continue
+        off = columns["rate"][rows] - columns["bias"][rows]
+        angle, rest = float(np.linalg.norm(tau @ off)), slice(len(off) // 2, None)
+        jump = np.mean(off[rest], axis=0)
+        sigma = np.hypot(columns["bias_sigma"][before], sensor.noise / np.sqrt(np.sum(tau[rest])))
+        if np.linalg.norm(jump) > EARTH * min(angle, 2.0) + FAR_OFF * np.linalg.norm(sigma):
+            k = int(np.argmax(np.abs(jump)))
+            when = moment(again.t, run.journal.faults.first_row)
+            by = f"{number(jump[k] * run.unit.factor)} {run.unit.shown}"
+            lines.append(
+                f"{axis_name(sensor.channel, sensor.axes[k])} jumped by {by} before {when}, and no turn explains "
+                f"it: by then the unit had turned by {np.rad2deg(angle):.2g}° at most; the bias jumped, or the unit is "
+                "turned steadily: look at it and its supply there, or leave that part out with PATH::START:STOP"
+            )
+    return lines
 
 
 def error_rows(runs: Sequence[Scores]) -> Rows:

@@ -32,7 +32,7 @@ from driftlab.soak.placements import Placements
 from driftlab.storage.json import plain, text_of
 from driftlab.triad.estimate import TriadFit
 from driftlab.triad.model import AXES, GRAVITY, PAIRS
-from driftlab.units import BiasUnit, default_unit, duration, tracked_unit
+from driftlab.units import EARTH, BiasUnit, default_unit, duration, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 
@@ -41,7 +41,6 @@ LARGE = {"rad/s": (np.deg2rad(1.0), "deg/s"), "m/s^2": (GRAVITY, "m/s^2")}  # be
 USUAL = {"rad/s": "deg/h", "m/s^2": "mg"}
 MAX_RECORDINGS = 3  # that are listed on the sheet; of more it has one hash of all
 MAX_DECIMALS = 6  # of a number without a power of ten
-EARTH = 7.292115e-5  # rad/s
 SOURCES = {
     "curve": "noise and walk of the recording in the curve, smoothing, misfit",
     "mean": "noise of the mean level, s / √n",

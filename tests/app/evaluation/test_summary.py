@@ -8,7 +8,7 @@ import pytest
 from driftlab.config import Config
 from driftlab.evaluation.overview import Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
-from driftlab.evaluation.summary import remarks
+from driftlab.evaluation.summary import jumps, remarks
 from driftlab.filtering.segment import RunLog
 from fusion_core.consistency import NisTest
 from fusion_core.contracts import Alignment
@@ -22,7 +22,8 @@ SCORES = Scores(
     {**dict.fromkeys(("first 30 s", "whole", *HORIZONS), 1.0), "10 min": 0.9}, 0.0,
 )  # fmt: skip
 QUIET = Overview(
-    count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, deviations=(ONES, ONES), yardsticks=SCORES,
+    count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, deviations=(ONES, ONES),
+    yardsticks=SCORES,
     nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, slow=(ONES, ONES, ONES), curves={}, errors={},
     nis_curve=np.zeros((0, 3)), nis_highest=0.0, swing=0.0,
 )  # fmt: skip
@@ -121,3 +122,41 @@ def test_a_score_without_a_value_says_why():
     scores = replace(SCORES, filter_first=np.full(3, np.nan), share={**SCORES.share, "first 30 s": 0.1})
     (line,) = said(replace(QUIET, yardsticks=scores), journal())
     assert line.startswith("no score for first 30 s (10 %)")
+
+
+def rested_anew(rate, noise=None):
+    """Columns of a run at rest over 100 s, refused from 40 s on at readings `rate` (100, 3), aligned anew at 99 s."""
+    none = np.zeros((100, 3))
+    columns = {
+        "t": np.arange(100.0), "tau": np.ones(100), "used": np.arange(100) < 40, "rate": rate, "bias": none,
+        "bias_sigma": none + 1e-7,
+    }  # fmt: skip
+    model = MODEL.model_copy(update={"gyro": MODEL.gyro.model_copy(update={"noise": noise * ONES})}) if noise else MODEL
+    return jumps(ScoredRun(Config(), model, journal(99.0), QUIET, None), columns)
+
+
+def test_a_rest_at_another_rate_that_no_turn_explains_is_a_jump():
+    """A turn by 3.4 degrees moves an Earth rate by at most 4e-6 rad/s, one by 1,000 degrees by 1.5e-4."""
+    rate = np.zeros((100, 3))
+    rate[40:] = [0.0, 1e-3, 0.0]
+    (line,) = rested_anew(rate)
+    assert line.startswith("gyro y jumped by 206 deg/h before 99.0 s, and no turn explains it: by then the unit had ")
+    assert "turned by 3.4° at most" in line
+
+
+def test_a_yaw_turn_moves_the_earth_rate():
+    rate = np.zeros((100, 3))
+    rate[40:] = [0.0, 1.4e-4, 0.0]
+    rate[40:45, 2] = np.pi / 5
+    assert rested_anew(rate, 1e-7) == []
+    rate[40:45, 2] = 0.0
+    assert rested_anew(rate, 1e-7)
+
+
+def test_readings_that_are_missing_may_hold_a_turn():
+    rate = np.zeros((100, 3))
+    rate[40:] = [0.0, 1e-3, 0.0]
+    run = ScoredRun(Config(), MODEL, journal(109.0), QUIET, None)
+    t = np.arange(100.0) + 10 * (np.arange(100) > 60)
+    columns = {"t": t, "tau": np.ones(100), "used": t < 40, "rate": rate, "bias": 0 * rate, "bias_sigma": 0 * rate}
+    assert jumps(run, columns) == []
