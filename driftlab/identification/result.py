@@ -175,7 +175,7 @@ def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
         if not len(e):
             continue
         total += np.sum(e**2), np.sum(after**2)
-        rows += len(e)
+        rows += e.size
         grown += float(np.sum(after**2) - np.sum(e**2))
         variance += 4 * sum(_variance(own, change) for own, change in zip(e.T, (after - e).T, strict=True))
     before, after = np.sqrt(total / max(rows, 1))

@@ -51,6 +51,12 @@ def test_what_changes_nothing_is_not_refuted_and_nothing_is_said():
     assert sentence(change, [outcome(e, 0 * s)]) == ""
 
 
+def test_errors_are_the_rms_of_all_axes_and_recordings():
+    e = np.broadcast_to([1.0, 2.0, 2.0], (300, 3))
+    change = change_of([outcome(e, 0 * e), outcome(3 * e, 0 * e)])
+    assert np.isclose(change.before, np.sqrt(3 * (1 + 9) / 2))
+
+
 def test_what_gets_worse_by_chance_is_said():
     for seed in range(50):
         e, s = drawn(seed, slow=True)
