@@ -97,9 +97,9 @@ def closed(
     verdict = replace(identified.verdict, word="refuted") if change.worse else identified.verdict
     untested, nothing = _untested(outcomes), verdict.word == "nothing_missing"
     off = [f"{Path(o.name).name}: {line}" for o in outcomes for line in o.off if nothing]
-    if off or (untested and verdict.word == "explained"):
+    first = sentence(change, outcomes) if identified.anything else ""
+    if off or (verdict.word == "explained" and (untested or first)):
         verdict = replace(verdict, word="unexplained")
-    first = sentence(change, outcomes)
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     others = (remark for remark in remarks if remark not in off)
     lines = (*untested, *off, *([first] if first else []), *identified.lines, *others)
@@ -148,17 +148,24 @@ class Outcome:
 class ErrorChange:
     """Change of the prediction error over all test recordings: its rms before and after, SI.
 
-    `sigma` is by how many deviations of chance the sum of its squares grows.
+    `sigma` is by how many deviations of chance the sum of its squares grows; `power` by how many it would fall, if the
+    effects are there as they were found, and grow, if they are not.
     """
 
     before: float
     after: float
     sigma: float
+    power: float
 
     @property
     def worse(self) -> bool:
         """True if it grows beyond chance."""
         return self.after > self.before and self.sigma > SURE
+
+    @property
+    def confirms(self) -> bool:
+        """True if it falls where effects that are there would hardly ever let it grow."""
+        return self.after < self.before and self.power > SURE
 
 
 def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
@@ -166,9 +173,11 @@ def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
 
     With e the error before and s the change of the prediction, the sum of squares grows by s's + 2 s'e. Its deviation
     is 2 sqrt(s' Omega s), Omega what the periodogram of e says, smooth and falling: slow noise that happens to run
-    along a slow s counts as what it is, a few independent rows.
+    along a slow s counts as what it is, a few independent rows. Of effects that are there it falls by s's, but for
+    the noise that is left then, and of effects that are not it grows by as much beside that of e: the one of e and
+    e + s that is without the effects has the smaller Omega.
     """
-    grown, variance, total, rows = 0.0, 0.0, np.zeros(2), 0
+    grown, moved, variances, total, rows = 0.0, 0.0, np.zeros(2), np.zeros(2), 0
     for outcome in outcomes:
         known = np.all(np.isfinite(outcome.reference), axis=1)
         e, after = (_means((side - outcome.reference)[known]) for side in (outcome.before, outcome.after))
@@ -177,22 +186,35 @@ def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
         total += np.sum(e**2), np.sum(after**2)
         rows += e.size
         grown += float(np.sum(after**2) - np.sum(e**2))
-        variance += 4 * sum(_variance(own, change) for own, change in zip(e.T, (after - e).T, strict=True))
+        moved += float(np.sum((after - e) ** 2))
+        for k, error in enumerate((e, after)):
+            variances[k] += 4 * sum(_variance(own, change) for own, change in zip(error.T, (after - e).T, strict=True))
     before, after = np.sqrt(total / max(rows, 1))
-    return ErrorChange(float(before), float(after), grown / float(np.sqrt(variance)) if variance > 0 else 0.0)
+    sigma, power = (
+        x / float(np.sqrt(v)) if v > 0 else 0.0 for x, v in ((grown, variances[0]), (moved, variances.min()))
+    )
+    return ErrorChange(float(before), float(after), sigma, power)
 
 
 def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
-    """Return the first sentence about a prediction that gets worse; nothing where it does not by half a percent."""
-    if not change.after > 1.005 * change.before:
+    """Return the first sentence about a prediction that does not confirm the effects; nothing where it does."""
+    if change.confirms or not outcomes:
         return ""
     unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
     figures = f"{change.before * unit.factor:.3g} -> {change.after * unit.factor:.3g} {unit.shown}"
-    if not change.worse:
-        return f"{names}: predicted worse with the identified effects ({figures}), but not beyond chance"
+    if change.worse:
+        return (
+            f"{names}: predicted worse with the identified effects than without ({figures}; {change.sigma:.1f} "
+            "sigma): explained.yaml is the declared config, and candidate.yaml has the effects"
+        )
+    if change.power <= SURE:
+        return (
+            f"{names}: hardly tests the identified effects ({figures}): what they move the prediction by there is "
+            "within chance; test by a recording in which what they depend on moves further"
+        )
     return (
-        f"{names}: predicted worse with the identified effects than without ({figures}; {change.sigma:.1f} "
-        "sigma): explained.yaml is the declared config, and candidate.yaml has the effects"
+        f"{names}: predicted no better with the identified effects ({figures}), where effects as large as those that "
+        "were found would be seen; worse, if it is, by no more than chance: test by another recording"
     )
 
 
