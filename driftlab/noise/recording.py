@@ -6,7 +6,7 @@ rest. N samples, S stretches, n windows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,11 +17,12 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.noise.allan import bridgeable, curve
 from driftlab.noise.allan_fit import Coefficients, fit
-from driftlab.noise.allan_model import PRESENT, AllanCurve
+from driftlab.noise.allan_model import KEYS, PRESENT, AllanCurve
+from driftlab.noise.bias_step import bias_steps
 from driftlab.recordings.epochs import GAP, epochs
 from driftlab.recordings.plausibility import axes_in
 from driftlab.recordings.screening import read
-from driftlab.units import axis_name
+from driftlab.units import axis_name, default_unit, unit_of, with_uncertainty
 from fusion_core.chunk import Array, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor
 from fusion_core.errors import DataError
@@ -164,6 +165,7 @@ def limits(t: Array, stretches: Integers) -> tuple[float, float]:
 
 
 IMU = ("gyro", "accel")
+SLOW = slice(KEYS.index("bias_instability"), None)  # of the coefficients: those that one step of the bias looks like
 
 SPARSE = 0.2  # of the time that samples at their interval fill, at least
 EARLY = 1e-3  # of the steps, that are the shortest: a stamp is early by so much, and another one as late
@@ -233,6 +235,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     first = next(iter(curves.values()))[0]
     notes = [*_gap_notes(first, whole, cut, faults), *_motion_notes(config, rest, faults)]
     for c, of_axes in coefficients.items():
+        notes += _step_notes(whole.t, whole[c], cut.spans, of_axes, c, axes[c], sensors.get(c), faults)
         notes += _grouped(c, axes[c], [one.notes for one in of_axes])
     start, plugins = float(whole.t[cut.spans[0, 0]]), participants(config.source)
     return Analysis(name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors)
@@ -251,6 +254,26 @@ def _doubt_stamps(faults: Faults, rows: int, dt: float, total: float) -> None:
             f"{repeated} of {faults.rows} rows repeat a time stamp and are left out: the clock is coarser than the "
             "rows, and the noise is that of the rows that are left; set source.interval"
         )
+
+
+def _step_notes(
+    t: Array, rate: Array, spans: Integers, found: Sequence[Coefficients], channel: str, axes: list[str],
+    sensor: Sensor | None, faults: Faults,
+) -> Iterator[str]:  # fmt: skip
+    """Yield a remark on each axis whose walk, or ramp, is rather one step of the bias."""
+    slow = [k for k, one in enumerate(found) if np.any(one.value[SLOW] > 0)]
+    if not slow:
+        return
+    unit = default_unit("rad/s" if channel == IMU[0] else "m/s^2") if sensor is None else unit_of(sensor)
+    for k, step in zip(slow, bias_steps(t, rate[:, slow], spans), strict=True):
+        if step is not None:
+            value = with_uncertainty(step.size * unit.factor, step.sigma * unit.factor)
+            beside = f"{step.walk * unit.factor:.3g} {unit.shown}/sqrt(s)" if step.walk > 0 else "not seen"
+            yield (
+                f"{axis_name(channel, axes[k])}: the bias steps by {value} {unit.shown} at {faults.when(step.t)} "
+                f"(log-likelihood {step.gain:.0f} beyond noise and walk alone); the walk that is fitted has it in, "
+                f"beside it the walk is {beside}: find its cause, or leave one side of it out with PATH::START:STOP"
+            )
 
 
 def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]:
