@@ -55,17 +55,18 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         begun = [] if carry is None else [carry]
         if starts[0] > 0:
             begun.append(chunk.part(0, starts[0]))
-        done = []
-        if begun:
-            done.append(_integrate(concatenate(begun), np.zeros(1, dtype=np.int64), pace, previous))
-            previous = done[-1].last() if len(done[-1]) else previous
+        pieces = [(concatenate(begun), np.zeros(1, dtype=np.int64))] if begun else []
         if count > 1:
-            done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
+            pieces.append((chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0]))
         carry = chunk.part(starts[-1], len(chunk))
-        done = [part for part in done if len(part)]
+        done = []
+        for rows, begins in pieces:
+            part = _integrate(rows, begins, pace, previous)
+            if len(part):
+                done.append(part)
+                previous = part.last()
         if done:
             yield concatenate(done)
-            previous = done[-1].last()
     if carry is not None:
         done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
         if len(done[0]):
@@ -157,10 +158,10 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
         _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
         channels[name] = locked(means)
     locked(tau)  # only now: of what is locked, compiled functions have a version of its own
-    done = made(locked(rows.t[last]), channels, None, rows.sensors)
+    done = made(locked(rows.t[last]), channels, previous, rows.sensors)
     done = done if lasting else done.where(tau > 0)
-    if previous is None and len(done):
-        # the step to the first epoch is as long as what it integrates
-        first = {name: values[:1] for name, values in done.channels.items()}
-        previous = Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors)
-    return done.following(previous)
+    if previous is not None or not len(done):
+        return done
+    # the step to the first epoch is as long as what it integrates
+    first = {name: values[:1] for name, values in done.channels.items()}
+    return done.following(Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors))

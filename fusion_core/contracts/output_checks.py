@@ -193,17 +193,18 @@ def _ordinary(step: Transition, n: int, N: int) -> bool:
         if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes:
             return False
         arrays.append(array if array.flags.carray else array.copy())
-    return bool(_sound(*arrays))
+    F, Q, u = arrays
+    return bool(_sound(F, Q, u.reshape(-1)))
 
 
 @compiled
 def _sound(F: Array, Q: Array, u: Array) -> bool:
-    """Return True if F (n, n), Q (n, n) and u are finite, and Q is diagonal with no variance below zero."""
+    """Return True if F (n, n), Q (n, n) and numbers u are finite, and Q is diagonal with no variance below zero."""
     n, ordinary = len(F), True
     for i in range(n):
         for j in range(n):
             ordinary &= np.isfinite(F[i, j]) and (Q[i, j] == 0 if i != j else 0 <= Q[i, j] < np.inf)
-    for value in u.flat:
+    for value in u:
         ordinary &= np.isfinite(value)
     return ordinary
 
