@@ -85,6 +85,11 @@ class Chunk:
                 steps[begins:] = usual
         return constant(steps)
 
+    @property
+    def each_dt(self) -> Array:
+        """Duration of the step to each sample (N,) in s, also where all are the same."""
+        return self.dt.repeat(len(self.t)) if self.dt.ndim == 0 else self.dt.copy()
+
     def part(self, start: int, stop: int) -> Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
         if start <= 0 and stop >= len(self.t):
@@ -96,31 +101,41 @@ class Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
         return self.following(None) if len(self.t) == 1 else self._rows(slice(len(self.t) - 1, len(self.t)), None)
 
-    def following(self, previous: Chunk | None) -> Chunk:
-        """Return the same samples after another one."""
-        return self._made(self.channels, previous)
+    def following(self, previous: Chunk | None, sensors: frozenset[str] | None = None) -> Chunk:
+        """Return the same samples after another one, and with other channels for its `sensors` where they are given."""
+        return made(self.t, self.channels, previous, self.sensors if sensors is None else sensors)
 
-    def _rows(self, rows: slice | Flags, previous: Chunk | None) -> Chunk:
-        return Chunk(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
+    def _rows(self, rows: slice, previous: Chunk | None) -> Chunk:
+        channels = {key: a[rows] for key, a in self.channels.items()}  # parts of what is locked are locked
+        return made(self.t[rows], channels, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
         known: Any = self.channels  # a proxy: to be unpacked it takes six times as long as its dict
         whole = known | {name: read_only(values) for name, values in channels.items()}
-        made = self._made(MappingProxyType(whole), self.previous)
+        same = made(self.t, whole, self.previous, self.sensors)
         if "dt" in self.__dict__ and "dt" not in channels:
-            made.__dict__["dt"] = self.dt
-        return made
-
-    def _made(self, channels: Mapping[str, Array], previous: Chunk | None) -> Chunk:
-        """Return the same samples with channels that nobody can write to already: they are not looked at again."""
-        made = object.__new__(Chunk)
-        made.__dict__.update(t=self.t, channels=channels, previous=previous, sensors=self.sensors)
-        return made
+            same.__dict__["dt"] = self.dt
+        return same
 
     def where(self, keep: Flags) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
-        return self._rows(keep, self.previous)
+        channels = {key: locked(a[keep]) for key, a in self.channels.items()}
+        return made(locked(self.t[keep]), channels, self.previous, self.sensors)
+
+
+def made(t: Array, channels: Mapping[str, Array], previous: Chunk | None, sensors: frozenset[str]) -> Chunk:
+    """Return a chunk of arrays that are locked already: they are not looked at again."""
+    proxy = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
+    chunk = object.__new__(Chunk)
+    chunk.__dict__.update(t=t, channels=proxy, previous=previous, sensors=sensors)
+    return chunk
+
+
+def locked(values: Array) -> Array:
+    """Return an array that nobody else holds, which cannot be written to any more."""
+    values.setflags(write=False)
+    return values
 
 
 def read_only(values: Array) -> Array:

@@ -129,8 +129,10 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
 
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
-    keep = np.abs(chunk.t) <= LARGEST  # neither NaN
-    if lost := len(keep) - int(np.count_nonzero(keep)):
+    keep = None  # all
+    if not _all_usable(chunk.t, -LARGEST, LARGEST):
+        keep = np.abs(chunk.t) <= LARGEST  # neither NaN
+        lost = len(keep) - int(np.count_nonzero(keep))
         faults.add("rows with a time stamp that is not a number, left out", lost, _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
         low, high, unit = RANGES.get(channel, (-LARGEST, LARGEST, ""))
@@ -140,6 +142,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         if channel == "valid":
             good &= values != 0
         good = good if good.ndim == 1 else np.all(good, axis=1)
+        keep = np.ones(len(chunk), dtype=np.bool_) if keep is None else keep
         bad = keep & ~good
         beyond = f"is beyond {low:g} to {high:g} {unit}" if unit else f"is beyond {LARGEST:g}"
         beyond = beyond if np.all(np.isfinite(values)) else "is not a finite number"
@@ -147,7 +150,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         if np.any(bad):
             faults.add(f"{what}, left out", int(np.sum(bad)), f"at {faults.when(chunk.t[np.argmax(bad)])}")
             keep = keep & good
-    rows = chunk if np.count_nonzero(keep) == len(keep) else chunk.where(keep)
+    rows = chunk if keep is None or np.count_nonzero(keep) == len(keep) else chunk.where(keep)
     if "valid" not in rows.channels:
         return rows
     return Chunk(rows.t, {name: values for name, values in rows.channels.items() if name != "valid"}, chunk.previous)

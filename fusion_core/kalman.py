@@ -181,5 +181,6 @@ def expected(x: Array, transition: Transition, N: int) -> Array:
     n = np.size(x)
     x = finite("x", numbers("x", x, (n,), "of the states"))
     steps = checked_transition(transition, n, N)
-    u = np.ascontiguousarray(np.broadcast_to(steps.u, (N, n)))
-    return np.asarray(drift(x, steps.F if steps.F.ndim == 3 else steps.F[None], u), dtype=np.float64)
+    u, out = np.ascontiguousarray(np.broadcast_to(steps.u, (N, n))), np.empty((N, n))
+    drift(x, steps.F if steps.F.ndim == 3 else steps.F[None], u, out)
+    return out

@@ -54,10 +54,9 @@ def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
 
 
 @compiled
-def drift(x: Array, F: Array, u: Array) -> Array:
-    """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
+def drift(x: Array, F: Array, u: Array, out: Array) -> None:
+    """Write x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
     N, n = len(u), len(x)
-    out = np.empty((N, n))
     for k in range(N):
         F_k = F[min(k, len(F) - 1)]
         before = x if k == 0 else out[k - 1]
@@ -66,7 +65,6 @@ def drift(x: Array, F: Array, u: Array) -> Array:
             for j in range(n):
                 total += F_k[i, j] * before[j]
             out[k, i] = total
-    return out
 
 
 def lag_fading(dt: Array, N: int, tau: float, begun: bool) -> Array:
@@ -79,11 +77,10 @@ def lag_fading(dt: Array, N: int, tau: float, begun: bool) -> Array:
 
 
 @compiled
-def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
-    """Return values (N,), their rates (N,) and the memory of a straight line whose weights fade by tau s."""
+def regression_rate(dt: Array, T: Array, memory: Array, tau: float, smooth: Array, rate: Array) -> None:
+    """Write values (N,) and their rates (N,) of a straight line whose weights fade by tau s; `memory` goes on."""
     # weighted sums with time counted from the current sample and T from the first one
     T_0, w, wt, wtt, wT, wtT, pull = memory
-    smooth, rate = np.empty(len(T)), np.empty(len(T))
     usual, keep = -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
         wtt, wt, wtT = wtt + dt[k] * (dt[k] * w - 2 * wt), wt - dt[k] * w, wtT - dt[k] * wT
@@ -94,14 +91,15 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
         spread = wtt - wt * wt / w + pull
         rate[k] = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
         smooth[k] = T_0 + (wT - rate[k] * wt) / w
-    return smooth, rate, np.array([T_0, w, wt, wtt, wT, wtT, pull])
+    memory[1], memory[2], memory[3], memory[4], memory[5], memory[6] = w, wt, wtt, wT, wtT, pull
 
 
 @compiled
 def regression_value(
-    dt: Array, T: Array, rate: Array, steps: Array, known: tuple[float, ...], memory: Array, longest: float, walk: float
-) -> tuple[Array, Array, Array]:
-    """Return values (N,) of a straight line, its windows (N,) in s, and the memory; the noisier T, the longer these.
+    dt: Array, T: Array, rate: Array, steps: Array, known: tuple[float, ...], memory: Array, longest: float,
+    walk: float, smooth: Array, windows: Array,
+) -> None:  # fmt: skip
+    """Write values (N,) of a straight line and its windows (N,) in s, the noisier T, the longer; `memory` goes on.
 
     A rate that is a random walk of the density `walk`, seen through noise of a density n, is followed in sqrt(n / walk)
     s. n^2 is that of T itself, by its second differences, and of what the thermometer's steps q leave: q^2 / 12, or
@@ -109,7 +107,6 @@ def regression_value(
     (N,). `steps` (N,) are those seen so far, `known` a larger one and the variance that it leaves in means.
     """
     T_0, w, wt, wtt, wT, wtT, one, two, count, noise = memory
-    smooth, windows = np.empty(len(T)), np.empty(len(T))
     worked, usual, keep = -1.0, -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
         h = dt[k]
@@ -129,14 +126,14 @@ def regression_value(
         spread = wtt - wt * wt / w + tau * tau * max(1 - (count - 1) * h / max(2 * tau, h), 0.0)
         slope = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
         smooth[k], windows[k] = T_0 + (wT - slope * wt) / w, 2 * tau
-    return smooth, windows, np.array([T_0, w, wt, wtt, wT, wtT, one, two, count, noise])
+    memory[1], memory[2], memory[3], memory[4], memory[5] = w, wt, wtt, wT, wtT
+    memory[6], memory[7], memory[8], memory[9] = one, two, count, noise
 
 
 @compiled
-def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
-    """Return values (N,), their rates (N,) and the memory of a two-state filter with variances r and q dt."""
+def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float, smooth: Array, rate: Array) -> None:
+    """Write values (N,) and their rates (N,) of a two-state filter with variances r and q dt; `memory` goes on."""
     x, v, xx, xv, vv = memory
-    smooth, rate = np.empty(len(T)), np.empty(len(T))
     for k in range(len(T)):
         h = dt[k]
         x += h * v
@@ -151,17 +148,16 @@ def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple
         xv -= xv * xx / s
         xx -= xx * xx / s
         smooth[k], rate[k] = x, v
-    return smooth, rate, np.array([x, v, xx, xv, vv])
+    memory[0], memory[1], memory[2], memory[3], memory[4] = x, v, xx, xv, vv
 
 
 @compiled
-def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, Array]:
-    """Return the step (N,) of which all changes of T (N,) are multiples (Euclid), and its variance (N,) so far.
+def steps_and_variance(T: Array, memory: Array, largest: float, steps: Array, variances: Array) -> None:
+    """Write the step (N,) of which all changes of T (N,) are multiples (Euclid), and its variance (N,) so far.
 
     `memory` is changed: the last two and how many there were, the step, the variance.
     """
     one, two, count, step, variance = memory
-    steps, variances = np.empty(len(T)), np.empty(len(T))
     for k in range(len(T)):
         change, same = abs(T[k] - one), 1e-6 * max(abs(T[k]), 5.0)
         if count >= 1 and change > same:
@@ -178,7 +174,6 @@ def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, 
         steps[k] = step if step <= largest else 0.0
         variances[k] = variance
     memory[0], memory[1], memory[2], memory[3], memory[4] = one, two, count, step, variance
-    return steps, variances
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,8 @@ class Coast:
         """Return the bias (N, d) that is predicted for the next N epochs, and its variance (N, d)."""
         F = step.F if step.F.ndim == 3 else step.F[None]
         u = step.u if step.u.ndim == 2 else np.broadcast_to(step.u, (N, len(self.x)))
-        x = recursions.drift(self.x, F, np.ascontiguousarray(u))
+        x = np.empty(u.shape)
+        recursions.drift(self.x, F, np.ascontiguousarray(u), x)
         self.x = x[-1]
         variance, self.P = spread(self.P, step, N)
         return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x), variance
@@ -113,7 +114,7 @@ class Uncertainty:
     """
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
-        self.fitted, self.noise, d = fitted, noise, len(noise)
+        self.fitted, self.noise, self.noise_squared, d = fitted, noise, noise**2, len(noise)
         # c, h and the imaginary c of both parts of the thermometer's error: of the running estimate, and of the coast
         self.following, self.departing = np.zeros((3, 2, d)), np.zeros((3, 2, d))
         self.learnt, self._between = np.zeros((0, d)), np.zeros((FINE, d))
@@ -165,7 +166,15 @@ class Uncertainty:
         tables = self.low, self.step, self.slope, self.modes, self._between
         memory = self.following, self.departing, self.learnt
         _deviations(
-            T, *error, *map(np.ascontiguousarray, variances), weight, self.noise**2, *squares, *tables, *memory, *sigmas
+            T,
+            *error,
+            *map(np.ascontiguousarray, variances),
+            weight,
+            self.noise_squared,
+            *squares,
+            *tables,
+            *memory,
+            *sigmas,
         )
         return sigmas
 
@@ -358,35 +367,32 @@ class Prediction:
         if x is not None or np.count_nonzero(self.departed):
             coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
         known = np.ascontiguousarray(calibration if calibration.strides[0] else calibration[:1])
-        bias, coast = _to_the_end(states, at, coast, *self._late(done, step), known)
-        return BiasOutput(bias, sigma, coast, coast_sigma)
-
-    def _late(self, done: Chunk, step: Transition) -> tuple[Array, Array]:
-        """Return the share (N,) of the known drift (N or 1, d) from the middle of an epoch, of which it is, to its end.
-
-        None where there are effects: their channels are not smoothed, and half a step more of them is more noise.
-        """
         drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
-        share = done["tau"] / np.where(done.dt > 0, done.dt, np.inf) / 2
-        return np.zeros_like(share) if self.effects else share, np.atleast_2d(drift)
+        drift = drift if drift.ndim == 2 else drift[None]
+        # half a step more of effects is more noise: their channels are not smoothed
+        share = 0.0 if self.effects else 0.5
+        bias, ahead = np.empty(coast.shape), np.empty(coast.shape)
+        _to_the_end(states, at, coast, share, done["tau"], done.dt.reshape(-1), drift, known, bias, ahead)
+        return BiasOutput(bias, sigma, ahead, coast_sigma)
 
 
 @compiled
 def _to_the_end(
-    states: Array, at: int, coast: Array, share: Array, drift: Array, calibration: Array
-) -> tuple[Array, Array]:
-    """Return the bias, of states (N, n) from place `at` on, and the prediction (N, d) at the ends of the epochs.
+    states: Array, at: int, coast: Array, share: float, tau: Array, dt: Array, drift: Array, calibration: Array,
+    bias: Array, ahead: Array,
+) -> None:  # fmt: skip
+    """Write the bias, of states (N, n) from place `at` on, and the prediction (N, d) at the ends of the epochs.
 
-    That is with a share (N,) of the drift, and with the calibration (N or 1, d).
+    That is with a `share` of the known drift (N or 1, d) of tau (N,) in dt (N or 1,) s, from the middle of an epoch, of
+    which it is, to its end; and with the calibration (N or 1, d).
     """
     N, d = coast.shape
-    bias, ahead = np.empty((N, d)), np.empty((N, d))
     for k in range(N):
-        k_u, k_c = min(k, len(drift) - 1), min(k, len(calibration) - 1)
+        k_u, k_c, dt_k = min(k, len(drift) - 1), min(k, len(calibration) - 1), dt[min(k, len(dt) - 1)]
+        part = tau[k] / dt_k * share if dt_k > 0 else 0.0
         for j in range(d):
-            late, known = share[k] * drift[k_u, j], calibration[k_c, j]
+            late, known = part * drift[k_u, j], calibration[k_c, j]
             bias[k, j], ahead[k, j] = states[k, at + j] + late + known, coast[k, j] + late + known
-    return bias, ahead
 
 
 def _output(estimates: Estimates, block: slice, C: Array | None) -> tuple[Array, int, Array]:

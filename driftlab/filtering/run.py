@@ -204,7 +204,7 @@ class Run:
             low, high = fitted.domain
             T = chunk["temperature"]
             beyond = (low > T) | (high < T)
-            if np.any(beyond):
+            if np.count_nonzero(beyond):
                 k = int(np.argmax(beyond))
                 where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} °C"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"

@@ -84,12 +84,12 @@ class ThermometerError:
         """Return the error of the temperature over N epochs."""
         T = chunk["temperature"]
         raw = chunk.channels.get("temperature_raw", T)
-        known = all(name in chunk.channels for name in READINGS)
-        step, variance = (chunk[name] for name in READINGS) if known else readings(raw, self.rows)
+        known = READINGS[0] in chunk.channels
+        step, variance = [chunk[name] for name in READINGS] if known else readings(raw, self.rows)
         steps = np.maximum(step, self.known.size)
         table, which = self._sawteeth(steps, variance)
         error = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
-        dt = np.full(T.shape, chunk.dt)
+        dt = chunk.each_dt
         windows = chunk.channels.get("temperature_window")
         windows = np.full(T.shape, self.window) if windows is None else windows
         _look(T, raw, dt, steps, table, which, windows, self.memory, *error)
@@ -98,10 +98,10 @@ class ThermometerError:
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Integers]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
         # a quarter of an octave is near enough; the least and the largest mostly say it of all
-        least, most = (float(np.rint(4 * np.log2(max(value, NOTHING)))) for value in extremes(variance))
-        finest, coarsest = extremes(steps)
-        if least == most and finest == coarsest:
-            return _sawtooth(finest, least, self.known)[None], np.zeros(len(steps), dtype=np.int64)
+        (finest, coarsest), (least, most) = extremes(steps), extremes(variance)
+        quarters = float(np.rint(4 * np.log2(max(least, NOTHING))))
+        if finest == coarsest and (least == most or quarters == np.rint(4 * np.log2(max(most, NOTHING)))):
+            return _sawtooth(finest, quarters, self.known)[None], np.zeros(len(steps), dtype=np.int64)
         rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
         table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]

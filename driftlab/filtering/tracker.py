@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +19,8 @@ from driftlab.filtering.coasting import Prediction
 from driftlab.filtering.segment import RunLog, RunSegment, runs
 from driftlab.filtering.setup import RunSetup, bias_steps, prior_again, subtracted
 from driftlab.units import axis_name
-from fusion_core.checks import NotFinite, TooWide, all_finite
-from fusion_core.chunk import Array, Chunk, Flags, concatenate
+from fusion_core.checks import FEW, NotFinite, TooWide, all_finite
+from fusion_core.chunk import Array, Chunk, Flags, concatenate, extremes, locked
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.errors import BadValue
 from fusion_core.kalman import estimate
@@ -28,10 +29,12 @@ from fusion_core.model import Estimates
 
 def check_finite(estimates: Estimates, t: Array, when: Callable[[float], str]) -> None:
     """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
-    sigma = estimates.sigma if estimates.sigma.strides[0] else estimates.sigma[:1]  # one row that stands for all
-    if all_finite(estimates.x) and all_finite(sigma):
+    x, sigma = estimates.x, estimates.sigma
+    if x.size < FEW and isfinite(np.vdot(x, sigma)):
+        return  # nearly always, of few
+    if all_finite(x) and all_finite(sigma if sigma.strides[0] else sigma[:1]):  # one row that stands for all
         return
-    good = np.all(np.isfinite(estimates.x) & np.isfinite(estimates.sigma), axis=1)
+    good = np.all(np.isfinite(x) & np.isfinite(sigma), axis=1)
     raise not_finite(t[int(np.argmin(good))], when)
 
 
@@ -44,6 +47,7 @@ def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
 
 
 SPAN = 32_768  # epochs filtered at once: what motion makes it do again is bounded by that
+NOTHING = locked(np.zeros(1))
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -157,11 +161,12 @@ class Tracker:
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
                 less = subtracted(epochs, self.plan.calibrations, self.plan.followed)
-                parts = {channel: epochs[channel] - part for channel, part in less.items()}
+                parts = {channel: locked(epochs[channel] - part) for channel, part in less.items()}
                 corrected = epochs.having(**parts) if parts else epochs
-                channel = self.model.tracked.channel
-                none = np.broadcast_to(0.0, epochs[channel].shape)
-                yield _Piece(epochs, corrected, less.get(channel, none), steps, before)
+                tracked = self.model.tracked
+                # of no calibration a row of zeros that stands for all
+                none = np.ndarray((len(epochs), len(tracked.axes)), np.float64, NOTHING, strides=(0, 0))
+                yield _Piece(epochs, corrected, less.get(tracked.channel, none), steps, before)
 
     def _filter(self, part: Chunk, transition: Transition, measurement: Measurement, *, keep_P: bool) -> Estimates:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
@@ -228,26 +233,20 @@ class Segments:
         if filtered.departure is not None:
             self.prediction.depart(*filtered.departure)
         output = self.prediction.look(done, filtered.estimates, filtered.step, alignment.unsure, filtered.calibration)
-        return RunSegment(
-            epochs=done,
-            rate=done[self.model.tracked.channel] - self.model.known(done, alignment),
-            **output._asdict(),
-            calibration=filtered.calibration,
-            still=still,
-            estimates=filtered.estimates,
-            began=filtered.began,
-            model=filtered.equations,
-        )
+        rate = done[self.model.tracked.channel] - self.model.known(done, alignment)
+        kept = filtered.estimates, filtered.began, filtered.equations
+        return RunSegment(done, rate, *output, filtered.calibration, still, *kept)
 
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
     dt, tau = chunk.dt, chunk["tau"]
-    regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
-    if np.count_nonzero(regular) == len(regular):  # nearly always
-        lasting = np.full(len(regular), usual)
+    ends = *extremes(dt.reshape(-1)), *extremes(tau)
+    if all(abs(end / usual - 1) < REGULAR for end in ends):  # nearly always
+        lasting = locked(np.full(len(tau), usual))
         yield chunk.having(dt=lasting, tau=lasting)
         return
+    regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
     chunk = chunk.having(dt=np.where(regular, usual, dt), tau=np.where(regular, usual, tau))
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
@@ -295,10 +294,10 @@ class Realigning:
 
     def look(self, done: Chunk, used: Flags, before: Alignment) -> Alignment | None:
         """Return the new alignment where the unit has been still, at another bias or attitude, for long enough."""
-        refused = runs(~used)
-        if not refused or refused[-1][1] < len(done):
+        if used[-1]:  # nearly always
             self.refused = None
             return None
+        refused = runs(~used)
         tail = done.part(refused[-1][0], len(done))
         self.refused = tail if self.refused is None or len(tail) < len(done) else concatenate([self.refused, tail])
         if self.refused.t[-1] - self.refused.t[0] < self.patience:

@@ -15,7 +15,7 @@ from itertools import chain, islice
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, Integers, concatenate
+from fusion_core.chunk import Array, Chunk, Integers, concatenate, locked, made
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, readings, started
 
@@ -45,25 +45,28 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     carry: Chunk | None = None  # the rows of the epoch that is not over
     last = -np.inf  # its number
     for chunk in _with_readings(chain([first], stream)):
-        starts, last = _starts(chunk.t, t_0, interval, last)
-        if len(starts) == 0:
+        starts = np.empty(len(chunk), dtype=np.int64)
+        count, last = _starts(chunk.t, t_0, interval, last, starts)
+        starts = starts[:count]
+        if count == 0:
             carry = chunk if carry is None else concatenate([carry, chunk])
             continue
         # the epoch begun earlier is put together; all others are integrated where they are, not copied
         begun = [] if carry is None else [carry]
         if starts[0] > 0:
             begun.append(chunk.part(0, starts[0]))
-        done = []
-        if begun:
-            done.append(_integrate(concatenate(begun), np.zeros(1, dtype=np.int64), pace, previous))
-            previous = done[-1].last() if len(done[-1]) else previous
-        if len(starts) > 1:
-            done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
+        pieces = [(concatenate(begun), np.zeros(1, dtype=np.int64))] if begun else []
+        if count > 1:
+            pieces.append((chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0]))
         carry = chunk.part(starts[-1], len(chunk))
-        done = [part for part in done if len(part)]
+        done = []
+        for rows, begins in pieces:
+            part = _integrate(rows, begins, pace, previous)
+            if len(part):
+                done.append(part)
+                previous = part.last()
         if done:
             yield concatenate(done)
-            previous = done[-1].last()
     if carry is not None:
         done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
         if len(done[0]):
@@ -77,16 +80,18 @@ def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
             yield chunk
             continue
         seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
-        yield chunk.having(**dict(zip(READINGS, seen, strict=True)))
+        yield chunk.having(**dict(zip(READINGS, map(locked, seen), strict=True)))
+
+
+# what compiled functions return takes ten times as long to hand over as what they are given to write to
 
 
 @compiled
-def _owned(t: Array, before: float, pace: Array) -> Array:
-    """Return the steps to times t (N,) without the gaps, which are no one's time; `pace` (usual step, streaks) follows.
+def _owned(t: Array, before: float, pace: Array, owned: Array) -> None:
+    """Write the steps to times t (N,) without the gaps, which are no one's time; `pace` (usual step, streaks) follows.
 
     A recording may change its rate: after TURN long (or short) steps in a row, they are the usual ones.
     """
-    owned = np.zeros(len(t))
     for k in range(len(t)):
         dt = t[k] - (t[k - 1] if k else before)
         gap, quick = dt > GAP * pace[0], dt < pace[0] / GAP
@@ -95,15 +100,15 @@ def _owned(t: Array, before: float, pace: Array) -> Array:
         if max(pace[1], pace[2]) >= TURN:
             pace[0], pace[1], pace[2] = dt, 0, 0
             gap = False
-        if dt > 0 and not gap:
-            owned[k] = dt
-    return owned
+        owned[k] = dt if dt > 0 and not gap else 0.0
 
 
 @compiled
-def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Integers, float]:
-    """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
-    starts = np.empty(len(t), dtype=np.int64)
+def _starts(t: Array, t_0: float, interval: float, last: float, starts: Integers) -> tuple[int, float]:
+    """Write the first row of each epoch that begins here, and return their count and the last one's number.
+
+    `last` is that of before.
+    """
     count = 0
     for k in range(len(t)):
         number = np.ceil((t[k] - t_0) / interval - EDGE)
@@ -111,14 +116,13 @@ def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Integer
             starts[count] = k
             count += 1
             last = number
-    return starts[:count], last
+    return count, last
 
 
 @compiled
-def _means(values: Array, weights: Array, starts: Integers, total: Array) -> Array:
-    """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
+def _means(values: Array, weights: Array, starts: Integers, total: Array, means: Array) -> None:
+    """Write the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape
-    means = np.empty((len(starts), d))
     for k in range(len(starts)):
         stop = starts[k + 1] if k + 1 < len(starts) else N
         for j in range(d):
@@ -126,7 +130,6 @@ def _means(values: Array, weights: Array, starts: Integers, total: Array) -> Arr
             for i in range(starts[k], stop):
                 sum += values[i, j] * weights[i]
             means[k, j] = sum / total[k]
-    return means
 
 
 def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | None) -> Chunk:
@@ -134,26 +137,31 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
     if N == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
-    dt = _owned(rows.t, before, pace)
-    tau = np.add.reduceat(dt, starts)
-    counts = np.empty(K)
-    counts[:-1], counts[-1] = starts[1:] - starts[:-1], N - starts[-1]
-    last = slice(None) if K == N else starts + counts.astype(np.int64) - 1
+    dt = np.empty(N)
+    _owned(rows.t, before, pace, dt)
+    ones = np.ones(N)
+    tau, counts = dt, ones
+    last: slice | Integers = slice(None)
+    if K < N:
+        tau, ends = np.add.reduceat(dt, starts), np.append(starts[1:], N)
+        counts, last = (ends - starts).astype(np.float64), ends - 1
     lasting = np.count_nonzero(tau > 0) == K
     by_time = dt, tau if lasting else np.where(tau > 0, tau, 1.0)
-    by_number = np.ones(N), counts
+    by_number = ones, counts
     channels = {"tau": tau}
     for name, values in rows.channels.items():
         if name in READINGS:
-            channels[name] = values[last]
+            channels[name] = locked(values[last])
             continue
         weights, total = by_time if name in rows.sensors else by_number
-        means = _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total)
-        channels[name] = means if values.ndim == 2 else means.reshape(K, *values.shape[1:])
-    done = Chunk(rows.t[last], channels, sensors=rows.sensors)
+        means = np.empty((K, *values.shape[1:]))
+        _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
+        channels[name] = locked(means)
+    locked(tau)  # only now: of what is locked, compiled functions have a version of its own
+    done = made(locked(rows.t[last]), channels, previous, rows.sensors)
     done = done if lasting else done.where(tau > 0)
-    if previous is None and len(done):
-        # the step to the first epoch is as long as what it integrates
-        first = {name: values[:1] for name, values in done.channels.items()}
-        previous = Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors)
-    return done.following(previous)
+    if previous is not None or not len(done):
+        return done
+    # the step to the first epoch is as long as what it integrates
+    first = {name: values[:1] for name, values in done.channels.items()}
+    return done.following(Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors))

@@ -146,8 +146,8 @@ class Thermometer:
 
     def __init__(self, faults: Faults) -> None:
         self.faults = faults
-        self._parts: list[tuple[Array, Array]] = []  # times in s and readings that are not looked at yet
-        self._rows = 0  # of these; and one that was looked at before them
+        # times in s and readings that are not looked at yet, after one that was; their number, and with that one
+        self._held, self._rows, self._stop = np.empty((2, ENOUGH)), 0, 0
         self.changes = self.longest = self.run = 0  # changes, rows of the longest repetition, and of the present one
         self.since = np.nan  # when that began, s
         self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
@@ -155,17 +155,23 @@ class Thermometer:
 
     def look(self, chunk: Chunk) -> None:
         """Take the next temperatures (N,), in degC, and look at them once there are enough."""
-        self._parts.append((chunk.t, chunk["temperature"]))
-        self._rows += len(chunk)
-        if self._rows >= ENOUGH or chunk.t[-1] - self._parts[0][0][0] > LASTING:
-            self.flush()
+        t, T, begin = chunk.t, chunk["temperature"], self._stop
+        since = self._held[0, 0] if begin else t[0]
+        if self._rows + len(t) >= ENOUGH or t[-1] - since > LASTING:
+            self._look(np.append(self._held[0, :begin], t), np.append(self._held[1, :begin], T), self._rows + len(t))
+            return
+        self._rows, self._stop = self._rows + len(t), begin + len(t)
+        self._held[0, begin : self._stop], self._held[1, begin : self._stop] = t, T
 
     def flush(self) -> None:
         """Look at all that came."""
-        if not self._rows:
-            return
-        t, T = (np.concatenate(column) for column in zip(*self._parts, strict=True))
-        known, self._parts, self._rows = len(t) - self._rows, [(t[-1:], T[-1:])], 0
+        if self._rows:
+            t, T = self._held[:, : self._stop].copy()
+            self._look(t, T, self._rows)
+
+    def _look(self, t: Array, T: Array, new: int) -> None:
+        """Look at times and readings, of which the last `new` have not been looked at."""
+        known, self._held[:, 0], self._rows, self._stop = len(t) - new, (t[-1], T[-1]), 0, 1
         steps = np.abs(np.diff(T))
         self._repeats(t, T, np.flatnonzero(steps) + 1, known)
         if np.max(steps, initial=0.0) > JUMP:

@@ -8,6 +8,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
+from fusion_core.checks import all_finite
 from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
@@ -81,9 +82,8 @@ class _Screen:
                 self.runs[name], self.rails[name] = np.zeros(d), Rails(name, sensor, d)
                 self.roundings[name] = Rounding(name, sensor, d)
             self.roundings[name].look(chunk)
-            before, table = self.runs[name], self.rails[name].table
-            suspect, self.runs[name] = self.look(chunk[name], _value_before(chunk, name), before, limit, table)
-            if not suspect:
+            before, self.runs[name], table = self.runs[name], np.empty(d), self.rails[name].table
+            if not self.look(chunk[name], _value_before(chunk, name), before, self.runs[name], limit, table):
                 continue
             repeats = _repeats(chunk, name, before)
             for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
@@ -100,8 +100,7 @@ def _with_sensors(chunk: Chunk, declared: Collection[str] | None, previous: Chun
     several = (name for name, values in chunk.channels.items() if values.ndim == 2)
     sensors = frozenset(several if declared is None else (name for name in declared if name in chunk.channels))
     columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors if chunk[name].ndim != 2}
-    channels = {**chunk.channels, **columns} if columns else chunk.channels
-    return Chunk(chunk.t, channels, previous, sensors)
+    return (chunk.having(**columns) if columns else chunk).following(previous, sensors)
 
 
 class Gaps:
@@ -118,9 +117,9 @@ class Gaps:
         """Pass the rows of a source on, and look at them: what is left out of them is counted by itself."""
         for chunk in chunks:
             yield chunk
-            known = np.isfinite(chunk.t)
-            if np.any(known):
-                self.look(chunk.t if np.all(known) else chunk.t[known])
+            t = chunk.t if all_finite(chunk.t) else chunk.t[np.isfinite(chunk.t)]
+            if len(t):
+                self.look(t)
 
     def look(self, t: Array) -> None:
         """Look at the times (N,) of the next rows."""
@@ -150,13 +149,13 @@ class Gaps:
 
 
 @compiled
-def _suspect(values: Array, last: Array, carried: Array, limit: float, rails: Array) -> tuple[bool, Array]:
-    """Return True if any value (N, d) is stuck or beyond the limit, and the length of each axis' repetition (d,).
+def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: float, rails: Array) -> bool:
+    """Return True if any value (N, d) is stuck or beyond the limit; `runs` are the lengths of the repetitions (d,).
 
     One pass over what is nearly always good; `_repeats` says where it is not, in NumPy. `rails` (2, d, 4) goes on: the
     largest value and how often it was there, the next one and how often, of the readings and with their sign reversed.
     """
-    suspect, runs = False, np.empty(values.shape[1])
+    suspect = False
     for j in range(values.shape[1]):
         run, value = carried[j], last[j]
         for k in range(len(values)):
@@ -177,7 +176,7 @@ def _suspect(values: Array, last: Array, carried: Array, limit: float, rails: Ar
                 else:
                     rails[side, j, 3] += 1.0
         runs[j] = run
-    return suspect, runs
+    return suspect
 
 
 def _value_before(chunk: Chunk, name: str) -> Array:

@@ -23,6 +23,7 @@ from fusion_core.contracts.measurement_model import MeasurementModel
 from fusion_core.contracts.plugin import Check, Memory, built_in, plugin_error
 from fusion_core.contracts.sensor import Alignment, Detector, Sensor
 from fusion_core.contracts.thermal_map import ThermalMap
+from fusion_core.fast import compiled
 from fusion_core.faults import Faults
 from fusion_core.model import Measurement, Prior, Transition
 from fusion_core.thermal.fitted_map import FittedMap
@@ -187,10 +188,25 @@ def _ordinary(step: Transition, n: int, N: int) -> bool:
     """Return True if steps are sound and as nearly all are, which is seen quickly: F and Q constant, Q diagonal."""
     if type(step) is not Transition or step.C is not None:
         return False
+    arrays = []
     for array, shapes in ((step.F, ((n, n),)), (step.Q, ((n, n),)), (step.u, ((n,), (N, n)))):
-        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes or not all_finite(array):
+        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes:
             return False
-    return bool(np.count_nonzero(step.Q.diagonal() > 0) == np.count_nonzero(step.Q))
+        arrays.append(array if array.flags.carray else array.copy())
+    F, Q, u = arrays
+    return bool(_sound(F, Q, u.reshape(-1)))
+
+
+@compiled
+def _sound(F: Array, Q: Array, u: Array) -> bool:
+    """Return True if F (n, n), Q (n, n) and numbers u are finite, and Q is diagonal with no variance below zero."""
+    n, ordinary = len(F), True
+    for i in range(n):
+        for j in range(n):
+            ordinary &= np.isfinite(F[i, j]) and (Q[i, j] == 0 if i != j else 0 <= Q[i, j] < np.inf)
+    for value in u:
+        ordinary &= np.isfinite(value)
+    return ordinary
 
 
 def sensors(model: MeasurementModel, answer: Any) -> tuple[Sensor, ...]:
@@ -389,10 +405,11 @@ def _pair(plugin: Any, name: str, answer: Any, what: str) -> tuple[Any, Any]:
 def _lock(memory: Memory, depth: int = 8) -> None:
     """Lock the arrays of a memory, in containers within one another up to a depth."""
     if isinstance(memory, np.ndarray):
-        memory.flags.writeable = False
+        memory.setflags(write=False)
     elif depth and isinstance(memory, (tuple, list, dict)):
         for item in memory.values() if isinstance(memory, dict) else memory:
-            _lock(item, depth - 1)
+            if item is not None:
+                _lock(item, depth - 1)
 
 
 def expect_array(

@@ -64,10 +64,11 @@ def alone(
     n, m = np.size(x), np.size(z)
     shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
     for array, shape in zip(given, shapes, strict=True):
-        plain = type(array) is np.ndarray and array.dtype == FLOAT
-        if not plain or (array.shape != shape and array.shape != (1, *shape)):
+        if type(array) is np.ndarray and array.shape == (1, *shape):
+            array = array[0]
+        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape != shape:
             return None
-        arrays.append((array if array.flags.carray else array.copy()).reshape(shape))
+        arrays.append(array if array.flags.carray else array.copy())
     measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and all(used.flat)
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
     sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None

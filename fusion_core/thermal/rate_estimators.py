@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core import recursions
-from fusion_core.chunk import Array, Chunk, extremes
+from fusion_core.chunk import Array, Chunk, extremes, locked
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit
 
@@ -41,7 +41,9 @@ class Regression(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        return recursions.regression_rate(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
+        smooth, rate, memory = np.empty(len(T)), np.empty(len(T)), memory.copy()
+        recursions.regression_rate(dt, T, memory, self.window / 2, smooth, rate)
+        return smooth, rate, memory
 
 
 class Kalman(Settings):
@@ -67,7 +69,9 @@ class Kalman(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        return recursions.kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
+        smooth, rate, memory = np.empty(len(T)), np.empty(len(T)), memory.copy()
+        recursions.kalman_rate(dt, T, memory, self.noise**2, self.walk**2, smooth, rate)
+        return smooth, rate, memory
 
 
 CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
@@ -104,17 +108,18 @@ def with_rate(
     T = chunk["temperature"]
     if memory is None:  # before the first sample, that of a straight line too
         memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), np.array([T[0], *np.zeros(9)]))
-    dt, value = np.full(T.shape, chunk.dt), memory.value
+    dt, value, windows = chunk.each_dt, memory.value.copy(), np.empty(len(T))
     smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
     if isinstance(estimator, Regression):
         steps = chunk["temperature_step"] if "temperature_step" in chunk.channels else np.zeros(len(T))
         given = dt, T, rate, steps, known, value, estimator.memory_s, float(WALK)
-        smooth, windows, value = recursions.regression_value(*given)
+        recursions.regression_value(*given, smooth, windows)
     else:
-        windows = np.full(T.shape, estimator.memory_s)
+        windows[:] = estimator.memory_s
     (low, high), (coldest, hottest), (least, largest) = memory.range, extremes(T), extremes(smooth)
     if least < domain[0] or largest > domain[1]:
         lows, highs = np.minimum(np.minimum.accumulate(T), low), np.maximum(np.maximum.accumulate(T), high)
         smooth = np.clip(smooth, np.minimum(lows, domain[0]), np.maximum(highs, domain[1]))
+    smooth, rate, windows = locked(smooth), locked(rate), locked(windows)
     conditioned = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
     return conditioned, RateMemory(numbers, (min(low, coldest), max(high, hottest)), value)

@@ -226,8 +226,9 @@ class ThermometerReadings(NamedTuple):
 
 def readings(T: Array, memory: Array) -> ThermometerReadings:
     """Look at readings T (N,) in degC; `memory` is of those before (`started`), and is changed."""
-    steps, variance = recursions.steps_and_variance(T, memory, LARGEST)
-    return ThermometerReadings(steps, variance)
+    seen = ThermometerReadings(np.empty(len(T)), np.empty(len(T)))
+    recursions.steps_and_variance(T, memory, LARGEST, *seen)
+    return seen
 
 
 def started() -> Array:

@@ -111,6 +111,11 @@ class ThermalDerivative(ThermalBias):
         density[:d] = along_axes(self.walk, d) ** 2
         return np.diag(density)
 
+    @cached_property
+    def _same(self) -> Array:
+        """F of states that stay as they are (n, n)."""
+        return np.eye(len(self.labels))
+
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule, or what earlier switch-ons say.
 
@@ -168,8 +173,10 @@ class ThermalDerivative(ThermalBias):
         if self.form == "difference":
             g = level
         u = np.zeros((len(g), n))
-        u[1:, :d] = g[1:] - g[:-1]
-        u[0, :d] = 0.0 if before.g is None else g[0] - before.g
+        if len(g) > 1:
+            u[1:, :d] = g[1:] - g[:-1]
+        if before.g is not None:
+            u[0, :d] = g[0] - before.g
         if self.form == "slope" and self.fitted is not None:
             rate = chunk["temperature_rate"] * chunk.dt
             u[:, :d] += self.fitted.slope(shifted["temperature"], chunk.t) * rate[:, None]
@@ -191,7 +198,7 @@ class ThermalDerivative(ThermalBias):
         d, factors = len(self.axes), []
         fadings, left = list(before.fadings), list(before.left)
         if not self._starts:
-            return np.eye(len(self.labels)), fadings, left
+            return self._same, fadings, left
         chunk = as_measured(chunk)
         for k in self._starts:
             factor, fadings[k] = self.effects[k].fading(chunk, before.fadings[k])

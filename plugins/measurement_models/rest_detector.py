@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -65,34 +66,40 @@ class RestDetector(Detector):
 
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
         """Return the epochs that are still (N,), the axes that stand out in each (N, D), and the memory."""
-        triads = dict.fromkeys(channel for channel, _ in self.axes)
+        triads, limit = self._constant
         x = np.ascontiguousarray(np.concatenate([chunk[channel] for channel in triads], axis=1))
-        steep, T = self.steepest, np.zeros(len(x))
-        rate, limit = T, (OUTLIER * self.density) ** 2
+        (N, D), memory = x.shape, memory.copy()
+        T = rate = np.zeros(N)
         if "temperature" in chunk.channels:
             T = chunk.channels.get("temperature_raw", chunk["temperature"])
             rate = chunk.channels.get("temperature_rate", rate)
-        memory = memory.copy()
-        means, rest = memory[: 7 * len(self.axes)].reshape(7, -1), memory[7 * len(self.axes) :]
-        still, out = _look(chunk.t, chunk["tau"], x, T, rate, limit, steep, self.patience, means, rest)
+        means, rest = memory[: 7 * D].reshape(7, D), memory[7 * D :]
+        still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
+        _look(chunk.t, chunk["tau"], x, T, rate, limit, self.steepest, self.patience, means, rest, still, out)
         return still, out, memory
+
+    @cached_property
+    def _constant(self) -> tuple[tuple[str, ...], Array]:
+        """The channels, and the square (D,) of what stands out in a second."""
+        return tuple(dict.fromkeys(channel for channel, _ in self.axes)), (OUTLIER * self.density) ** 2
 
 
 @compiled
 def _look(
     t: Array, tau: Array, x: Array, T: Array, rate: Array, limit: Array, steep: Array, patience: float,
-    means: Array, rest: Array,
-) -> tuple[Flags, Flags]:  # fmt: skip
-    """Run the detector; the memory, means (7, D) and the rest (20,), is changed in place.
+    means: Array, rest: Array, still: Flags, out: Flags,
+) -> None:  # fmt: skip
+    """Run the detector, which writes what is still (N,) and where what stands out (N, D); the memory goes on in place.
+
+    That is means (7, D) and the rest (20,).
 
     For each axis the level's means over LEVEL and LONG, the same of another level, the mean over FAST, its weight and
     its age; then of the two levels what `_average` keeps, the temperature over FAST with its weight, what the
     thermometer scatters (variance, last reading), whether it moves, two counters in s, and the last time.
     """
-    N, D = x.shape
+    N = len(x)
     level, other, fast = means[:2], means[2:4], means[4:]
     of_level, of_other, warm, counters = rest[:6], rest[6:12], rest[12:16], rest[16:]
-    still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
     moving, quiet, settled, last = counters[0] > 0.0, counters[1], counters[2], counters[3]
     for k in range(N):
         dt = t[k] - last
@@ -120,7 +127,6 @@ def _look(
             _average(level, of_level, x, k, warm[0], tau[k])
         still[k] = not moving
     counters[0], counters[1], counters[2], counters[3] = 1.0 if moving else 0.0, quiet, settled, last
-    return still, out
 
 
 @inlined

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, constant, read_only
+from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import Alignment, Measurement, Sensor, Transition
 from fusion_core.fast import compiled
 from fusion_core.statespace import StateSpace
@@ -68,9 +68,9 @@ class ZeroVelocity:
         """Put the bias models' steps and the integrals of the epochs together."""
         dt, lasting = chunk.dt, chunk["tau"]
         tau = constant(lasting)
-        arrays = [dt, tau, *[a for step in steps for a in (step.F, step.Q, step.C) if a is not None]]
-        if dt.ndim == tau.ndim == 0 and max(a.ndim for a in arrays) <= 2:  # nearly always, and then always the same
-            key = tuple(a.tobytes() for a in arrays)
+        if dt.ndim == tau.ndim == 0 and all(step.invariant for step in steps):  # nearly always, and then the same
+            arrays = [dt, tau, *[a for step in steps for a in (step.F, step.Q, step.C) if a is not None]]
+            key = tuple([a.tobytes() for a in arrays])
             if self._kept is None or self._kept[0] != key:
                 self._kept = key, self._matrices(dt, tau, steps)
             F, Q = self._kept[1]
@@ -78,12 +78,12 @@ class ZeroVelocity:
             F, Q = self._matrices(dt, tau, steps)
         u, places = np.empty((len(lasting), self.space.n)), self.space.places
         for triad, step in zip(self.triads, steps, strict=True):
-            drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
-            drift = read_only(np.ascontiguousarray(drift if drift.ndim == 2 else drift[None]))
             values, given = chunk[triad.sensor.channel], alignment.inputs[triad.sensor.channel]
-            integral = u[:, places[triad.integral]]
+            integral, drift = u[:, places[triad.integral]], u[:, places[triad.sensor.block.name]]
+            drift[:] = step.u
+            if step.C is not None:
+                drift = np.atleast_2d(np.einsum("...ij,...j->...i", step.C, step.u))
             _turned(lasting, values, given, drift, integral)
-            u[:, places[triad.sensor.block.name]] = step.u
         return Transition(F, Q, u)
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:

@@ -103,7 +103,7 @@ def ends(values, size=999):
     """Return the doubts of readings (N, 1) that come in chunks."""
     faults, rails = Faults(rows=len(values)), Rails("gyro", None, 1)
     for start in range(0, len(values), size):
-        _suspect(values[start : start + size], np.full(1, np.nan), np.zeros(1), np.inf, rails.table)
+        _suspect(values[start : start + size], np.full(1, np.nan), np.zeros(1), np.empty(1), np.inf, rails.table)
     rails.judge(faults)
     return faults.doubts
 

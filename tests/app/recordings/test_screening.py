@@ -118,7 +118,8 @@ def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
     chunk = Chunk(np.arange(400.0), {"gyro": values}, before)
     carried = np.zeros(2) if first else np.array([STUCK - 20.0, 3.0])
     last = np.full(2, np.nan) if first else np.zeros(2)
-    suspect, runs = _suspect(values, last, carried, level, np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 2, 1)))
+    runs, rails = np.empty(2), np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 2, 1))
+    suspect = _suspect(values, last, carried, runs, level, rails)
     repeats = _repeats(chunk, "gyro", carried)
     assert suspect == bool(np.any(repeats >= STUCK) or np.any(np.abs(values) >= level))
     np.testing.assert_array_equal(runs, repeats[-1])
@@ -131,7 +132,8 @@ def test_means_over_epochs_are_weighted_averages(seed, epochs):
     starts = np.concatenate([[0], np.sort(rng.choice(np.arange(1, 100), epochs - 1, replace=False))]).astype(np.int64)
     values, weights = rng.normal(size=(100, 3)), rng.uniform(0.1, 1, 100)
     parts = np.split(np.arange(100), starts[1:])
-    found = _means(values, weights, starts, np.array([weights[part].sum() for part in parts]))
+    found, total = np.empty((epochs, 3)), np.array([weights[part].sum() for part in parts])
+    _means(values, weights, starts, total, found)
     expected = [np.average(values[part], axis=0, weights=weights[part]) for part in parts]
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
 
