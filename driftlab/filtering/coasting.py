@@ -165,17 +165,8 @@ class Uncertainty:
         sigmas = np.empty_like(variances[1]), np.empty_like(variances[1])
         tables = self.low, self.step, self.slope, self.modes, self._between
         memory = self.following, self.departing, self.learnt
-        _deviations(
-            T,
-            *error,
-            *map(np.ascontiguousarray, variances),
-            weight,
-            self.noise_squared,
-            *squares,
-            *tables,
-            *memory,
-            *sigmas,
-        )
+        of_states = map(np.ascontiguousarray, variances)
+        _deviations(T, *error, *of_states, weight, self.noise_squared, *squares, *tables, *memory, *sigmas)
         return sigmas
 
 
