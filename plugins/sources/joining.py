@@ -36,7 +36,7 @@ HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn acr
 FIRST, LEAST = 11, 3  # readings that tell how often a channel of a table is read, and at least
 HELD = 1 << 18  # rows in which they are looked for
 
-SPAN, FEW = 1 << 23, 100  # bytes of a log in memory at once, and places for which none is given back
+SPAN, FEW = 1 << 21, 100  # bytes of a log in memory at once, and places for which none is given back
 PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
 
 
@@ -305,7 +305,8 @@ def records(data: Bytes | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[
     # every place in the data where one could begin, without a copy
     windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
     values = np.empty(len(at), windows.dtype)
-    for start, stop in pairwise([*np.flatnonzero(np.diff(at // SPAN, prepend=-1)), len(at)]):
+    spans = np.arange(SPAN, int(at[-1]) + 1 if len(at) else 0, SPAN).astype(at.dtype)  # of another type, `at` is copied
+    for start, stop in pairwise([0, *np.searchsorted(at, spans), len(at)]):
         values[start:stop] = windows[at[start:stop]]
         if len(at) > FEW:
             release(data)
