@@ -320,7 +320,9 @@ def show(result: FirstConfig, given: Mapping[str, Any]) -> None:
     say_lines(result.problems, "problem: ")
     if result.status:
         say(f"written to {result.path}\n")
-        remedy = "say what is missing with --column, --unit, --interval or --dates, or write it there"
+        remedy = "mend what speaks against it, or go on all the same with `driftlab fit-map`"
+        if result.asked:
+            remedy = "say what is missing with --column, --unit, --interval or --dates, or write it there"
         sys.stderr.write(f"driftlab: {line(str(given['file']))}: is not ready for a map; {remedy}\n")
         return
     if given.get("go"):

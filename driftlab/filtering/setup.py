@@ -56,9 +56,10 @@ def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str
     single = axis_name(sensor.channel, sensor.axes[0]) == sensor.channel
     each = [f"{r:.2g}" if single else f"{axis} {r:.2g}" for axis, r in pairs if single or off(r, least)]
     path = f", or correct unit and path of source.channels.{sensor.channel}" if any(off(r, OFF) for r in ratios) else ""
+    alike = ", unless neighbouring samples are alike, as those of a filter or of interpolation"
     return [
         f"{sensor.channel}: white noise is not as declared (measured / declared: {', '.join(each)}); "
-        f"set {sensor.section}.noise{path}"
+        f"set {sensor.section}.noise{path}{alike if np.max(ratios) < 1 else ''}"
     ]
 
 

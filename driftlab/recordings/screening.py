@@ -9,7 +9,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
 from fusion_core.checks import all_finite
-from fusion_core.chunk import Array, Chunk, Flags
+from fusion_core.chunk import Array, Chunk, Flags, concatenate
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -214,7 +214,10 @@ def head(config: Config) -> tuple[Chunk | None, list[str]]:
     if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
         return None, []
     faults = Faults()
-    first = next(read(config, faults, rows=1000, few=True))
+    rows = read(config, faults, rows=1000, few=True)
+    first = next(rows)
+    while len(first) < FIRST and (more := next(rows, None)) is not None:
+        first = concatenate([first, more])
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():

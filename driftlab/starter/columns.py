@@ -18,7 +18,7 @@ from driftlab.noise.quick import QuickNoise, noise_of
 from driftlab.starter.names import NO_SENSOR, Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
 from driftlab.units import YEARS
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, Flags
 from fusion_core.contracts import USUAL
 from fusion_core.errors import ConfigError, quote
 from fusion_core.units import convert, same_dimension, to_si
@@ -79,10 +79,12 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
     channels: dict[str, GuessedChannel] = {}
     noise: dict[str, QuickNoise] = {}
     t = _regular(given.interval, columns)
+    led = _known(_values(groups["gyro"], columns)) if "gyro" in groups else None
     for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
         group, values = groups[field], _values(groups[field], columns)
         T = _between(channels["temperature"].values[:, 0]) if "temperature" in channels else None
-        own = np.any(np.isfinite(values), axis=1)  # rows that are not another sensor's alone
+        own = _known(values)  # rows that are not another sensor's alone
+        own = own & led if led is not None and np.any(own & led) else own  # and of these the gyro's, which are used
         if field in SENSORS and t is not None:
             quick = noise_of(t[own], values[own], None if T is None else T[own])
             noise |= {} if quick is None else {field: quick}
@@ -97,7 +99,13 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
         paths = tuple(name.path for name in group)
         channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)
         t = _seconds(channels.get("time")) if "time" in channels else t
-    return Channels(_in_order(channels), _in_order(noise), others, _step(t))
+    step = _step(t if t is None or led is None or not np.any(led) else t[led])
+    return Channels(_in_order(channels), _in_order(noise), others, step)
+
+
+def _known(values: Array) -> Flags:
+    """Return the rows (N,) of values (N, d) with a number in them."""
+    return np.asarray(np.any(np.isfinite(values), axis=1), dtype=np.bool_)
 
 
 def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:

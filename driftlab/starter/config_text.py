@@ -132,7 +132,9 @@ def _starter(
 def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]:
     rows = len(next(iter(columns.values.values()), ()))
     count = f"the first {rows:,} rows" if columns.more else f"{rows:,} rows"
-    rate = f" at {1 / channels.step:.4g} Hz" if channels.step else ""
+    gyro = channels.found.get("gyro")
+    of = ", the gyro's" if gyro is not None and np.mean(np.isfinite(gyro.values)) <= 0.5 else ""
+    rate = f"{of} at {1 / channels.step:.4g} Hz" if channels.step else ""
     yield f"# From {name}: {count}{rate}."
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 

@@ -79,7 +79,7 @@ def _first(source: Source) -> Chunk:
 def _of_values(name: str, values: Array) -> Iterator[str]:
     finite = np.all(np.isfinite(values), axis=1)
     if (lost := 1 - float(np.mean(finite))) > LOST:
-        yield f"{name}: {lost:.0%} of the first {len(values):,} rows are no numbers"
+        yield f"{name}: {lost:.0%} of the first {len(values):,} rows have no number, and are left out"
     elif len(values) < ROWS and np.any(np.ptp(values[finite], axis=0) == 0):
         yield f"{name} does not change: it shows {', '.join(f'{v:.6g}' for v in values[finite][0])} in every row"
 

@@ -80,21 +80,19 @@ def _read(lines: Sequence[str], separator: str, decimal: str) -> Dialect | None:
     cut = [fields_of(line, separator) for line in lines]
     number = NUMBER[decimal].fullmatch
     good = [sum(bool(number(c.strip()) or DATE.fullmatch(c.strip())) for c in cells) for cells in cut]
-    widths = Counter(
-        len(bare(cells)) for cells, k in zip(cut[-SAMPLE:], good[-SAMPLE:], strict=True) if 2 * k >= len(cells)
-    )
+    filled = [sum(bool(cell.strip()) for cell in cells) for cells in cut]  # of a sensor's rows others' cells are empty
+    widths = Counter(len(bare(cut[k])) for k in range(len(cut))[-SAMPLE:] if 2 * good[k] >= filled[k] > 0)
     if not widths:
         return None
     width = widths.most_common(1)[0][0]
-    rows = [k for k, cells in enumerate(cut) if 0 <= len(bare(cells)) - width <= 1 and 3 * good[k] >= width]
+    rows = [k for k, cells in enumerate(cut) if 0 <= len(bare(cells)) - width <= 1 and 3 * good[k] >= filled[k] > 0]
     most = max((good[k] for k in rows), default=0)
     usual = [k for k in rows if 2 * good[k] >= most]
     if not usual:
         return None
-    filled = [sum(bool(cell.strip()) for cell in cells) for cells in cut]
     few = {k for k, count in enumerate(filled) if 2 <= count == good[k] and len(cut[k]) >= width}  # most cells empty
     first = _longest_run(usual, lines, few)
-    share = sum(good[k] for k in usual if k >= first) / sum(len(bare(cells)) for cells in cut[first:] if cells)
+    share = sum(good[k] for k in few.union(usual) if k >= first) / sum(filled[first:])
     header = _header(lines, first, width, separator, decimal)
     names = names_of(lines[header], separator) if header is not None else [str(k + 1) for k in range(width)]
     texts = {

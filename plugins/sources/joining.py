@@ -8,13 +8,14 @@ A log keeps each sensor under its own time stamps, a filter wants rows.
     a slower one (a thermometer):                    a straight line between its samples
 
 Where no sample is near enough a row has NaN, so that it is left out and counted like any other that lacks a value.
-A table has one time for all columns; one of a thermometer that is empty in most rows is a slower stream all the same.
+A table has one time for all columns; one that is empty in most of the gyro's rows is a stream of its own all the same.
 """
 
 from __future__ import annotations
 
 import mmap
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
@@ -26,16 +27,16 @@ from numpy.typing import NDArray
 from fusion_core.chunk import Array, Bytes, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource
 from fusion_core.errors import UnreadableFile
-from fusion_core.faults import RANGES, Faults
+from fusion_core.faults import LARGEST, RANGES, Faults
 
 SLOWER = 2.0  # times the rows' interval: from there on a stream is drawn through, not picked from
 NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of that row
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
 
-FIRST, LEAST = 11, 5  # readings that tell how often a thermometer is read, and at least
+FIRST, LEAST = 11, 3  # readings that tell how often a channel of a table is read, and at least
 HELD = 1 << 18  # rows in which they are looked for
 
-SPAN, FEW = 1 << 23, 100  # bytes of a log in memory at once, and places for which none is given back
+SPAN, FEW = 1 << 21, 100  # bytes of a log in memory at once, and places for which none is given back
 PATH = re.compile(r"(\w+?)(?:\[(\d+)\])?\.(.+)")
 
 
@@ -113,7 +114,7 @@ def joined(t: Array, sampled: Array, values: Array, step: float | None = None, s
 
 
 class TableSource(FileSource):
-    """A file of rows with one time; the temperature of one that few rows have is drawn between these."""
+    """A file of rows with one time; channels that few of its rows have are drawn between these."""
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the range."""
@@ -121,106 +122,172 @@ class TableSource(FileSource):
 
 
 def bridged(chunks: Iterable[Chunk], size: int, faults: Faults) -> Iterator[Chunk]:
-    """Pass on the chunks of a table, of `size` rows at most; a thermometer that few rows read is a stream of its own.
+    """Pass on the chunks of a table, of `size` rows at most; a channel that few rows have is a stream of its own.
+
+    The rows are those of the gyro, else of the accelerometers, else of the first channel that is no temperature. That
+    channel is no stream: where its cells are empty, nothing was measured.
 
     Law: rows and values are the same however the rows are cut into chunks.
     """
-    stream = iter(chunks)
-    head: list[Chunk] = []
-    rows = readings = 0
-    for chunk in stream:
-        head.append(chunk)
-        if "temperature" not in chunk.channels:
-            break
-        rows, readings = rows + len(chunk), readings + int(np.sum(_readings(chunk)))
-        if readings >= FIRST or rows >= HELD:
-            break
-    spacing = _spacing(head)
-    if spacing is None:
+    rest = iter(chunks)
+    head = _head(rest)
+    streams = _streams(head, faults)
+    if not streams:
         yield from head
-        yield from stream
+        yield from rest
         return
-    thermometer = _Thermometer(spacing, faults)
-    done = (thermometer.take(stop) for chunk in chain(head, stream) if (stop := thermometer.hold(chunk)))
-    for part in chain(done, thermometer.rest()):
+    waiting = _Waiting(streams)
+    done = (waiting.take(stop) for chunk in chain(head, rest) if (stop := waiting.hold(chunk)))
+    for part in chain(done, waiting.rest()):
         yield from (part.part(start, start + size) for start in range(0, len(part), size))
 
 
-def _readings(chunk: Chunk) -> Flags:
-    """Return the rows (N,) that have a reading of the thermometer."""
-    low, high, _ = RANGES["temperature"]
-    T = chunk["temperature"]
-    return np.isfinite(chunk.t) & (low <= T) & (high >= T)
+def _leading(chunk: Chunk) -> str | None:
+    """Return the channel whose rows these are; None where there is none but a temperature."""
+    names = [name for name in chunk.channels if name not in ("temperature", "valid")]
+    return next((name for name in ("gyro", "accel", *names) if name in names), None)
 
 
-def _spacing(head: list[Chunk]) -> float | None:
-    """Return the usual time between readings, s, by the first rows; None where there is one in nearly every row."""
-    if not head or "temperature" not in head[-1].channels:
-        return None
-    rows = concatenate(head)
-    at = np.flatnonzero(_readings(rows)[:HELD])[:FIRST]
-    if len(at) < LEAST or not np.median(np.diff(at)) > 1:
-        return None
-    spacing = interval(rows.t[at])
-    return spacing if spacing > 0 else None
+def _others(chunk: Chunk) -> list[str]:
+    """Return the channels that may be streams of their own."""
+    return [name for name in chunk.channels if name not in (_leading(chunk), "valid")]
 
 
-class _Thermometer:
-    """The rows since the last reading, which wait for the next one, and what is said of them all."""
+def _readings(chunk: Chunk, name: str) -> Flags:
+    """Return the rows (N,) that have a reading of a channel."""
+    low, high, _ = RANGES.get(name, (-LARGEST, LARGEST, ""))
+    good = (low <= chunk[name]) & (high >= chunk[name])
+    return np.isfinite(chunk.t) & (good if good.ndim == 1 else np.all(good, axis=1))
 
-    def __init__(self, spacing: float, faults: Faults) -> None:
-        self.spacing, self.faults = spacing, faults
-        self.held: list[Chunk] = []
-        self.t = self.T = np.empty(0)  # of the last reading
+
+def _head(stream: Iterator[Chunk]) -> list[Chunk]:
+    """Return the first chunks: those that show how often each channel has a reading."""
+    head: list[Chunk] = []
+    rows, count = 0, Counter[str]()
+    for chunk in stream:
+        head.append(chunk)
+        others = _others(chunk)
+        names = {*others, _leading(chunk) or others[0]} if others else set()
+        rows += len(chunk)
+        count.update({name: int(np.sum(_readings(chunk, name))) for name in names if count[name] < FIRST})
+        if rows >= HELD or all(count[name] >= FIRST for name in names):
+            break
+    return head
+
+
+def _streams(head: list[Chunk], faults: Faults) -> list[_Stream]:
+    """Return the channels that few of the first rows have."""
+    if not head or not _others(head[0]):
+        return []
+    rows, streams = concatenate(head).part(0, HELD), []
+    leading = _leading(rows)
+    own = np.isfinite(rows.t) if leading is None else _readings(rows, leading)
+    own = own if np.any(own) else np.isfinite(rows.t)
+    first = np.flatnonzero(own)[:FIRST]
+    for name in _others(rows):
+        read = _readings(rows, name)
+        at = np.flatnonzero(read)[:FIRST]
+        if len(at) < LEAST or len(first) < LEAST:
+            continue
+        shown = max(at[-1], first[-1]) + 1
+        together = np.flatnonzero(read[:shown][own[:shown]])
+        spacing = interval(rows.t[at])
+        apart = len(together) < 2
+        if spacing > 0 and (apart or np.median(np.diff(together)) >= 2):
+            # the noise of a sensor about as fast as the rows stays what it is; anything else is drawn through
+            step = interval(rows.t[first]) if rows[name].ndim > 1 else 0.0
+            streams.append(_Stream(name, rows[name][:0], step, spacing, faults, apart=apart))
+    return streams
+
+
+class _Stream:
+    """A channel that few rows have: its last reading, and what is said of all of them."""
+
+    def __init__(self, name: str, none: Array, step: float, spacing: float, faults: Faults, *, apart: bool) -> None:
+        self.name, self.step, self.spacing, self.faults = name, step, spacing, faults
+        self.apart = apart  # whether its readings have rows of their own
+        self.t, self.values = np.empty(0), none  # of the last reading in a row that was taken
+        self.last = np.nan  # time of the last reading
+        self.ready = 0  # how many of the rows that are held need not wait for another one
         self.rows = self.readings = self.open = 0
         self.longest, self.note = 0.0, ""
 
-    def hold(self, chunk: Chunk) -> int:
-        """Keep the next rows; return how many of those that are held need not wait."""
-        before = sum(map(len, self.held))
-        self.held.append(chunk)
-        at = np.flatnonzero(_readings(chunk))
-        if len(at):
-            return before + int(at[-1]) + 1
+    def look(self, chunk: Chunk, held: list[Chunk]) -> int:
+        """Look at the chunk that is held last; return how many rows need not wait."""
+        before = sum(map(len, held)) - len(chunk)
+        at = np.flatnonzero(_readings(chunk, self.name))
         now = float(chunk.t[-1])
-        if len(self.t) and now - self.t[0] > HOLE * self.spacing:
-            t = np.concatenate([rows.t for rows in self.held])
-            return int(np.argmax(t >= now - NEAR * self.spacing))
-        return before if before > 8 * HELD else 0  # of a time that does not go on
+        if len(at):
+            self.ready, self.last = before + int(at[-1]) + 1, float(chunk.t[at[-1]])
+        elif now - self.last > HOLE * self.spacing:
+            t = np.concatenate([rows.t for rows in held])
+            self.ready = max(self.ready, int(np.argmax(t >= now - NEAR * self.spacing)))
+        elif before > 8 * HELD:  # of a time that does not go on
+            self.ready = before
+        return self.ready
 
-    def take(self, stop: int) -> Chunk:
-        """Return the first rows that are held, with their temperature, but for those of a reading and nothing else."""
-        rows = concatenate(self.held)
-        self.held = [rest] if len(rest := rows.part(stop, len(rows))) else []
-        rows = rows.part(0, stop)
-        read = _readings(rows)
-        t, T = np.append(self.t, rows.t[read]), np.append(self.T, rows["temperature"][read])
-        values = rows["temperature"].copy()
-        empty = np.isnan(values)
-        values[empty] = joined(rows.t[empty], t, T, 0.0, self.spacing)
-        widths = np.diff(t)
+    def filled(self, rows: Chunk, stop: int) -> Array:
+        """Return the values of the first rows that are held, and count these."""
+        read = _readings(rows, self.name)
+        t, known = np.append(self.t, rows.t[read]), np.concatenate([self.values, rows[self.name][read]])
+        values = rows[self.name][:stop].copy()
+        empty = np.isnan(values) if values.ndim == 1 else np.any(np.isnan(values), axis=1)
+        drawn = joined(rows.t[:stop][empty], t, known, self.step, self.spacing)
+        values[empty] = np.where(np.isnan(values[empty]), drawn, values[empty])
+        readings = int(np.sum(read[:stop]))
+        done = len(self.t) + readings
+        widths = np.diff(t[:done])
         self.longest = max(self.longest, float(np.max(widths[widths <= HOLE * self.spacing], initial=0.0)))
-        self.t, self.T = t[-1:], T[-1:]
-        self.rows, self.readings = self.rows + stop, self.readings + int(np.sum(read))
-        self.open += int(np.sum(np.isnan(values)))
+        self.t, self.values = t[:done][-1:], known[:done][-1:]
+        self.rows, self.readings, self.ready = self.rows + stop, self.readings + readings, self.ready - stop
+        self.open += int(np.sum(np.isnan(values).reshape(stop, -1).any(axis=1)))
         self._say()
-        others = [v.reshape(len(rows), -1) for name, v in rows.channels.items() if name != "temperature"]
-        alone = read & np.all(np.isnan(np.hstack(others)), axis=1) if others else np.zeros(stop, dtype=bool)
-        return rows.having(temperature=values).where(~alone)
-
-    def rest(self) -> Iterator[Chunk]:
-        """Yield the rows behind the last reading."""
-        if self.held:
-            yield self.take(sum(map(len, self.held)))
+        return values
 
     def _say(self) -> None:
         self.faults.found.pop(self.note, None)
-        left = f"; gaps of more than {HOLE * self.spacing:.4g} s are left as they are" if self.open else ""
+        if self.spacing > SLOWER * self.step:
+            done = f"it is interpolated in time between them, over {self.longest:.4g} s at most"
+            left = f"gaps of more than {HOLE * self.spacing:.4g} s are left as they are"
+        else:
+            done = "each row takes the nearest of them"
+            left = f"rows more than {NEAR * max(self.step, self.spacing):.4g} s from one are left as they are"
         self.note = (
-            f"temperature has a reading in {self.readings:,} of {self.rows:,} rows, every {self.spacing:.4g} s; "
-            f"it is interpolated in time between them, over {self.longest:.4g} s at most{left}"
+            f"{self.name} has a reading in {self.readings:,} of {self.rows:,} rows, every {self.spacing:.4g} s; {done}"
+            + (f"; {left}" if self.open else "")
         )
         self.faults.note(self.note)
+
+
+class _Waiting:
+    """The rows since the last readings of all streams, which wait for the next ones."""
+
+    def __init__(self, streams: list[_Stream]) -> None:
+        self.streams, self.held = streams, list[Chunk]()
+
+    def hold(self, chunk: Chunk) -> int:
+        """Keep the next rows; return how many of those that are held need not wait."""
+        self.held.append(chunk)
+        return min(stream.look(chunk, self.held) for stream in self.streams)
+
+    def take(self, stop: int) -> Chunk:
+        """Return the first rows that are held, filled, but for those of a stream's reading and nothing else.
+
+        Where sensors have rows of their own, a row without a number is one of a sensor that nobody asked for.
+        """
+        rows = concatenate(self.held)
+        self.held = [rest] if len(rest := rows.part(stop, len(rows))) else []
+        filled = {stream.name: stream.filled(rows, stop) for stream in self.streams}
+        rows = rows.part(0, stop)
+        others = [v.reshape(len(rows), -1) for name, v in rows.channels.items() if name not in filled]
+        read = np.any([stream.apart | _readings(rows, stream.name) for stream in self.streams], axis=0)
+        alone = read & np.all(np.isnan(np.hstack(others)), axis=1) if others else np.zeros(stop, dtype=bool)
+        return rows.having(**filled).where(~alone)
+
+    def rest(self) -> Iterator[Chunk]:
+        """Yield the rows behind the last readings."""
+        if self.held:
+            yield self.take(sum(map(len, self.held)))
 
 
 def interval(t: Array) -> float:
@@ -238,7 +305,8 @@ def records(data: Bytes | bytes, at: Integers, dtype: np.dtype[Any]) -> NDArray[
     # every place in the data where one could begin, without a copy
     windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
     values = np.empty(len(at), windows.dtype)
-    for start, stop in pairwise([*np.flatnonzero(np.diff(at // SPAN, prepend=-1)), len(at)]):
+    spans = np.arange(SPAN, int(at[-1]) + 1 if len(at) else 0, SPAN).astype(at.dtype)  # of another type, `at` is copied
+    for start, stop in pairwise([0, *np.searchsorted(at, spans), len(at)]):
         values[start:stop] = windows[at[start:stop]]
         if len(at) > FEW:
             release(data)

@@ -155,7 +155,8 @@ class ImuCorrections:
 
     def _spans(self, at: Integers) -> Iterator[tuple[slice, int]]:
         """Yield stretches of rows over which no parameter changed, and the place of their first one."""
-        edges = np.searchsorted(at, self.parameters.changes(self._relevant())).tolist()
+        changes = np.array(self.parameters.changes(self._relevant()), at.dtype)  # of another type, all `at` is copied
+        edges = np.searchsorted(at, changes).tolist()
         for begin, end in pairwise(sorted({0, *edges, len(at)})):
             yield slice(begin, end), int(at[begin])
 

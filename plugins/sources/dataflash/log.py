@@ -22,8 +22,8 @@ comes after to tell, a few rows that are farther from all others than these last
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -70,6 +70,19 @@ class MessageStream:
         """Return a field of the rows."""
         return self.message.values(self.data, self.at, label)
 
+    def pieces(self) -> Iterator[MessageStream]:
+        """Yield the rows in order, some at a time: a column of a long log takes more memory than their places."""
+        for start in range(0, len(self.at), records.ROWS):
+            yield replace(self, at=self.at[start : start + records.ROWS])
+
+    def extremes(self, label: str) -> tuple[float, float]:
+        """Return the least and the largest value of a field that is a number; NaN where none is."""
+        low = high = np.nan
+        for part in self.pieces():
+            values = part.values(label)
+            low, high = float(np.fmin.reduce(values, initial=low)), float(np.fmax.reduce(values, initial=high))
+        return low, high
+
     def time(self, label: str | None = None) -> Array:
         """Return the times of the rows (N,) in s since power-up, by their TimeUS or the clock `label`.
 
@@ -81,7 +94,9 @@ class MessageStream:
         label = label if label in records.CLOCKS and label in self.message.labels else self.message.clock
         if label is None:
             raise MissingChannel(f"{self.message.name}: its rows have no time stamp; name a message with TimeUS")
-        return self.values(label) * records.CLOCKS[label]
+        t: Array = self.values(label)
+        t *= records.CLOCKS[label]
+        return t
 
 
 class DataFlashMessages:
@@ -104,10 +119,12 @@ class DataFlashMessages:
 
     def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
         self.path, self.data = path, data
+        self._instances: dict[str, dict[int, MessageStream]] = {}
         clock = TimeBudget(path, "what is no record")
-        first = records.scan(data, (records.FMT,), len(data) // records.FMT_LENGTH + 1, clock)
-        check_count(path, "descriptions of messages (FMT)", len(first.at), DESCRIBED)
-        self._described = records.described(data, first.at)
+        first = records.scan(data, {records.FMT: len(data) // records.FMT_LENGTH + 1}, clock)
+        descriptions = first.at[records.FMT]
+        check_count(path, "descriptions of messages (FMT)", len(descriptions), DESCRIBED)
+        self._described = records.described(data, descriptions)
         self.counts = first.counts
         if not self._described:
             raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
@@ -117,9 +134,9 @@ class DataFlashMessages:
                 most = DESCRIBED if name in records.DESCRIPTIONS else COUNT
                 check_count(path, f"records of {name}", int(self.counts[message.type]), most)
         wanted_messages = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
-        types = tuple({message.type for message in wanted_messages} | set(first.doubtful_types.tolist()))
-        second = records.scan(data, types, int(sum(first.counts[kind] for kind in types)), clock)
-        self._at = {kind: second.at[second.types == kind] for kind in types}
+        types = {message.type for message in wanted_messages} | set(first.doubtful_types.tolist())
+        second = records.scan(data, {kind: int(first.counts[kind]) for kind in types}, clock)
+        self._at = second.at
         self._drop_redefined(faults)
         self._report(*self._with_doubtful(second), faults)
         self._add_units()
@@ -144,8 +161,9 @@ class DataFlashMessages:
         for kind in np.unique(scanned.doubtful_types).tolist():
             message, at = self._described[kind][0][1], scanned.doubtful[scanned.doubtful_types == kind]
             if message.name not in ABOUT and len(self._described[kind]) == 1:
-                at = at[credible(message, self.data, self._at[kind], at)]
-                self._at[kind] = np.sort(np.concatenate([self._at[kind], at]))
+                whole = self._at[kind]
+                at = at[credible(message, self.data, whole, at)].astype(whole.dtype)
+                self._at[kind] = np.sort(np.concatenate([whole, at])) if len(at) else whole
                 credited += [(pos, message.size) for pos in at.tolist()]
         lost, first, end = scanned.lost, scanned.first_lost, scanned.end
         for pos, size in sorted(credited):
@@ -217,27 +235,41 @@ class DataFlashMessages:
         check_count(self.path, "changes of the inertial units' parameters (PARM)", parameters.steps, CHANGES)
         return parameters
 
-    @cached_property
+    @property
     def units(self) -> dict[int, MessageStream]:
         """The inertial units: rows of IMU by instance, or of IMU, IMU2, IMU3 of earlier logs."""
         return self.instances("IMU")
 
     def instances(self, name: str) -> dict[int, MessageStream]:
         """Return the rows of a message by instance; 0 where it has none."""
+        if name not in self._instances:
+            self._instances[name] = self._by_instance(name)
+        return self._instances[name]
+
+    def _by_instance(self, name: str) -> dict[int, MessageStream]:
         streams: dict[int, MessageStream] = {}
         inertial = name in records.INERTIAL
         if name in self.messages and self.messages[name].instance:
             message = self.messages[name]
-            at = self._at.get(message.type, np.empty(0, np.int64))
-            which = message.raw(self.data, at, str(message.instance))
-            for k in np.unique(which).tolist():
-                streams[int(k)] = MessageStream(message, at[which == k], self.data, int(k) if inertial else None)
+            found = self._places(message, str(message.instance))
+            for k in sorted(found):
+                at = np.concatenate(found.pop(k))
+                streams[k] = MessageStream(message, at, self.data, k if inertial else None)
             return streams
         for message in self._family(name):
             digit = message.name.removeprefix(name)
             k = int(digit) - 1 if digit else 0
             streams[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
         return {k: stream for k, stream in streams.items() if len(stream.at)}
+
+    def _places(self, message: records.Message, label: str) -> dict[int, list[Integers]]:
+        """Return the places of each instance's rows, piece by piece, and give up those of all."""
+        found: dict[int, list[Integers]] = {}
+        for part in MessageStream(message, self._at.pop(message.type, np.empty(0, np.int64)), self.data).pieces():
+            which = message.raw(self.data, part.at, label)
+            for k in np.unique(which).tolist():
+                found.setdefault(int(k), []).append(part.at[which == k])
+        return found
 
     def missing(self, path: str) -> MissingChannel:
         """Return the error for a message that the log does not have."""
@@ -254,12 +286,13 @@ class DataFlashMessages:
         """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""
         if clock is None and stream.message.clock is None:
             return stream
-        t = stream.time(clock)
-        good = plausible(t)
+        if _rises(stream, clock):
+            return stream
+        good = plausible(stream.time(clock))
         if faults is not None and not np.all(good):
             where = f"at byte {stream.at[np.argmin(good)]}"
             faults.add("rows with a damaged time stamp, left out", int(np.sum(~good)), where)
-        return MessageStream(stream.message, stream.at[good], self.data, stream.unit)
+        return replace(stream, at=stream.at[good])
 
 
 def _letters(rows: MessageStream) -> list[str]:
@@ -298,10 +331,24 @@ FEW = 8  # rows in a row: damage is a sector of 512 bytes, which holds so many
 MIN_HOLE = 60.0  # s: a hole that is shorter is a hole
 
 
+def _rises(stream: MessageStream, clock: str | None) -> bool:
+    """Return True if the time never goes back, and no few rows at either end are far from all others."""
+    at, last = stream.at, -np.inf
+    ends = at if len(at) < 2 * FEW + 2 else np.concatenate([at[: FEW + 1], at[-FEW - 1 :]])
+    if not np.all(_near(replace(stream, at=ends).time(clock))):
+        return False
+    for part in stream.pieces():
+        t = part.time(clock)
+        if t[0] < last or np.any(t[1:] < t[:-1]):
+            return False
+        last = t[-1]
+    return True
+
+
 def plausible(t: Array) -> Flags:
     """Return the time stamps t (N,) in s, in the order of the file, that are not damaged, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
-    if np.any(np.diff(t) < 0):
+    if np.any(t[1:] < t[:-1]):
         good = _rising(t)
         edges = np.flatnonzero(np.diff(np.concatenate(([True], good, [True]))))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
@@ -314,10 +361,10 @@ def plausible(t: Array) -> Flags:
 def _near(t: Array) -> Flags:
     """Return the rows that are not a few beyond a hole, at either end, that is longer than all the rest, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
-    for part in (t, -t[::-1]):
+    for part, flags, sign in ((t, good, 1), (t[::-1], good[::-1], -1)):
         for k in range(1, min(FEW, len(t) - FEW - 1) + 1):  # the first k rows, and the last
-            if part[k] - part[k - 1] > max(part[-1] - part[k], MIN_HOLE):
-                (good if part is t else good[::-1])[:k] = False
+            if sign * (part[k] - part[k - 1]) > max(sign * (part[-1] - part[k]), MIN_HOLE):
+                flags[:k] = False
     return good
 
 

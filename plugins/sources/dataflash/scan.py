@@ -21,20 +21,23 @@ Source: ArduPilot, libraries/AP_Logger/LogStructure.h and README.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from struct import calcsize
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from fusion_core.budget import COUNT, TimeBudget
-from fusion_core.chunk import Bytes, Flags, Integers
+from fusion_core.chunk import Bytes, Integers
 from fusion_plugins.sources.joining import records, release
 
 PIECE = 1 << 22  # bytes between two looks at the clock, and of a mapped log that are held
-Into = tuple[Integers, Bytes, Integers, Integers]
-State = tuple[int, int, int, int, int, int]
+ROWS = 1 << 16  # that are made float64 at once
+SHORT = 1 << 31  # bytes of a file whose places are int32
+Into = tuple[Integers, Integers, Integers, Integers, Integers]
+State = tuple[int, int, int, int, int]
 
 PACKED = {
     "b": "b", "B": "B", "M": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "g": "e", "q": "q",
@@ -56,10 +59,8 @@ class Scan(NamedTuple):
 
     Attributes
     ----------
-    at : (N,) array of int
-        Where the records that were asked for begin, in the order of the file.
-    types : (N,) array of uint8
-        Their types.
+    at : dict of int to (N,) array of int
+        Where the records of each type that was asked for begin, in the order of the file.
     counts : (256,) array of int
         Records of each type.
     doubtful, doubtful_types : (D,) arrays
@@ -70,8 +71,7 @@ class Scan(NamedTuple):
         Where the last record ends.
     """
 
-    at: Integers
-    types: Bytes
+    at: dict[int, Integers]
     counts: Integers
     doubtful: Integers
     doubtful_types: Bytes
@@ -80,33 +80,37 @@ class Scan(NamedTuple):
     end: int
 
 
-def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: TimeBudget) -> Scan:
-    """Return the places of the records of the wanted types, at most `most`; raises UnreadableFile out of time."""
-    types_wanted = np.zeros(256, dtype=np.bool_)
-    types_wanted[list(wanted)] = True
-    at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
-    doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, np.int64)
-    lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, 0, -1, 0)
+def scan(data: Bytes, most: Mapping[int, int], clock: TimeBudget) -> Scan:
+    """Return the places of the records of each type, `most` of them at most; raises UnreadableFile out of time."""
+    at: Integers = np.empty(sum(most.values()), np.int32 if len(data) < SHORT else np.int64)
+    ends = np.cumsum([most.get(kind, 0) for kind in range(256)])
+    places, counts = np.concatenate([[0], ends[:-1]]), np.zeros(256, np.int64)  # of the next record of each type
+    doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, at.dtype)
+    lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, -1, 0)
     lengths[:2, FMT], lengths[2] = FMT_LENGTH, _LETTERS
     while state[0] + 3 <= len(data):
         rows, stop = counts.sum(), state[0] + PIECE
-        state = _walk(data, stop, types_wanted, lengths, (at, types, counts, doubtful), state)
+        state = _walk(data, stop, lengths, (at, places, ends, counts, doubtful), state)
         clock.check(int(counts.sum() - rows))
         release(data)
-    _, count, doubts, lost, first_lost, end = state
+    _, doubts, lost, first_lost, end = state
     doubtful = doubtful[:doubts].copy()
-    return Scan(at[:count], types[:count], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
+    found = {kind: at[ends[kind] - count : places[kind]] for kind, count in most.items()}
+    # places of few records do not keep those of all in memory
+    found = {kind: part if 2 * len(part) > len(at) else part.copy() for kind, part in found.items()}
+    return Scan(found, counts, doubtful, data[doubtful + 2], lost, first_lost, end)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _walk(data: Bytes, stop: int, wanted: Flags, lengths: Integers, into: Into, state: State) -> State:
-    """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
+def _walk(data: Bytes, stop: int, lengths: Integers, into: Into, state: State) -> State:
+    """Fill `at` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
 
-    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
-    goes on, how many were found, are in doubt, the bytes lost, the first of them, and the end of the last record.
+    The next record of a type goes to `places` (256,) of `at`, if that is before `ends` (256,). `lengths` (3, 256) are
+    declared, as the letters of the formats add up, and of each letter; the state is where it goes on, how many are in
+    doubt, the bytes lost, the first of them, and the end of the last record.
     """
-    n, (pos, count, doubts, lost, first_lost, end) = len(data), state
-    at, types, counts, doubtful = into
+    n, (pos, doubts, lost, first_lost, end) = len(data), state
+    at, places, ends, counts, doubtful = into
     length, fields, letters = lengths
     while pos + 3 <= n and pos < stop:
         kind, step = data[pos + 2], 0
@@ -132,13 +136,13 @@ def _walk(data: Bytes, stop: int, wanted: Flags, lengths: Integers, into: Into, 
             first_lost = end if lost == 0 else first_lost
             lost += pos - end
         if step >= fields[kind]:
-            if wanted[kind] and count < len(at):
-                at[count], types[count] = pos, kind
-                count += 1
+            if places[kind] < ends[kind]:
+                at[places[kind]] = pos
+                places[kind] += 1
             counts[kind] += 1
         pos += step
         end = pos
-    return pos, count, doubts, lost, first_lost, end
+    return pos, doubts, lost, first_lost, end
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -246,17 +250,25 @@ class Message:
         """Return a field as it stands in the records at `at` (N,), unscaled."""
         k = self.labels.index(label)
         offset = 3 + sum(SIZES[letter] for letter in self.letters[:k])
-        code = CODES.get(self.letters[k], f"S{SIZES[self.letters[k]]}")
-        return records(data, at + offset, np.dtype(code))
+        return records(data[offset:], at, self._type(label))
+
+    def _type(self, label: str) -> np.dtype[Any]:
+        """Return the type of a field as it stands in the records."""
+        letter = self.letters[self.labels.index(label)]
+        return np.dtype(CODES.get(letter, f"S{SIZES[letter]}"))
 
     def values(self, data: Bytes, at: Integers, label: str) -> np.ndarray:
         """Return a field of the records at `at` (N,) as float64 (N,), or (N, 32) where it is an array."""
+        values = np.empty((len(at), *self._type(label).shape))
         with np.errstate(invalid="ignore"):  # a signalling NaN is damage, and NaN then
-            values = self.raw(data, at, label).astype(np.float64)
+            for start in range(0, len(at), ROWS):
+                values[start : start + ROWS] = self.raw(data, at[start : start + ROWS], label)
         divisor = DIVISORS.get(self.letters[self.labels.index(label)])
-        values = values if divisor is None else values / divisor
-        scale = self.scales.get(label)
-        return values if scale is None else values * scale
+        if divisor is not None:
+            values /= divisor
+        if label in self.scales:
+            values *= self.scales[label]
+        return values
 
     def text(self, data: Bytes, at: Integers, label: str) -> list[str]:
         """Return a field of characters, without what follows its end."""

@@ -154,13 +154,14 @@ class Messages(Table):
 
     def _about(self, stream: MessageStream) -> str:
         """Return rows, rate and range of temperature of a stream."""
-        t = self.log.sound(stream, None).time() if stream.message.clock else np.empty(0)
-        span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
-        text = f"{len(stream.at)} rows" + (f", {(len(t) - 1) / span:.4g} Hz" if span > 0 else "")
+        rows = self.log.sound(stream, None).at if stream.message.clock else np.empty(0, np.int64)
+        ends = replace(stream, at=rows[[0, -1]]).time() if len(rows) > 1 else np.zeros(2)
+        span = float(ends[1] - ends[0])
+        text = f"{len(stream.at)} rows" + (f", {(len(rows) - 1) / span:.4g} Hz" if span > 0 else "")
         label = stream.message.label("T")
-        T = stream.values(label) if label else np.empty(0)
-        if np.any(np.isfinite(T)):
-            text += f", {np.nanmin(T):.1f} to {np.nanmax(T):.1f} °C"
+        low, high = stream.extremes(label) if label else (np.nan, np.nan)
+        if np.isfinite(low) or np.isfinite(high):
+            text += f", {low:.1f} to {high:.1f} °C"
         return text
 
 
@@ -254,7 +255,7 @@ class RawSamples:
             raise UnreadableFile(
                 f"{of}, raw data were expected; set compensated: undo under source, or log with INS_TCALn_ENABLE 0"
             )
-        if not np.any(np.isfinite(self._temperature(stream))):
+        if not any(np.any(np.isfinite(self._temperature(part))) for part in stream.pieces()):
             raise UnreadableFile(
                 f"{of} by a temperature that is not in the log, IMU.T was expected; add IMU to LOG_BITMASK, or set "
                 "compensated: keep under source"
@@ -262,8 +263,8 @@ class RawSamples:
 
 
 def _check_temperature(stream: MessageStream, label: str, faults: Faults) -> None:
-    T = stream.values(label)
-    if len(T) > 1 and np.ptp(T) == 0:
-        why = "it has no thermometer" if T[0] == 0 else "its thermometer stands still"
-        what = f"rows of IMU {stream.unit} that all show {T[0]:.6g} °C ({why}; BARO.Temp may serve)"
-        faults.add(what, len(T), AT_FIRST)
+    T = float(replace(stream, at=stream.at[:1]).values(label)[0])
+    if len(stream.at) > 1 and np.isfinite(T) and all(np.all(part.values(label) == T) for part in stream.pieces()):
+        why = "it has no thermometer" if T == 0 else "its thermometer stands still"
+        what = f"rows of IMU {stream.unit} that all show {T:.6g} °C ({why}; BARO.Temp may serve)"
+        faults.add(what, len(stream.at), AT_FIRST)

@@ -26,7 +26,7 @@ from recordings_on_disk import read
 from fusion_core.errors import EmptyRecording, FusionError, MissingChannel, TimeBackwards, UnitConflict, UnreadableFile
 from fusion_core.faults import Faults, usable
 from fusion_core.testing import check_plugin
-from fusion_plugins.sources.dataflash import DataFlash
+from fusion_plugins.sources.dataflash import DataFlash, scan
 from fusion_plugins.sources.dataflash.log import FEW, plausible
 
 CHANNELS = {
@@ -345,6 +345,28 @@ def test_a_clock_that_began_anew_is_refused(tmp_path):
     with pytest.raises(TimeBackwards, match=r"time runs backwards by 3\.96 s at 0\.0 s .*l\.bin:::3\.959$"):
         used(path)
     assert len(used(path, stop=3.959)[0]) == 99
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_places_and_pieces_change_no_value(tmp_path, monkeypatch, damaged):
+    """A log of any length is read in pieces, and one of 2 GB has places of 64 bits."""
+    path = log(tmp_path / "l.bin", imus=2)
+    if damaged:
+        data = bytearray(path.read_bytes())
+        at = data.index(struct.pack("<Q", 25_000_000))  # the time of a row in the middle, which goes back
+        data[at : at + 8] = bytes(8)
+        path.write_bytes(data)
+    found = []
+    for some, short in ((scan.ROWS, scan.SHORT), (7, scan.SHORT), (scan.ROWS, 0)):
+        monkeypatch.setattr(scan, "ROWS", some)
+        monkeypatch.setattr(scan, "SHORT", short)
+        faults = Faults()
+        got = read(DataFlash(path=path, channels=CHANNELS), size=71, faults=faults)
+        found.append((got.t, got["gyro"], got["accel"], got["temperature"], faults.lines()))
+    assert any("damaged time stamp" in line for line in found[0][-1]) == damaged
+    for other in found[1:]:
+        for one, same in zip(found[0], other, strict=True):
+            np.testing.assert_array_equal(one, same)
 
 
 def test_which_time_stamps_are_plausible():
