@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 3980
+    assert 0 < count <= 3995
 
 
 def imports():
@@ -256,39 +256,39 @@ def test_tests_mirror_the_tree():
 
 
 BUDGET = {
-    "driftlab": 631,
-    "driftlab/commands": 3798,
-    "driftlab/evaluation": 1532,
+    "driftlab": 632,
+    "driftlab/commands": 3801,
+    "driftlab/evaluation": 1569,
     "driftlab/family": 3347,
-    "driftlab/filtering": 1264,
-    "driftlab/identification": 2269,
+    "driftlab/filtering": 1263,
+    "driftlab/identification": 2286,
     "driftlab/live": 845,
     "driftlab/maps": 1909,
-    "driftlab/noise": 1374,
+    "driftlab/noise": 1458,
     "driftlab/planning": 1221,
     "driftlab/production": 3205,
     "driftlab/products": 6,
-    "driftlab/recordings": 656,
-    "driftlab/reports": 3545,
+    "driftlab/recordings": 663,
+    "driftlab/reports": 3544,
     "driftlab/soak": 751,
     "driftlab/spc": 1551,
-    "driftlab/starter": 894,
+    "driftlab/starter": 901,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,
-    "fusion_core": 1942,
-    "fusion_core/contracts": 1963,
-    "fusion_core/fast": 824,
+    "fusion_core": 1950,
+    "fusion_core/contracts": 1977,
+    "fusion_core/fast": 825,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1232,
+    "fusion_core/thermal": 1238,
     "fusion_core/units": 428,
     "plugins": 302,
-    "plugins/bias_models": 246,
+    "plugins/bias_models": 251,
     "plugins/effects": 711,
     "plugins/exporters": 1720,
     "plugins/framings": 625,
-    "plugins/measurement_models": 733,
-    "plugins/sources": 5341,
+    "plugins/measurement_models": 735,
+    "plugins/sources": 5434,
     "plugins/stimuli": 298,
     "plugins/thermal_maps": 886,
 }
