@@ -78,7 +78,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
         place = f"{{path: {yaml_text(held.path)}, unit: {yaml_text(_held_unit(held))}}}"
         lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
-    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other != held]
+    lines += [_auxiliary(other.path, other.unit or columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
     return _starter(lines, asked, questions, [*unread_of(columns, channels), *_quiet(channels)])

@@ -26,7 +26,8 @@ def written(path, rows):
     axes = {f"{c}{a} ({u})": sparse[name] * values[:, k] for c, u, name, values in (
         ("g", "rad/s", "gyro", UNIT.gyro), ("a", "m/s^2", "accel", UNIT.accel),
     ) for k, a in enumerate("xyz")}  # fmt: skip
-    columns = {"t (s)": UNIT.t, **axes, "temp (degC)": sparse["temp"] * UNIT.temperature}
+    supply = np.where(at % 25 == 7, 12.0 + np.sin(UNIT.t / 100), np.nan)
+    columns = {"t (s)": UNIT.t, **axes, "temp (degC)": sparse["temp"] * UNIT.temperature, "supply (V)": supply}
     pl.DataFrame(columns).fill_nan(None).write_csv(path / "rec.csv")
     return path / "rec.yaml"
 
@@ -41,6 +42,7 @@ def test_slow_accelerometers_and_thermometers_are_no_problem(tmp_path, rows):
     done = init(tmp_path / "rec.csv", out=config)
     assert (done.asked, done.problems) == ((), ())
     assert "8,000 rows at 20 Hz" in done.text
+    assert 'path: "supply (V)", unit: V}' in done.text
     lines = check(config).remarks
     assert any(re.match(r"recording: .*, 20 Hz at its start", line) for line in lines)
     assert sum("it is interpolated in time between them" in line for line in lines) == len(rows)
