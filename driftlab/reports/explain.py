@@ -38,8 +38,8 @@ WORSE = "But the error on the test recording grows, though by no more than chanc
 MEANING = {
     "explained": "Effects that the declared model lacks are added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
-    "unexplained": "Something significant is left that no installed effect explains well enough, or no test recording "
-    "tests what was added.",
+    "unexplained": "Something significant is left that no installed effect explains well enough, or the test "
+    "recordings do not confirm the result.",
     "refuted": "The identified effects predict the test recording worse than the declared model: that stays as it "
     "is, and candidate.yaml has them.",
     "ambiguous": "These recordings cannot tell some explanations apart.",
