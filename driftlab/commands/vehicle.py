@@ -213,13 +213,17 @@ def vehicle(
     exporter = exporter_of(form, settings)
     site = {name: value for name, value in (("latitude", latitude), ("heading", heading)) if value is not None}
 
-    found = sensors_of(product, names, site)
-    sensors = [_fitted(product, one, found, site, kind, progress) for one in found]
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="driftlab-") as temporary:
-            return _exported(product, exporter, sensors, Path(temporary))
-    with output_folder(Path(out), COMMAND, paths_of(names)) as folder:
+    # what must not be replaced is refused before anything is fitted
+    with (
+        tempfile.TemporaryDirectory(prefix="driftlab-")
+        if out is None
+        else output_folder(Path(out), COMMAND, paths_of(names))
+    ) as place:
+        found, folder = sensors_of(product, names, site), Path(place)
+        sensors = [_fitted(product, one, found, site, kind, progress) for one in found]
         result = _exported(product, exporter, sensors, folder)
+        if out is None:
+            return result
         for one in result.sensors:
             if one.result is not None:
                 save(one.result.map, folder / one.file, COMMAND)

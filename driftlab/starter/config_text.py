@@ -78,7 +78,7 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
         place = f"{{path: {yaml_text(held.path)}, unit: {yaml_text(_held_unit(held))}}}"
         lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
-    lines += [_auxiliary(other.path, other.unit or columns.units.get(other.path)) for other in channels.others if other != held]
+    lines += [_auxiliary(other, columns.units.get(other.path)) for other in channels.others if other != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
     return _starter(lines, asked, questions, [*unread_of(columns, channels), *_quiet(channels)])
@@ -206,9 +206,10 @@ def _channel(field: str, channel: GuessedChannel) -> str:
     return f"    {field}: {{path: {path}, unit: {yaml_text(channel.unit)}}}{note}"
 
 
-def _auxiliary(path: str, unit: str | None) -> str:
+def _auxiliary(name: Name, stated: str | None) -> str:
+    unit = name.unit or stated
     known = f", unit: {yaml_text(unit)}" if unit is not None and _is_unit(unit) else ""
-    return f"    # {yaml_text(_key(path))}: {{path: {yaml_text(path)}{known}}}"
+    return f"    # {yaml_text(_key(name.path))}: {{path: {yaml_text(name.path)}{known}}}"
 
 
 def _filter(channels: Channels, map_name: str) -> Iterator[str]:

@@ -104,7 +104,7 @@ def test_each_sensor_of_an_ardupilot_vehicle_has_its_own_limits(folder, tmp_path
         np.testing.assert_allclose(slopes(accel.bias)[2], -imu * 2e-3 * 20, atol=0.005)
 
 
-def test_on_the_command_line(folder, tmp_path):
+def test_on_the_command_line(folder, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, ["vehicle", str(folder / "soak.ulg"), "--out", str(tmp_path / "out"), "--json"])
     assert done.exit_code == 0, done.output
     said = json.loads(done.stdout)
@@ -113,6 +113,7 @@ def test_on_the_command_line(folder, tmp_path):
     again = CliRunner().invoke(app, ["vehicle", str(folder / "soak.ulg"), "--out", str(tmp_path / "out"), "-q"])
     assert (again.exit_code, again.stdout) == (0, "")
     (tmp_path / "out" / "vehicle.params").write_text("mine")
+    monkeypatch.delattr("driftlab.commands.vehicle.sensors_of")  # it is refused before a log is read
     edited = CliRunner().invoke(app, ["vehicle", str(folder / "soak.ulg"), "--out", str(tmp_path / "out")])
     assert isinstance(edited.exception, ConfigError)
     assert (tmp_path / "out" / "vehicle.params").read_text() == "mine"
