@@ -166,14 +166,12 @@ def test_rows_of_one_group_are_read_in_spans(tmp_path):
     assert [begin for begin, _ in spans] == np.cumsum([0, *(rows for _, rows in spans[:-1])]).tolist()
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [0, 1, *range(3, 8), *range(9, 12), 13, 14])  # others make sparse files of 10 GB
 def test_footers_and_pages_are_refused_or_read(tmp_path, seed):
     rng = np.random.default_rng(seed)
     path = tmp_path / "a.parquet"
     (bombs_of_columns.parquet if seed % 2 else bombs_of_columns.footers)(rng, path)
     channels = {"time": {"path": "time", "unit": "s"}, "gyro": {"path": ["gx", "gy", "gz"], "unit": "rad/s"}}
-    if path.stat().st_size > 10**6:
-        pytest.skip("too large for the suite")
     begun = time.process_time()
     with suppress(DataError):
         read("parquet", path, channels)
