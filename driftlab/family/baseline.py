@@ -48,6 +48,9 @@ class FrozenLimits(BaseModel):
         Middle of a line in control, and the deviation between units without that of their measurement.
     share : float
         Factor of the units' own deviations.
+    own : float or None
+        Least own deviation of a unit, in the scale: the middle one of the units that the law is of. None, in files from
+        before it was frozen: the middle one of those that are judged together.
     tails : TailLaw or None
         Law of one column, the deviations from the centre in sigmas; None where they are taken for normal.
     """
@@ -60,6 +63,7 @@ class FrozenLimits(BaseModel):
     centre: FiniteFloat
     spread: Annotated[FiniteFloat, Field(ge=0)]
     share: Annotated[FiniteFloat, Field(ge=0)] = 1.0
+    own: Annotated[FiniteFloat, Field(ge=0)] | None = None
     tails: TailLaw | None = None
 
     @model_validator(mode="after")

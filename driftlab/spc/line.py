@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from driftlab.config import Limits
 from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
-from driftlab.family.record import FIGURES, PER, UnitRecord
+from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
 from driftlab.family.tail_law import TailLaw
 from driftlab.family.unit_records import RecordsOfUnits, at_places, figure_of
 from driftlab.spc.capability import Capability, indices, share_beyond, why_no_index
@@ -89,7 +89,7 @@ def line_of(
         _control(line, name, line.axes.index(axis), quantities, alpha, known.get((name, axis)), of_rules, everywhere)
         for (name, axis), there in enough.items() if there
     )  # fmt: skip
-    too_few = tuple(f"{axis} {name}" for (name, axis), there in enough.items() if not there)
+    too_few = tuple(f"{axis} {figure_name(name)}" for (name, axis), there in enough.items() if not there)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
     line = replace(line, multivariate=_multivariate(line))
     return replace(line, sentences=tuple(sentences(line)))
@@ -147,7 +147,7 @@ def _control(
     scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale(known.scale)
     frozen = None if known is None else InControl(known.centre, known.spread, known.share)
     usual = float(np.median(value) if frozen is None else scale.back(np.array(frozen.centre)))
-    figures = partial(_figures, quantities, name, k, at, scale, usual)
+    figures = partial(_figures, quantities, name, k, at, scale, usual, None if known is None else known.own)
     x, own = scale.to(value), figures()[1]
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
     course = course_of(x, whole, alpha, _runs(lots.tolist()))
@@ -161,7 +161,7 @@ def _control(
         quantity=name, axis=line.axes[k], unit=line.unit.si + PER.get(name, ""), at=at, scale=scale, figures=figures,
         basis=(int(at[start]), int(at[stop - 1]) + 1), centre=float(scale.back(np.array(law.centre))),
         changes=_changes(level_steps, stretches, x, sigma, scale, at),
-        lots=_lots(lots, x, sigma, law, scale, known=known is not None),
+        lots=_lots(lots, x, sigma, law, scale, known),
         trend=trend, law=law, rules=rules, phi=course.phi, frozen=known,
     )  # fmt: skip
 
@@ -208,7 +208,7 @@ def baseline_of(line: LineReport, levels: Sequence[InControl]) -> Baseline:
             law = chart.law
             limits = FrozenLimits(
                 quantity=name, axis=chart.axis, scale=chart.scale.name, centre=law.centre + _moved(chart),
-                spread=law.spread, share=law.share, tails=own,
+                spread=law.spread, share=law.share, own=float(np.median(chart.figures()[1])), tails=own,
             )  # fmt: skip
             frozen.append(limits)
             scores[chart.axis][name] = limits.scores(u[:, k])
@@ -249,18 +249,20 @@ def _about_stretches(line: LineReport, chart: ControlChart) -> Array:
 
 
 def _figures(
-    quantities: _Quantities, name: str, k: int, at: NDArray[np.intp], scale: ChartScale, usual: float
-) -> tuple[Array, Array]:
+    quantities: _Quantities, name: str, k: int, at: NDArray[np.intp], scale: ChartScale, usual: float,
+    least: float | None,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return the values (m,), SI, of a quantity of axis k, and the deviations in the scale that they would have.
 
     Were each as `usual` (SI): what comes out large by chance has a large deviation of its own, what comes out small a
-    small one.
+    small one. None is below the `least`, which is frozen with limits and is else the middle one: limits that are frozen
+    do not depend on what other units are judged with a unit.
     """
     value, sigma = quantities.read(name)[:, at, k]
     if not usual > 0:
         return value, scale.sigma(value, sigma)
     own = scale.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
-    return value, np.maximum(own, np.median(own))
+    return value, np.maximum(own, np.median(own) if least is None else least)
 
 
 def _trend(course: Course, scale: ChartScale) -> Trend | None:
@@ -291,10 +293,16 @@ def _changes(
 
 
 def _lots(
-    names: NDArray[np.str_], x: Array, sigma: Array, law: InControl, scale: ChartScale, *, known: bool
+    names: NDArray[np.str_], x: Array, sigma: Array, law: InControl, scale: ChartScale, known: FrozenLimits | None
 ) -> tuple[LotPoint, ...]:
+    """Return the points of lots; deviations are of normal scores where tails are known, which have normal limits."""
+    off, frozen = x - law.centre, None if known is None else float(np.median(sigma))
+    scores = off if known is None else known.scores(off / sigma) * sigma
     points = []
-    for name, of_lot in lots_of(names, x - law.centre, sigma, float(np.median(sigma)) if known else None):
+    for (name, of_lot), (_, spread) in zip(
+        lots_of(names, off, sigma, frozen), lots_of(names, scores, sigma, frozen), strict=True
+    ):
+        of_lot[4:] = spread[4:]
         mean, low, high = scale.back(law.centre + of_lot[1:4]).tolist()
         out = bool(not of_lot[2] <= of_lot[1] <= of_lot[3])
         points.append(LotPoint(name, int(of_lot[0]), mean, low, high, out, *of_lot[4:].tolist()))

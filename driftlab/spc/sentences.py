@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,10 +30,10 @@ def sentences(line: LineReport) -> list[str]:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
         within = "within these" if judged else "in"
-        lines = [f"{off} change of the line {within} {len(line.units):,} units, {line.order}."]
+        lines = [f"{off} change of the line {within} {_units(len(line.units))}, {line.order}."]
     if any(chart.rules for chart in line.controls):
         places = sorted({int(k) for c in line.controls for f in c.patterns.values() for k in c.at[_beginnings(f)]})
-        which = f"at {len(places):,} units: {_names(line, places)}" if places else "at no unit"
+        which = f"at {_units(len(places))}: {_names(line, places)}" if places else "at no unit"
         lines.append(f"Run rules begin to alarm {which}.")
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
@@ -112,7 +112,7 @@ def _against_baseline(line: LineReport) -> list[str]:
         usual = sum(len(at) for at, _ in charts) / 370
         chance = f"of a line in control {usual:.2g} to {MANY * usual:.2g} would be by chance, of {len(charts)} charts"
         verb = "is" if len(places) == 1 else "are"
-        return [f"{len(places):,} of {len(line.units):,} units {verb} beyond {by}: {names}; {chance}.", *beside]
+        return [f"{len(places):,} of {_units(len(line.units))} {verb} beyond {by}: {names}; {chance}.", *beside]
     moved = ", ".join(_called(chart) for chart in frozen if chart.drifting[-1])
     if moved:
         single = f"No single unit of {len(line.units):,} is beyond {by}"
@@ -122,13 +122,16 @@ def _against_baseline(line: LineReport) -> list[str]:
     reach = max(float(np.max(np.abs(law.deviations(ends)))) for law in laws)
     seen = f"half of the units that are off by {reach:.2g} deviations in one figure, the widest limit, would be seen"
     count = sum(len(chart.at) for chart in frozen)
-    return [f"None of {count:,} values of {len(line.units):,} units is beyond {by}; {seen}.", *beside]
+    return [f"None of {count:,} values of {_units(len(line.units))} is beyond {by}; {seen}.", *beside]
+
+
+def _units(count: int) -> str:
+    return "1 unit" if count == 1 else f"{count:,} units"
 
 
 def _names(line: LineReport, places: list[int]) -> str:
     """Return the units at the first places, and the number of the others."""
-    more = f" and {len(places) - NAMED:,} more" if len(places) > NAMED else ""
-    return ", ".join(line.units[k] for k in places[:NAMED]) + more
+    return _first([line.units[k] for k in places])
 
 
 def place(line: LineReport, k: int) -> str:
@@ -184,10 +187,12 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     """Return the present state; `counted`: with the number of values beyond three sigma."""
     from scipy.special import ndtri
 
-    out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
+    last = len(line.units) - 10
+    out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= last]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
+    lines += _came_back(line, out) + _off_lots(line)
     if counted:  # else the units beyond frozen limits are
         lines.append(
             f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would, "
@@ -197,14 +202,41 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     charts = [c for c in line.controls if c.phi >= max(ALIKE, chance / np.sqrt(len(c.at)))]
     alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(charts, key=lambda c: -c.phi)]
     if alike:
-        more = f" and {len(alike) - NAMED:,} more" if len(alike) > NAMED else ""
         lines.append(
-            f"Units resemble those before them (autocorrelation: {', '.join(alike[:NAMED])}{more}): changes are "
+            f"Units resemble those before them (autocorrelation: {_first(alike)}): changes are "
             "reported beyond that, and limits by neighbours alarm more often than they say."
         )
     if line.too_few:
         lines.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
     return lines
+
+
+def _came_back(line: LineReport, out: Sequence[str]) -> list[str]:
+    """Return in a sentence the frozen charts whose EWMA left its limits, but those that are `out` at the end."""
+    charts = [c for c in line.controls if c.of_family and np.any(c.drifting) and _called(c) not in out]
+    each = [f"{_called(c)} from {line.units[c.at[_beginnings(c.drifting)[0]]]} on" for c in charts]
+    return [f"The EWMA left its limits and came back: {_first(each)}."] if each else []
+
+
+def _off_lots(line: LineReport) -> list[str]:
+    """Return in a sentence the lots whose mean or deviation is beyond frozen limits, and the number by chance."""
+    lots = [(lot, c) for c in line.controls if c.of_family for lot in c.lots if lot.name and lot.n > 1]
+    off = [f"lot {lot.name} {_called(c)} mean" for lot, c in lots if lot.out]
+    off += [f"lot {lot.name} {_called(c)} deviation" for lot, c in lots if lot.uneven]
+    if not off:
+        return []
+    count = 2 * len(lots)
+    verb = "is" if len(off) == 1 else "are"
+    return [
+        f"{len(off):,} of {count:,} means and deviations of lots {verb} beyond frozen limits, by chance "
+        f"{count / 370:.2g} would be: {_first(off)}."
+    ]
+
+
+def _first(texts: Sequence[str]) -> str:
+    """Return the first texts, and the number of the others."""
+    more = f" and {len(texts) - NAMED:,} more" if len(texts) > NAMED else ""
+    return ", ".join(texts[:NAMED]) + more
 
 
 def _usual(line: LineReport) -> float:

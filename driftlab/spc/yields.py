@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.evaluation.limits import worst
 from driftlab.family.record import UnitRecord, figure_name
 from driftlab.spc.capability import share_beyond
 from fusion_core.chunk import Array
@@ -54,6 +53,7 @@ class YieldGroup:
     odd: int = 0
     reasons: Mapping[str, int] = field(default_factory=dict)  # of what was not accepted, most units first
     undecided: int = 0  # of what was not accepted
+    accepted_odd: int = 0  # accepted, and unlike the others all the same: limits see what they are of
 
     @property
     def share(self) -> float:
@@ -70,6 +70,7 @@ class YieldGroup:
         return {
             "units": self.units, "accepted": self.accepted, "yield": self.share, "yield_95": [*self.interval],
             "odd": self.odd, "reasons": dict(self.reasons), "undecided": self.undecided,
+            "accepted_odd": self.accepted_odd,
         }  # fmt: skip
 
 
@@ -119,13 +120,15 @@ class Yield:
     def sentences(self) -> list[str]:
         """Return the yield and its reasons, and the columns by whose groups it differs."""
         whole = self.whole
+        unlike = f"{whole.accepted_odd:,} of the {whole.accepted:,} accepted units stand out: limits do not see why"
+        more_than_limits = [unlike] if whole.accepted_odd else []
         if not whole.reasons:
-            return []
+            return more_than_limits
         first = ", ".join(f"{reason} ({count:,})" for reason, count in [*whole.reasons.items()][:3])
         more = f" and {len(whole.reasons) - 3:,} more" if len(whole.reasons) > 3 else ""
         open_ = f"; {whole.undecided:,} undecided" if whole.undecided else ""
         yielded = f"yield: {whole.accepted:,} of {whole.units:,} units, {_per_cent(whole)}"
-        lines = [f"{yielded}{open_}; not accepted: {first}{more}"]
+        lines = [f"{yielded}{open_}; not accepted: {first}{more}", *more_than_limits]
         for column, groups in self.by.items():
             if self.differs(column):
                 least, most = (f(groups, key=lambda one: one.share) for f in (min, max))
@@ -182,8 +185,8 @@ def reasons(record: UnitRecord) -> list[str]:
 
 def undecided(record: UnitRecord) -> bool:
     """Return True if a unit is neither accepted nor known to fail: in doubt, or within the guard of a limit."""
-    doubts = [{"verdict": UNDECIDED}] * bool(record.doubts)
-    return record.state == "done" and worst([*record.limits, *doubts]) == UNDECIDED
+    verdicts = {str(row["verdict"]) for row in record.limits}
+    return record.state == "done" and "fail" not in verdicts and (bool(record.doubts) or UNDECIDED in verdicts)
 
 
 def _general(text: str, unit: str) -> str:
@@ -198,9 +201,9 @@ def _group(name: str, judged: Sequence[_Judged]) -> YieldGroup:
     """Return a group of units, of which each has its reasons, and whether it stands out and is undecided."""
     why, odd, left = zip(*judged, strict=True) if judged else ((), (), ())
     counts = Counter(reason for of_unit in why for reason in of_unit)
-    return YieldGroup(
-        name, len(why), sum(not of_unit for of_unit in why), sum(odd), dict(counts.most_common()), sum(left)
-    )
+    both = sum(stands_out and not of_unit for of_unit, stands_out in zip(why, odd, strict=True))
+    accepted = sum(not of_unit for of_unit in why)
+    return YieldGroup(name, len(why), accepted, sum(odd), dict(counts.most_common()), sum(left), both)
 
 
 def _names(records: Sequence[UnitRecord], column: str) -> list[str]:

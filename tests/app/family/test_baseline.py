@@ -24,6 +24,10 @@ def frozen(count, seed, **more):
     return Baseline.model_validate_json(baseline_of(found, LEVEL).model_dump_json())
 
 
+def values_of(record):
+    return {name: figure.value for name, figure in record.figures.items()}
+
+
 def judged(records, baseline, **more):
     return line_of(records, None, levels=levels(records, 99), baseline=baseline, **more)
 
@@ -61,13 +65,42 @@ def test_one_unit_is_enough():
     (good,), (bad,) = line(1, 4), line(1, 4, planted=[("walk", "z", 0, 1, 9)])
     quiet, found = judged([good], base), judged([bad], base)
     assert not alarms(quiet)
-    assert quiet.sentences[0].startswith("None of 18 values of 1 units is beyond frozen limits")
+    assert quiet.sentences[0].startswith("None of 18 values of 1 unit is beyond frozen limits")
     assert "half of the units that are off by" in quiet.sentences[0]
     ((place, reasons),) = alarms(found).items()
     assert place == 0
     texts = [one.text for one in reasons]
     assert any(text.startswith("z T-squared") and "(of it walk" in text for text in texts)
     assert any(text.startswith("z walk 0.1") and "deg/h/sqrt(s), limits" in text for text in texts)
+
+
+def test_limits_of_a_unit_are_the_same_in_whatever_company():
+    """Its own uncertainty and what is frozen make them; others that are judged with it do not."""
+    rng = np.random.default_rng(8)
+    shares = rng.uniform(0.02, 0.4, 120)  # uncertainty of each unit's figures
+    units = [
+        record(k, values_of(one), "L1", share) for k, (one, share) in enumerate(zip(line(120, 5), shares, strict=True))
+    ]
+    base = Baseline.model_validate_json(
+        baseline_of(line_of(units[:100], None, levels=levels(units[:100], 5)), LEVEL).model_dump_json()
+    )
+    alone = [judged([unit], base) for unit in units[100:]]
+    together = judged(units[100:], base)
+    for k, own in enumerate(alone):
+        for chart, of_all in zip(own.controls, together.controls, strict=True):
+            if chart.quantity != "level":
+                assert chart.z[0] == pytest.approx(of_all.z[k], rel=1e-12)
+                assert [one[0] for one in chart.limits] == pytest.approx([one[k] for one in of_all.limits], rel=1e-12)
+
+
+def test_an_ewma_that_came_back_and_an_uneven_lot_are_said():
+    new = line(
+        40, 6, lots=2, planted=[("noise", "x", 5, 12, 2.5), ("walk", "y", 20, 30, 2.5), ("walk", "y", 30, 40, -2.5)]
+    )
+    text = " ".join(judged(new, frozen(150, 3)).sentences)
+    assert "The EWMA left its limits and came back: " in text
+    assert "x noise from 00" in text
+    assert "lot L01 y walk deviation" in text
 
 
 def test_what_goes_together_is_missed_by_single_limits_and_seen_by_t_squared():

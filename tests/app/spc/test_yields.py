@@ -148,3 +148,16 @@ def test_lines_without_a_difference_say_one_in_twenty_times():
 def test_what_all_or_no_unit_does_is_no_difference():
     assert chance([5, 5], [5, 5]) == chance([5, 5], [0, 0]) == chance([10], [4]) == 1.0
     assert chance([100, 100], [100, 0]) == pytest.approx(1e-4)
+
+
+def test_a_unit_in_doubt_of_which_nothing_was_measured_is_undecided():
+    doubted = unit(0, "not measured", "not measured").model_copy(update={"doubts": ("gyro y is stuck",)})
+    assert yields_of([doubted]).whole.undecided == 1
+    failed = unit(0, "not measured", "fail").model_copy(update={"doubts": ("gyro y is stuck",)})
+    assert yields_of([failed]).whole.undecided == 0
+
+
+def test_units_that_limits_accept_and_that_stand_out_are_said():
+    found = yields_of([unit(k) for k in range(4)], odd=["0000", "0001", "0003"])
+    assert found.whole.accepted_odd == found.as_json()["accepted_odd"] == 3
+    assert found.sentences() == ["3 of the 4 accepted units stand out: limits do not see why"]
