@@ -199,7 +199,9 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
             "its sigma being known no better than from these units."
         )
     chance = float(-ndtri(CHANCE / max(len(line.controls), 1)))  # of any of so many charts
-    charts = [c for c in line.controls if c.phi >= max(ALIKE, chance / np.sqrt(len(c.at)))]
+    # what is added to it for its bias scatters as well
+    least = {n: max(ALIKE, chance * (1 + 3 / n) / np.sqrt(n)) for n in {len(c.at) for c in line.controls}}
+    charts = [c for c in line.controls if c.phi >= least[len(c.at)]]
     alike = [f"{_called(c)} {c.phi:.2g}" for c in sorted(charts, key=lambda c: -c.phi)]
     if alike:
         lines.append(
