@@ -236,7 +236,8 @@ def mispredicted(run: ScoredRun) -> list[str]:
 def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:
     """Return a sentence on each rest of a gyro triad that is at another bias, and at no other attitude, than the last.
 
-    Its readings since that rest add up to the angle of a turn, which moves an Earth rate by less than they are off.
+    The sizes of its readings since that rest add up to the largest angle that it may have turned by, which moves an
+    Earth rate by less than the readings of the new rest are off.
     """
     sensor, lines = run.sensor, []
     if not sensor.integral or len(sensor.axes) != AXES:
@@ -249,9 +250,10 @@ def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:
         if before + 2 > stop or np.any(np.diff(t) > GAP * tau):
             continue
         off = columns["rate"][rows] - columns["bias"][rows]
-        angle, rest = float(np.linalg.norm(tau @ off)), slice(len(off) // 2, None)
+        angle = float(tau @ np.linalg.norm(off, axis=1))
+        rest = t[1:] > again.t - run.model.patience.realign_after / 2  # no later than it came to rest
         jump = np.mean(off[rest], axis=0)
-        sigma = np.hypot(columns["bias_sigma"][before], sensor.noise / np.sqrt(np.sum(tau[rest])))
+        sigma = np.hypot(columns["bias_sigma"][stop - 1], sensor.noise / np.sqrt(np.sum(tau[rest])))
         if np.linalg.norm(jump) > EARTH * min(angle, 2.0) + FAR_OFF * np.linalg.norm(sigma):
             k = int(np.argmax(np.abs(jump)))
             when = moment(again.t, run.journal.faults.first_row)

@@ -49,7 +49,7 @@ class FrozenLimits(BaseModel):
     share : float
         Factor of the units' own deviations.
     own : float or None
-        Least own deviation of a unit, in the scale: the middle one of the units that the law is of. None, in files from
+        Least own deviation of a unit, in the scale: the middle one of the units of the line. None, in files from
         before it was frozen: the middle one of those that are judged together.
     tails : TailLaw or None
         Law of one column, the deviations from the centre in sigmas; None where they are taken for normal.

@@ -123,6 +123,7 @@ def _untested(outcomes: Sequence[Outcome]) -> list[str]:
 NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
 UNTESTED = 0.5  # of the updates beyond what an effect was fitted on: more test nothing of it
 MAX_MEANS = 4096  # of a prediction that are compared
+TINY = 1e-200  # of a variance: errors without noise leave no chance
 SURE = 1.645  # deviations: one-sided, 95 %
 
 
@@ -190,9 +191,7 @@ def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
         for k, error in enumerate((e, after)):
             variances[k] += 4 * sum(_variance(own, change) for own, change in zip(error.T, (after - e).T, strict=True))
     before, after = np.sqrt(total / max(rows, 1))
-    sigma, power = (
-        x / float(np.sqrt(v)) if v > 0 else 0.0 for x, v in ((grown, variances[0]), (moved, variances.min()))
-    )
+    sigma, power = (x / float(np.sqrt(max(v, TINY))) for x, v in ((grown, variances[0]), (moved, variances.min())))
     return ErrorChange(float(before), float(after), sigma, power)
 
 
@@ -201,6 +200,8 @@ def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
     if change.confirms or not outcomes:
         return ""
     unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
+    if not any(np.any(np.isfinite(outcome.reference)) for outcome in outcomes):
+        return f"{names}: is nowhere at rest after its alignment, so nothing tests the effects; test by one that is"
     figures = f"{change.before * unit.factor:.3g} -> {change.after * unit.factor:.3g} {unit.shown}"
     if change.worse:
         return (

@@ -27,7 +27,8 @@ RATIOS = np.concatenate([[0.0], np.logspace(-6, 2, 17)])  # of the walk's varian
 SURE = 10.0  # nats beside the choice of the instant: noise and walk alone have them once in 20,000 recordings
 MANY = 30  # samples of a block, whose scatter says how loud it is
 TINY = np.finfo(float).tiny
-EDGE = 3  # blocks at either end of a stretch in which a step is not looked for: white noise of some rows passes for one
+MOST = 4 * BLOCKS  # a recording that is cut into more stretches is not looked at
+EDGE = 3  # blocks at either end of the recording, where white noise of some rows would pass for a step
 
 
 class BiasStep(NamedTuple):
@@ -47,10 +48,11 @@ def bias_steps(t: Array, rate: Array, stretches: Integers) -> list[BiasStep | No
     """Return the likeliest step of each axis of readings `rate` (N, d) at times t (N,) in s; None where none is seen.
 
     `stretches` (S, 2) are first row and end of what can be used; what lies between is not read, and the bias walks on.
+    Where these are more than `MOST`, no step is looked for.
     """
     starts, last = _blocks(stretches)
     n = (last - starts).astype(np.float64)
-    if len(n) < 4 * EDGE:
+    if not 4 * EDGE <= len(n) <= MOST:
         return [None] * rate.shape[1]
     total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate - np.mean(rate, axis=0), axis=0)])
     y = (total[last] - total[starts]) / n[:, None]

@@ -192,7 +192,7 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
-    lines += _came_back(line, out) + _off_lots(line)
+    lines += _came_back(line) + _off_lots(line)
     if counted:  # else the units beyond frozen limits are
         lines.append(
             f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would, "
@@ -213,9 +213,9 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     return lines
 
 
-def _came_back(line: LineReport, out: Sequence[str]) -> list[str]:
-    """Return in a sentence the frozen charts whose EWMA left its limits, but those that are `out` at the end."""
-    charts = [c for c in line.controls if c.of_family and np.any(c.drifting) and _called(c) not in out]
+def _came_back(line: LineReport) -> list[str]:
+    """Return in a sentence the frozen charts whose EWMA left its limits, and is within them at their last unit."""
+    charts = [c for c in line.controls if c.of_family and np.any(c.drifting) and not c.drifting[-1]]
     each = [f"{_called(c)} from {line.units[c.at[_beginnings(c.drifting)[0]]]} on" for c in charts]
     return [f"The EWMA left its limits and came back: {_first(each)}."] if each else []
 

@@ -120,7 +120,8 @@ class Yield:
     def sentences(self) -> list[str]:
         """Return the yield and its reasons, and the columns by whose groups it differs."""
         whole = self.whole
-        unlike = f"{whole.accepted_odd:,} of the {whole.accepted:,} accepted units stand out: limits do not see why"
+        why = "limits do not see why" if self.judged else "no limits are set"
+        unlike = f"{whole.accepted_odd:,} of the {whole.accepted:,} accepted units stand out: {why}"
         more_than_limits = [unlike] if whole.accepted_odd else []
         if not whole.reasons:
             return more_than_limits

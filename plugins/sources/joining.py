@@ -157,7 +157,8 @@ def _readings(chunk: Chunk, name: str) -> Flags:
     """Return the rows (N,) that have a reading of a channel."""
     low, high, _ = RANGES.get(name, (-LARGEST, LARGEST, ""))
     good = (low <= chunk[name]) & (high >= chunk[name])
-    return np.isfinite(chunk.t) & (good if good.ndim == 1 else np.all(good, axis=1))
+    valid = np.all(chunk["valid"].reshape(len(chunk), -1) != 0, axis=1) if "valid" in chunk.channels else True
+    return np.isfinite(chunk.t) & (good if good.ndim == 1 else np.all(good, axis=1)) & valid
 
 
 def _head(stream: Iterator[Chunk]) -> list[Chunk]:
@@ -273,15 +274,19 @@ class _Waiting:
     def take(self, stop: int) -> Chunk:
         """Return the first rows that are held, filled, but for those of a stream's reading and nothing else.
 
-        Where sensors have rows of their own, a row without a number is one of a sensor that nobody asked for.
+        Where sensors have rows of their own, a row without a number is taken for one of a sensor that nobody asked for.
         """
         rows = concatenate(self.held)
         self.held = [rest] if len(rest := rows.part(stop, len(rows))) else []
         filled = {stream.name: stream.filled(rows, stop) for stream in self.streams}
-        rows = rows.part(0, stop)
-        others = [v.reshape(len(rows), -1) for name, v in rows.channels.items() if name not in filled]
-        read = np.any([stream.apart | _readings(rows, stream.name) for stream in self.streams], axis=0)
-        alone = read & np.all(np.isnan(np.hstack(others)), axis=1) if others else np.zeros(stop, dtype=bool)
+        rows, known = rows.part(0, stop), {*filled, "valid"}
+        others = [v.reshape(len(rows), -1) for name, v in rows.channels.items() if name not in known]
+        read = np.any([_readings(rows, stream.name) for stream in self.streams], axis=0)
+        apart = read | any(stream.apart for stream in self.streams)
+        alone = apart & np.all(np.isnan(np.hstack(others)), axis=1) if others else np.zeros(stop, dtype=bool)
+        if count := int(np.sum(alone & ~read)):
+            faults, first = self.streams[0].faults, float(rows.t[np.argmax(alone & ~read)])
+            faults.add("rows without a number, taken for those of other sensors", count, f"at {faults.when(first)}")
         return rows.having(**filled).where(~alone)
 
     def rest(self) -> Iterator[Chunk]:

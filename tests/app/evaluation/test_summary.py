@@ -153,6 +153,16 @@ def test_a_yaw_turn_moves_the_earth_rate():
     assert rested_anew(rate, 1e-7)
 
 
+def test_motion_before_the_new_rest_is_no_jump_and_turns_that_undo_each_other_are_turns():
+    rate = np.zeros((100, 3))
+    rate[40:45, 2], rate[60:65, 2] = np.pi / 10, -np.pi / 10  # there and back, then at rest
+    assert rested_anew(rate, 1e-7) == []
+    for k, axis in enumerate((0, 1, 0, 1)):  # four quarter turns that add up to nothing, and leave it turned by 120 deg
+        rate[40 + k, axis] = np.pi / 2 * (1 if k < 2 else -1)
+    rate[65:, 1] = 7e-5
+    assert rested_anew(rate, 1e-7) == []
+
+
 def test_readings_that_are_missing_may_hold_a_turn():
     rate = np.zeros((100, 3))
     rate[40:] = [0.0, 1e-3, 0.0]

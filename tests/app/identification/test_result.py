@@ -44,6 +44,17 @@ def test_an_effect_that_is_not_there_is_refuted():
     assert change_of([outcome(0.1 * e, 3 * s), outcome(0.1 * e, 3 * s)]).worse
 
 
+def test_errors_without_noise_leave_no_chance():
+    s = np.sin(np.arange(300.0))[:, None]
+    assert change_of([outcome(-s, s)]).confirms
+    assert change_of([outcome(0 * s, s)]).worse
+
+
+def test_a_test_that_is_nowhere_at_rest_is_said_to_be_none():
+    moving = Outcome(**{**vars(outcome(np.ones((9, 1)), np.ones((9, 1)))), "reference": np.full((9, 1), np.nan)})
+    assert "is nowhere at rest" in sentence(change_of([moving]), [moving])
+
+
 def test_what_changes_nothing_is_neither_refuted_nor_tested():
     e, s = drawn(1, slow=True)
     change = change_of([outcome(e, 0 * s)])

@@ -66,3 +66,8 @@ def test_a_step_across_a_gap_is_a_step_of_what_is_used():
 
 def test_too_short_a_recording_has_none():
     assert bias_steps(T[:8], np.ones((8, 2)), np.array([[0, 8]])) == [None, None]
+
+
+def test_thousands_of_stretches_are_not_looked_at():
+    rows = np.arange(0, 24_000, 12)
+    assert bias_steps(T, np.ones((N, 1)), np.stack([rows, rows + 10], axis=1)) == [None]

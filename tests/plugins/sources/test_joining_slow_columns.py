@@ -148,3 +148,26 @@ def test_no_row_of_a_loggers_text_is_lost(tmp_path, separator, empty, apart):
     inner = slice(apart - 1, ROWS - apart)
     for name in ("accel", "temperature", "voltage"):
         np.testing.assert_allclose(got[name][inner], unit()[name][inner], atol=1e-6)
+
+
+def test_rows_of_a_thermometer_alone_are_none_also_beside_a_column_that_says_what_is_valid():
+    """A reading that is marked as not valid is none."""
+    rows, alone = unit(), every(10, 4)
+    cells = {name: only(rows[name], ~alone) for name in ("gyro", "accel", "voltage")}
+    cells |= {"temperature": only(rows["temperature"], alone), "valid": np.ones(ROWS)}
+    cells["temperature"][1004], cells["valid"][1004] = 90.0, 0.0
+    faults = Faults()
+    found = concatenate(list(bridged(chunks(rows.having(**cells), 1000), 1000, faults)))
+    np.testing.assert_array_equal(found.t, rows.t[~alone])
+    np.testing.assert_allclose(found["temperature"], rows["temperature"][~alone], atol=0.3)
+
+
+def test_rows_without_a_number_are_counted():
+    rows, alone, lost = unit(), every(10, 4), np.arange(ROWS) // 50 == 33
+    cells = {name: only(rows[name], ~alone & ~lost) for name in ("gyro", "accel", "voltage")}
+    faults = Faults()
+    table = rows.having(**cells, temperature=only(rows["temperature"], alone))
+    found = concatenate(list(bridged(chunks(table, 1000), 1000, faults)))
+    assert len(found) == np.sum(~alone & ~lost)
+    (count,) = (fault.count for what, fault in faults.found.items() if what.startswith("rows without a number"))
+    assert count == np.sum(lost & ~alone)
