@@ -224,13 +224,18 @@ def vehicle(
         result = _exported(product, exporter, sensors, folder)
         if out is None:
             return result
-        for one in result.sensors:
-            if one.result is not None:
-                save(one.result.map, folder / one.file, COMMAND)
-        write_json(folder / "vehicle.json", result.summary)
-        (folder / PAGE).write_text(_page(result, names, folder), encoding="utf-8")
+        _write(result, names, folder)
         files = sorted(path.name for path in folder.iterdir() if path.suffix in (".json", ".html", exporter.suffix))
     return replace(result, written=tuple(Path(out) / name for name in files))
+
+
+def _write(result: VehicleResult, names: Sequence[str], folder: Path) -> None:
+    """Write maps, summary and page."""
+    for one in result.sensors:
+        if one.result is not None:
+            save(one.result.map, folder / one.file, COMMAND)
+    write_json(folder / "vehicle.json", result.summary)
+    (folder / PAGE).write_text(_page(result, names, folder), encoding="utf-8")
 
 
 def _fitted(
