@@ -85,6 +85,11 @@ def axis_name(channel: str, axis: str) -> str:
     return channel if axis == axis_of(channel) else f"{channel} {axis}"
 
 
+def units(count: int) -> str:
+    """Return a number of units, in words."""
+    return "1 unit" if count == 1 else f"{count:,} units"
+
+
 def number(value: float, *, zeros: bool = False, missing: str = "") -> str:
     """Return a value with three digits, from 1000 on without decimals.
 

@@ -23,10 +23,8 @@ COMPLETE = 0.9  # of the time: a score that stands on less says why
 FAR_OFF = 4.0  # deviations of a prediction: a right model is off by more in one axis of 10,000
 CHANCE = 1e-3  # probability that innovations of a right model are said to add up
 SMALL = 1.3  # times that a deviation of the bias is too small: with less nothing is said
-AXES, GAP = (
-    3,
-    1.5,
-)  # of a gyro whose turns are seen; epochs further apart than so many times their length: they may not be
+AXES = 3  # of a gyro whose turns are seen
+GAP = 1.5  # times the length of an epoch between two: the unit may have been turned unseen
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
 Rows = Sequence[tuple[str, list[Array]]]  # of a table: a label, and for each run the errors (d,) in SI
 
@@ -244,7 +242,8 @@ def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:
         return []
     for again in run.journal.alignments[1:]:
         stop = int(np.searchsorted(columns["t"], again.t, side="right"))
-        before = int(np.flatnonzero(columns["used"][:stop])[-1]) if np.any(columns["used"][:stop]) else stop
+        used = np.flatnonzero(columns["used"][:stop])
+        before = int(used[-1]) if len(used) else stop
         rows = slice(before + 1, stop)
         t, tau = columns["t"][before:stop], columns["tau"][rows]
         if before + 2 > stop or np.any(np.diff(t) > GAP * tau):

@@ -26,12 +26,12 @@ from driftlab.family.shared_effects import SharedEffects, find_common, sentences
 from driftlab.family.terms import fit_terms
 from driftlab.family.thermometers import with_odd_thermometers
 from driftlab.production.summary import FleetProgress, Stage
-from driftlab.production.summary import units as counted
 from driftlab.production.units_pass import FleetStatus
 from driftlab.recordings.identity import sha256
 from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import baseline_of, line_of, reconcile
 from driftlab.units import BiasUnit, tracked_unit
+from driftlab.units import units as counted
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, quote
 

@@ -20,7 +20,7 @@ from driftlab.production.unit_terms import sentence_of
 from driftlab.spc.acknowledgements import Acknowledgement
 from driftlab.spc.gauge_study import GaugeStudy
 from driftlab.spc.yields import Yield
-from driftlab.units import duration
+from driftlab.units import duration, units
 from fusion_core.escaping import line
 
 
@@ -222,11 +222,6 @@ class FleetSummary(BaseModel):
                 "are kept; --force drops them"
             )
         return lines
-
-
-def units(count: int) -> str:
-    """Return a number of units, in words."""
-    return "1 unit" if count == 1 else f"{count:,} units"
 
 
 def some(names: Sequence[str]) -> str:

@@ -296,12 +296,11 @@ def _lots(
     names: NDArray[np.str_], x: Array, sigma: Array, law: InControl, scale: ChartScale, known: FrozenLimits | None
 ) -> tuple[LotPoint, ...]:
     """Return the points of lots; where tails are known, limits of a deviation are those of its normal scores."""
-    off, frozen = x - law.centre, None if known is None else float(np.median(sigma))
-    scores = off if known is None else known.scores(off / sigma) * sigma
-    points = []
-    for (name, of_lot), (_, spread) in zip(
-        lots_of(names, off, sigma, frozen), lots_of(names, scores, sigma, frozen), strict=True
-    ):
+    off, points = x - law.centre, []
+    found = spreads = lots_of(names, off, sigma, None if known is None else float(np.median(sigma)))
+    if known is not None and known.tails is not None:
+        spreads = lots_of(names, known.scores(off / sigma) * sigma, sigma, float(np.median(sigma)))
+    for (name, of_lot), (_, spread) in zip(found, spreads, strict=True):
         of_lot[5:] = spread[5:] * (of_lot[4] / spread[4] if spread[4] > 0 else 1.0)
         mean, low, high = scale.back(law.centre + of_lot[1:4]).tolist()
         out = bool(not of_lot[2] <= of_lot[1] <= of_lot[3])

@@ -12,7 +12,7 @@ from driftlab.family.record import FIGURES, figure_name
 from driftlab.spc.acknowledgements import Alarm
 from driftlab.spc.capability import WORTH
 from driftlab.spc.charts import LEVEL, MIN_UNITS, SIGMAS
-from driftlab.units import number
+from driftlab.units import number, units
 
 if TYPE_CHECKING:
     from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
@@ -30,10 +30,10 @@ def sentences(line: LineReport) -> list[str]:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         off = f"Off as a whole: lot {', '.join(lots)}. Beside that no" if lots else "No"
         within = "within these" if judged else "in"
-        lines = [f"{off} change of the line {within} {_units(len(line.units))}, {line.order}."]
+        lines = [f"{off} change of the line {within} {units(len(line.units))}, {line.order}."]
     if any(chart.rules for chart in line.controls):
         places = sorted({int(k) for c in line.controls for f in c.patterns.values() for k in c.at[_beginnings(f)]})
-        which = f"at {_units(len(places))}: {_names(line, places)}" if places else "at no unit"
+        which = f"at {units(len(places))}: {_names(line, places)}" if places else "at no unit"
         lines.append(f"Run rules begin to alarm {which}.")
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
@@ -112,7 +112,7 @@ def _against_baseline(line: LineReport) -> list[str]:
         usual = sum(len(at) for at, _ in charts) / 370
         chance = f"of a line in control {usual:.2g} to {MANY * usual:.2g} would be by chance, of {len(charts)} charts"
         verb = "is" if len(places) == 1 else "are"
-        return [f"{len(places):,} of {_units(len(line.units))} {verb} beyond {by}: {names}; {chance}.", *beside]
+        return [f"{len(places):,} of {units(len(line.units))} {verb} beyond {by}: {names}; {chance}.", *beside]
     moved = ", ".join(_called(chart) for chart in frozen if chart.drifting[-1])
     if moved:
         single = f"No single unit of {len(line.units):,} is beyond {by}"
@@ -122,11 +122,7 @@ def _against_baseline(line: LineReport) -> list[str]:
     reach = max(float(np.max(np.abs(law.deviations(ends)))) for law in laws)
     seen = f"half of the units that are off by {reach:.2g} deviations in one figure, the widest limit, would be seen"
     count = sum(len(chart.at) for chart in frozen)
-    return [f"None of {count:,} values of {_units(len(line.units))} is beyond {by}; {seen}.", *beside]
-
-
-def _units(count: int) -> str:
-    return "1 unit" if count == 1 else f"{count:,} units"
+    return [f"None of {count:,} values of {units(len(line.units))} is beyond {by}; {seen}.", *beside]
 
 
 def _names(line: LineReport, places: list[int]) -> str:
@@ -187,8 +183,7 @@ def _now(line: LineReport, *, counted: bool) -> list[str]:
     """Return the present state; `counted`: with the number of values beyond three sigma."""
     from scipy.special import ndtri
 
-    last = len(line.units) - 10
-    out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= last]
+    out = [_called(c) for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
     values = sum(len(chart.at) for chart in line.controls)
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     lines = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
