@@ -18,6 +18,7 @@ from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.fast import compiled
 
 Size = tuple[float, ...]
+Lanes = tuple[float, ...]  # a number of each of several groups
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,15 @@ class IndependentGroups:
     m: int
 
     @cached_property
-    def size(self) -> tuple[Size, Size, Size]:
-        """Zeros, as many as a group has states and components, and as there are groups: sizes the compiler knows."""
-        return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1], (0.0,) * len(self.states)
+    def size(self) -> tuple[Size, Size]:
+        """Zeros, as many as a group has states, and components: sizes the compiler knows."""
+        return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1]
+
+    def side_by_side(self, most: int) -> tuple[Lanes, ...]:
+        """Zeros for the states of several groups, as many as divide their number and have at most so many states."""
+        G, s = self.states.shape
+        widest = max(W for W in range(1, G + 1) if G % W == 0 and s * W <= max(most, s))
+        return tuple([(0.0,) * widest] * s)
 
     @cached_property
     def ordered(self) -> bool:
@@ -62,7 +69,8 @@ class IndependentGroups:
 
     def whole(self, blocks: Array) -> Array:
         """Return the matrices (..., n, n) over all states from the blocks (..., G, s, s) of the groups."""
-        wide = np.zeros((*blocks.shape[:-3], self.n + 1, self.n + 1))
+        n = self.n if self.even else self.n + 1
+        wide = np.zeros((*blocks.shape[:-3], n, n))
         wide[..., self.states[:, :, None], self.states[:, None, :]] = blocks
         return wide[..., : self.n, : self.n]
 

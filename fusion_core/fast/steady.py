@@ -10,7 +10,7 @@ Until then the recursion of P is run alone, once for all groups of states that a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -89,7 +89,13 @@ class Gains:
         """Return the gains of the first N steps."""
         return self if len(self.P) == 1 else Gains(self.kind, self.P[:N], self.K[:N], self.root[:N], self.log_det[:N])
 
-    @property
+    @cached_property
+    def lanes(self) -> tuple[Array, Array]:
+        """K (N, c, s, G) and root (N, c, G) of all groups."""
+        K, root = self.K[:, self.kind], self.root[:, self.kind]
+        return np.ascontiguousarray(K.transpose(0, 2, 3, 1)), np.ascontiguousarray(root.transpose(0, 2, 1))
+
+    @cached_property
     def last(self) -> Array:
         """Covariances (G, s, s) of the groups after the last step."""
         return np.ascontiguousarray(self.P[-1, self.kind])
@@ -109,6 +115,8 @@ class Invariant:
     F, Q : (G, s, s) arrays
     H : (G, c, s) array
     r : (G, c) array
+    F_lanes, minus_H_lanes : (s, s, G), (c, s, G) arrays
+        F and -H of all groups side by side.
     steady : Gains or None
         Those that stay; None where P never settles.
     """
@@ -118,6 +126,7 @@ class Invariant:
         states, rows = groups.states, groups.rows
         self.F, self.Q = groups.blocks(F, states, states), groups.blocks(Q, states, states)
         self.H, self.r = groups.blocks(H, rows, states), np.append(r, 1.0)[rows]
+        self.F_lanes, self.minus_H_lanes = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in (self.F, -self.H))
         self.steady = self._steady()
         self._transient = lru_cache(MAX_TRANSIENTS)(self._from)
 
@@ -136,7 +145,9 @@ class Invariant:
     def gains_from(self, P: Array, N: int) -> tuple[Gains, int]:
         """Return gains from covariances P (G, s, s) on, and for how many steps: N, unless they still change."""
         if self.steady is not None:
-            limit = self.steady.P[0, self.steady.kind]
+            limit = self.steady.last
+            if limit.tobytes() == P.tobytes():  # of a stretch that goes on
+                return self.steady, N
             sigma = np.sqrt(np.diagonal(limit, axis1=1, axis2=2))
             if np.all(np.abs(P - limit) <= SETTLED * sigma[:, :, None] * sigma[:, None, :]):
                 return self.steady, N

@@ -389,6 +389,20 @@ def test_groups_of_different_size_equal_the_textbook(method):
     assert_same(ours, plain, 1e-8)
 
 
+@pytest.mark.parametrize(("s", "m", "G"), [(1, 1, 13), (2, 2, 12), (3, 2, 9), (6, 3, 2), (8, 2, 3)])
+def test_groups_side_by_side_equal_the_textbook(s, m, G):
+    """More groups than one instruction has, more states than its registers, and two kinds of groups among them."""
+    rng, N = np.random.default_rng(s), 300
+    kinds = [0.97 * np.linalg.qr(rng.normal(size=(s, s)))[0] for _ in range(2)]
+    F = scipy.linalg.block_diag(*(kinds[g % 2] for g in range(G)))
+    H = scipy.linalg.block_diag(*[rng.normal(size=(m, s))] * G)
+    P0, Q, R = np.eye(s * G), 0.01 * np.eye(s * G), np.diag(np.tile(rng.uniform(0.5, 2.0, m), G))
+    u, z = simulate(F, Q, H, R, P0, N, rng)
+    args = State(np.zeros(s * G), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(N, bool))
+    ours, plain = (estimate(*args, method=method, keep_P=True) for method in ("steady", "plain"))
+    assert_same(ours, plain, 1e-8)
+
+
 def test_expected_states_are_the_recursion_without_measurements():
     transition, _ = random_model(np.random.default_rng(10), N=50, n=3, m=1)
     x = np.ones(3)
