@@ -219,7 +219,7 @@ class _Levels(_Readings):
     def __init__(self, means: Array, count: Array, offset: float, steps: Steps) -> None:
         self.size, self.offset = steps.size, offset
         self.sharp = max(steps.noise, HARDLY * steps.size)
-        place = (means - self.offset) / steps.size
+        place = np.round((means - self.offset) / steps.size, 9)  # equal readings lie on a level but for rounding
         below = np.floor(place)
         self.middle = self.offset + below * steps.size
         count = np.maximum(count * min(steps.noise / self.sharp, 1.0), 1.0)
@@ -228,11 +228,13 @@ class _Levels(_Readings):
     def of(self, T: Array) -> tuple[float, Array, Array]:
         """Return -log P of all readings at T (K,), with its first and second derivatives (K,)."""
         total, slope, bend = 0.0, np.zeros(len(T)), np.zeros(len(T))
-        for k, weight in enumerate(self.weights):
-            value, first, second = self._of_level(T, self.middle + k * self.size)
-            total += float(np.sum(weight * value))
-            slope = slope + weight * first
-            bend = bend + weight * second
+        for k, weights in enumerate(self.weights):
+            shown = np.flatnonzero(weights)  # most groups show one level alone
+            weight = weights[shown]
+            value, first, second = self._of_level(T[shown], self.middle[shown] + k * self.size)
+            total += float(weight @ value)
+            slope[shown] += weight * first
+            bend[shown] += weight * second
         return total, slope, bend
 
     def _of_level(self, T: Array, middle: Array) -> tuple[Array, Array, Array]:
