@@ -28,7 +28,7 @@ from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_doubts
 from driftlab.recordings.prefetch import prefetch
 from driftlab.units import BiasUnit, unit_of
-from fusion_core.chunk import Array, Flags
+from fusion_core.chunk import Array, Flags, read_only
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor, ThermalBias
 from fusion_core.fast import compiled
@@ -111,7 +111,8 @@ class OverviewAccumulator:
     def _gather(self) -> None:
         """Look at the block that has come together, and at those that waited for it."""
         names = [name for name in self.names if self._parts and name in self._parts[0]]
-        block = {n: rows.astype(np.float64, copy=False) for n, rows in _joined(self._parts, names).items()}
+        joined = _joined(self._parts, names).items()
+        block = {n: read_only(rows.astype(np.float64, copy=False)) for n, rows in joined}  # compiled once: of one kind
         self._parts, self._pending = [], 0
         if block:
             self._waiting.append(block)

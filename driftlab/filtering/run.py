@@ -100,7 +100,7 @@ class Run:
                 f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
             )
         stream = epochs(read(self.config, self.journal.faults), self.model.update_interval)
-        return self._segments(self._prepared(stream), prefetch)
+        return self._segments(self._prepared(_last_two_joined(stream)), prefetch)
 
     def over(self, stream: Iterable[Chunk]) -> Generator[RunSegment]:
         """Yield the stretches of a stream of epochs."""
@@ -237,6 +237,17 @@ class Run:
             f"looked at{left_out}); use a longer recording, set filter.align lower, or check "
             f"{self.model.tracked.section}.noise and the units"
         )
+
+
+def _last_two_joined(chunks: Iterable[Chunk]) -> Generator[Chunk]:
+    """Yield the chunks of a recording, the last two as one: its last epoch is over where it ends, and comes alone."""
+    held: list[Chunk] = []
+    for chunk in chunks:
+        if len(held) == 2:
+            yield held.pop(0)
+        held.append(chunk)
+    if held:
+        yield concatenate(held)
 
 
 class FirstRest:

@@ -9,7 +9,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
 from fusion_core.checks import all_finite
-from fusion_core.chunk import Array, Chunk, Flags, concatenate
+from fusion_core.chunk import Array, Chunk, Flags, concatenate, read_only
 from fusion_core.contracts import FileSource, Sensor
 from fusion_core.contracts.table import DERIVED, USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -83,7 +83,8 @@ class _Screen:
                 self.roundings[name] = Rounding(name, sensor, d)
             self.roundings[name].look(chunk)
             before, self.runs[name], table = self.runs[name], np.empty(d), self.rails[name].table
-            if not self.look(chunk[name], _value_before(chunk, name), before, self.runs[name], limit, table):
+            last = read_only(_value_before(chunk, name))
+            if not self.look(chunk[name], last, before, self.runs[name], limit, table):
                 continue
             repeats = _repeats(chunk, name, before)
             for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):

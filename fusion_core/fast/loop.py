@@ -361,23 +361,22 @@ def single(
 
 
 @compiled
-def gains(N: int, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Array, Array, Array, Array]:
+def gains(N: int, s: Size, P: Array, F: Array, Q: Array, H: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Run the covariance alone over N steps, from P (D, s, s); F, Q (D, s, s), H (D, c, s), r (D, c) stay the same.
 
     Returned are P after each step (N, D, s, s), the gain of each scalar update (N, D, c, s), one over the deviation of
     its innovation (N, D, c), and log_det (N, D).
     """
-    s = P.shape[2]
-    nothing, p, w, q = np.zeros(s), np.empty(s), np.empty(s), np.empty(s)
-    x, u, log_det = np.zeros(s), np.zeros(s), np.zeros((N, len(P)))
+    nothing, p, w, q = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s)), np.empty(len(s))
+    x, u, log_det = np.zeros(len(s)), np.zeros(len(s)), np.zeros((N, len(P)))
     all_P, all_K, root = np.empty((N, *P.shape)), np.empty((N, *H.shape)), np.empty((N, *r.shape))
     for k in range(N):
         for g in range(len(P)):
             before, after = P[g] if k == 0 else all_P[k - 1, g], all_P[k, g]
-            predict(x, nothing, before, F[g], F[g], Q[g], u, x, after, w, None)
+            predict(s, nothing, before, F[g], F[g], Q[g], u, x, after, w, None)
             for i in range(H.shape[1]):
-                inverse = correct(x, x, after, H[g, i], r[g, i], 0.0, p, q, None)[1]
-                for j in range(s):
+                inverse = correct(s, x, after, H[g, i], r[g, i], 0.0, p, q, None)[1]
+                for j in range(len(s)):
                     all_K[k, g, i, j] = p[j] * inverse
                 root[k, g, i] = np.sqrt(inverse)
                 log_det[k, g] -= np.log(inverse)

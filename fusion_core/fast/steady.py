@@ -165,7 +165,7 @@ class Invariant:
         first: dict[bytes, int] = {}  # group of each kind
         alike = [first.setdefault(b"".join(a[g].tobytes() for a in parts), g) for g in range(len(P))]
         leaders = list(first.values())
-        P, K, root, log_det = gains(N, P[leaders], *(a[leaders] for a in parts[:-1]))
+        P, K, root, log_det = gains(N, self.groups.size[0], P[leaders], *(a[leaders] for a in parts[:-1]))
         kind = np.searchsorted(leaders, alike)
         return Gains(kind, P, K, root, log_det @ np.bincount(kind).astype(np.float64))
 
