@@ -11,8 +11,8 @@ way                  when                                        factor    price
 `groups`             always, under `loop` and `lanes`            7         a look for zeros in F and Q, a tenth of the
                                                                            time where they vary
 `factored`           P is over 1e12 times R                      0.5       NumPy, for the samples until P is narrow
-`steady` + `lanes`   F, Q, H, R the same at every sample, all    8 to 14   a compilation for each size of group and for as
-                     measured                                    on loop   many side by side; states as lanes
+`steady` + `lanes`   F, Q, H, R the same at every sample, all    8 to 14   a compilation for each size and number of
+                     measured                                    on loop   groups side by side; states as lanes
 ===================  ==========================================  ========  =============================================
 
 Measured with 12 states in six groups, 6 components (`benchmarks/methods.py`). `job` switches within a call.
