@@ -80,11 +80,13 @@ def analyse(
     known: Path | None,
     progress: FleetProgress,
     rules: str | None = None,
+    by: Sequence[str] = (),
 ) -> FamilyAnalysis:
     """Fit the family of the units that are done, or compare them with one that is `known`.
 
-    `units` are the sound ones of the status, `rules` run rules of the line's charts. Those that are `doubted` are held
-    against the family as new units: their recordings may be of something else.
+    `units` are the sound ones of the status, `rules` run rules of the line's charts, `by` columns by whose groups its
+    figures may differ. Those that are `doubted` are held against the family as new units: their recordings may be of
+    something else.
 
     Raises
     ------
@@ -100,7 +102,7 @@ def analyse(
     progress(Stage("what the line did"))
     levels = None if family is None else _levels(family, apart)
     before = None if known is None or family is None else family.baseline
-    line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules)
+    line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules, by=by)
     if family is None:
         odd, lines = _doubted(doubted, status, None, common, unit)
         return FamilyAnalysis(None, common, odd, line, [*([f"no family: {why}"] if why else []), *lines])

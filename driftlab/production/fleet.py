@@ -267,7 +267,9 @@ class _Command:
                 stored(some.units, [record.lot for record in some]) if len(some) < len(status.records) else whole
                 for some in (status.doubted, status.sound)
             )
-            learned = partial(analyse, units, doubted, status, self.config, options.family, progress, options.rules)
+            learned = partial(
+                analyse, units, doubted, status, self.config, options.family, progress, options.rules, options.by
+            )
             analysis = self._timed("family", learned)
             odd = analysis.reasons
             self._tell(odd)
@@ -306,6 +308,7 @@ class _Command:
                 row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability
             ],
             charts=[chart.as_json(line) for chart in line.controls],
+            differences=[one.as_json(line.shown(one.quantity).si) for one in line.differences],
         )  # fmt: skip
 
     def _acknowledged(self, analysis: FamilyAnalysis) -> tuple[dict[str, Acknowledgement], dict[str, list[Alarm]]]:

@@ -102,7 +102,8 @@ class FamilySummary(BaseModel):
 
     `alarms` are why units are out of control, by frozen limits and run rules; `acknowledged` has the notes on units
     whose alarms are all known, `open` the units with others, odd ones among both; `without_alarm` are units with a note
-    on nothing. `capability` has the indices, `charts` limits, changes and lots of each chart.
+    on nothing. `capability` has the indices, `charts` limits, changes and lots of each chart,
+    `differences` the figures that differ between groups of units.
     """
 
     units: int
@@ -116,6 +117,7 @@ class FamilySummary(BaseModel):
     without_alarm: Annotated[list[str], Field(exclude=True)] = []
     capability: list[dict[str, Any]] = []
     charts: list[dict[str, Any]] = []
+    differences: list[dict[str, Any]] = []
     judged: bool = True
 
     def sentences(self) -> list[str]:

@@ -34,7 +34,7 @@ from driftlab.production.unit import STIMULUS, Task, UnitResult, certificate_of,
 from driftlab.production.unit_folders import PAGE_FILE, UnitFolders
 from driftlab.production.workers import Pool, WorkerLost, Workers
 from driftlab.reports.provenance import sheet_of
-from driftlab.spc.yields import COLUMNS
+from driftlab.spc.stratification import COLUMNS
 from fusion_core.errors import ConfigError, FusionError, quote
 from fusion_core.host.provenance import participants
 

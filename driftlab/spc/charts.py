@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from driftlab.family.baseline import Baseline, FrozenLimits, ScaleName
 from driftlab.family.record import PER
 from driftlab.spc.capability import D2, Capability
+from driftlab.spc.stratification import GroupDifference
 from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
@@ -260,6 +261,8 @@ class LineReport:
         Frozen limits on which the charts stand.
     partial : int
         Units that were soaked over less than the range of the baseline: neither swing nor prediction is charted.
+    differences : tuple of GroupDifference
+        Figures that differ between the groups of a column of the units' table.
     sentences : tuple of str
         Changes, the present state, and the limits, in words.
     """
@@ -277,6 +280,7 @@ class LineReport:
     multivariate: tuple[TSquaredChart, ...] = ()
     baseline: Baseline | None = None
     partial: int = 0
+    differences: tuple[GroupDifference, ...] = ()
     sentences: tuple[str, ...] = ()
 
     def shown(self, quantity: str) -> BiasUnit:

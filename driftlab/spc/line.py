@@ -12,7 +12,7 @@ Changes of the line that an odd lot explains, and odd lots that a change of the 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -45,6 +45,7 @@ from driftlab.spc.charts import (
 )
 from driftlab.spc.run_rules import RULES
 from driftlab.spc.sentences import sentences
+from driftlab.spc.stratification import differences, strata_of
 from driftlab.spc.subgroups import LotPoint, lots_of
 from driftlab.units import BiasUnit, default_unit
 from fusion_core.chunk import Array
@@ -56,7 +57,7 @@ OF_THE_RANGE = ("swing", "coast")  # figures that a soak over a part of the rang
 
 def line_of(
     records: Sequence[UnitRecord], limits: Limits | None, *, unit: BiasUnit | None = None,
-    levels: Array | None = None, baseline: Baseline | None = None, rules: str | None = None,
+    levels: Array | None = None, baseline: Baseline | None = None, rules: str | None = None, by: Iterable[str] = (),
 ) -> LineReport:  # fmt: skip
     """Return the report of a line.
 
@@ -74,6 +75,8 @@ def line_of(
         Frozen laws, on which the limits of their quantities then stand, also of one unit.
     rules : str, optional
         Run rules beside three sigma, one of `driftlab.spc.run_rules.RULES`.
+    by : iterable of str
+        Columns by whose groups figures may differ, beside the manifest's own (`driftlab.spc.stratification`).
     """
     done = _done(records)
     line, place = _ordered(done, unit)
@@ -91,7 +94,8 @@ def line_of(
     )  # fmt: skip
     too_few = tuple(f"{axis} {figure_name(name)}" for (name, axis), there in enough.items() if not there)
     line = replace(line, controls=controls, capability=_capability(controls, limits), too_few=too_few)
-    line = replace(line, multivariate=_multivariate(line))
+    strata = {column: [names[k] for k in place] for column, names in strata_of(done, by).items()}
+    line = replace(line, multivariate=_multivariate(line), differences=differences(line, strata))
     return replace(line, sentences=tuple(sentences(line)))
 
 

@@ -38,7 +38,7 @@ def sentences(line: LineReport) -> list[str]:
     if line.partial:
         soaked = "unit was" if line.partial == 1 else "units were"
         lines.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
-    return [*judged, *lines, *_now(line, counted=not judged), *_limits(line)]
+    return [*judged, *lines, *_differences(line), *_now(line, counted=not judged), *_limits(line)]
 
 
 def in_tables(line: LineReport) -> set[str]:
@@ -228,6 +228,19 @@ def _off_lots(line: LineReport) -> list[str]:
         f"{len(off):,} of {count:,} means and deviations of lots {verb} beyond frozen limits, by chance "
         f"{count / 370:.2g} would be: {_first(off)}."
     ]
+
+
+def _differences(line: LineReport) -> list[str]:
+    """Return the figures that differ between groups of units, the least probable first."""
+    lines = []
+    for one in sorted(line.differences, key=lambda one: one.p):
+        unit = line.shown(one.quantity)
+        value, others = (f"{number(x * unit.factor)} {unit.shown}" for x in (one.value, one.others))
+        lines.append(
+            f"{figure_name(one.quantity).capitalize()} of {one.axis} differs by {one.column} (p = {one.p:.1g}): in the "
+            f"middle {value} of the {units(one.units)} of {one.group}, {others} of the others."
+        )
+    return lines
 
 
 def _first(texts: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Any
@@ -19,25 +19,13 @@ import numpy as np
 
 from driftlab.family.record import UnitRecord, figure_name
 from driftlab.spc.capability import share_beyond
-from fusion_core.chunk import Array
+from driftlab.spc.stratification import groups_of
 from fusion_core.faults import in_doubt
 
-COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
-    "lot": lambda record: record.lot,
-    "date": lambda record: record.date[:10],
-    "channel": lambda record: record.channel,
-    "driftlab": lambda record: record.driftlab,
-    "T_low": lambda record: f"{record.domain[0]:g}" if record.domain else "",
-    "T_high": lambda record: f"{record.domain[1]:g}" if record.domain else "",
-    "hours": lambda record: f"{record.hours:g}" if record.hours else "",
-}
-"""Columns of the units' table by which a yield is grouped, beside those of the manifest itself."""
-UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of the columns above
+UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of columns
 UNDECIDED = "undecided"
 SAID = {"fail": "above limit", UNDECIDED: "undecided", "not measured": "not measured"}
 _Judged = tuple[list[str], bool, bool]  # reasons of a unit, whether it stands out, and whether it is undecided
-NO_VALUE = "not known"
-CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
 DRAWS = 9999  # permutations
 CELLS = 10_000_000  # groups of all draws
 ALPHA = 0.05  # chance, over all columns, that a yield is said to differ where it does not
@@ -160,7 +148,7 @@ def yields_of(records: Sequence[UnitRecord], odd: Collection[str] = (), by: Iter
     groups: dict[str, tuple[YieldGroup, ...]] = {}
     for column in dict.fromkeys(by):
         parts = dict[str, list[_Judged]]()
-        for name, of_unit in zip(_names(records, column), judged, strict=True):
+        for name, of_unit in zip(groups_of(records, column), judged, strict=True):
             parts.setdefault(name, []).append(of_unit)
         groups[column] = tuple(_group(name, part) for name, part in parts.items())
     p = {
@@ -205,34 +193,6 @@ def _group(name: str, judged: Sequence[_Judged]) -> YieldGroup:
     both = sum(stands_out and not of_unit for of_unit, stands_out in zip(why, odd, strict=True))
     accepted = sum(not of_unit for of_unit in why)
     return YieldGroup(name, len(why), accepted, sum(odd), dict(counts.most_common()), sum(left), both)
-
-
-def _names(records: Sequence[UnitRecord], column: str) -> list[str]:
-    """Return the group of each unit: its text in the column, or a quarter of many numbers."""
-    own = COLUMNS.get(column)
-    texts = [(record.more.get(column, "") if own is None else own(record)).strip() for record in records]
-    numbers = np.array([_number(text) for text in texts])
-    known = np.isfinite(numbers)
-    if len(set(texts)) <= CLASSES or not np.all(known | np.array([not text for text in texts])):
-        return [text or NO_VALUE for text in texts]
-    return _quarters(numbers, known)
-
-
-def _quarters(numbers: Array, known: Any) -> list[str]:
-    edges = np.quantile(numbers[known], [0.25, 0.5, 0.75])
-    quarter = np.searchsorted(edges, numbers, side="left")
-    spans = {
-        k: f"{np.min(numbers[known & (quarter == k)]):.4g} to {np.max(numbers[known & (quarter == k)]):.4g}"
-        for k in set(quarter[known].tolist())
-    }
-    return [spans[k] if one else NO_VALUE for k, one in zip(quarter.tolist(), known.tolist(), strict=True)]
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
 
 
 def chance(units: Sequence[int], accepted: Sequence[int]) -> float:
