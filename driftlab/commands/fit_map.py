@@ -228,8 +228,8 @@ def _fitted(
     elif neurons is not None:
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
-    fitted = fit_gathered(config, settings, soak, more)
-    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
+    fitted = fit_gathered(config, settings, soak, more, soak.memory)
+    verdict = MapVerdict(fitted, settings, soak.summary, soak.placements, soak.used, faults.doubts, soak.memory)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

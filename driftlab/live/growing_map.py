@@ -21,7 +21,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.maps.assessment import memory_sentence
 from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, map_settings
-from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
+from driftlab.maps.hysteresis.memory import MemoryVerdict
 from driftlab.maps.kind_selection import TURN
 from driftlab.planning.request import read_range
 from driftlab.soak.blocks import GrowingSoak
@@ -180,7 +180,7 @@ class GrowingMap:
         domain = Used(low=self.used.low, high=self.used.high)
         name = self.config.source.name if self.config.source else ""
         soak = GatheredSoak(blocks.t, T, blocks.bias, [name], [0], interval, used=domain, steps=steps, off=off)
-        fitted = fit_gathered(self.config, self.settings, soak)
+        fitted = fit_gathered(self.config, self.settings, soak, memory=soak.memory)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
             # of a thermometer with steps, what readings do within a block is rounding and not temperature
@@ -191,8 +191,7 @@ class GrowingMap:
 
     def _publish(self, fitted: FittedMap) -> None:
         assert self._soak is not None, "the map was fitted on it"
-        memory = memory_of(self._soak.brief())
-        self.status = with_curve(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
+        self.status = with_curve(self._with(why="", axes=axes_of(fitted), memory=self._soak.memory), fitted)
         self.publish(self.status)
 
     def _with(self, **changes: Any) -> GrowingMapStatus:

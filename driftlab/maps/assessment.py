@@ -47,6 +47,7 @@ class MapVerdict:
     placements: Placements | None = None  # of the unit, where its input is known by its length alone
     used: Used | None = None  # share of the soak that is used; None where that is not known
     doubts: Sequence[str] = ()  # why the soak may not be what its config says (`Faults.doubts`)
+    known_memory: MemoryVerdict | None = None  # of the soak, where it has been looked for
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -56,7 +57,7 @@ class MapVerdict:
     @cached_property
     def memory(self) -> MemoryVerdict:
         """Verdict on whether the bias remembers which temperatures came before."""
-        return memory_of(self.soak)
+        return memory_of(self.soak) if self.known_memory is None else self.known_memory
 
     @cached_property
     def map(self) -> FittedMap:

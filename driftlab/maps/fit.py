@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
+from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
@@ -22,13 +24,15 @@ from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array, Chunk, Integers
+from fusion_core.chunk import Array, Chunk, Flags, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import did_you_mean
+from fusion_core.thermal.curve_error import nested
+from fusion_core.thermal.penalised import penalised, smooth_lines
 from fusion_core.thermal.thermometer import NO_STEPS, Steps
 
 Progress = Callable[[float, int], None]
@@ -37,6 +41,7 @@ USUAL = "spline"  # kind of a map where neither the config nor the user names on
 ROW = 10.0  # s, of a row of a soak
 MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
+GRID = 400  # temperatures at which the difference between up and down is looked at
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
@@ -82,22 +87,57 @@ def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults:
 
 
 def fit_gathered(
-    config: Config, settings: ThermalMap, soak: GatheredSoak, more: Mapping[str, str] | None = None
-) -> FittedMap:
-    """Fit a thermal map on samples; its provenance has `more` too."""
+    config: Config, settings: ThermalMap, soak: GatheredSoak, more: Mapping[str, str] | None = None,
+    memory: MemoryVerdict | None = None,
+) -> FittedMap:  # fmt: skip
+    """Fit a thermal map on samples; its provenance has `more` too.
+
+    Where the `memory` of the soak is seen, the curve is the mean of warming and cooling at each temperature.
+    """
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
+    bias, apart = soak.bias, memory.apart if memory is not None else np.zeros(soak.bias.shape[1], dtype=np.bool_)
+    if np.any(apart):
+        bias = _mean_of_ways(soak, apart)
     try:
-        fitted = settings.fit(_to_fit(soak), soak.bias, about)
+        fitted = settings.fit(_to_fit(soak), bias, about)
     except (SingularFit, SwingTooSmall) as error:
         unused = soak.used.sentence()
         raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
+    if memory is not None and np.any(apart):
+        fitted = _with_spread(fitted, memory, apart)
     if soak.used.low < soak.used.high:
         fitted = settings.over(fitted, (soak.used.low, soak.used.high))
     if soak.placements is not None:
-        fitted = soak.placements.widened(fitted, settings.smoother(soak.T, soak.bias))
+        fitted = soak.placements.widened(fitted, settings.smoother(soak.T, bias))
     residual = residual_of(fitted, settings, soak.T, soak.bias, soak.starts, soak.interval)
     fitted = fitted.noting(**residual.as_record(soak.interval * len(soak.T)))
     return of_sensor(config, of_thermometer(fitted, soak.steps, soak.T, soak.off, soak.interval))
+
+
+def _mean_of_ways(soak: GatheredSoak, axes: Flags) -> Array:
+    """Return the bias (N, d) less half of what is between up and down, on the way that each sample is on.
+
+    A soak in stairs stays just below a temperature while it warms, and just above it while it cools. A curve of all
+    samples alike would follow the one way below each step, and the other above. Of `axes` (d,) where they differ.
+    """
+    T, difference, up, down = soak.summary.between_ways()
+    lines = smooth_lines(soak.summary.domain)
+    B, grid = lines.values(T), np.linspace(*soak.summary.domain, GRID)
+    way = np.repeat(soak.summary.way, np.round(soak.summary.span / soak.interval).astype(np.int64))
+    bias = soak.bias.copy()
+    for axis in np.flatnonzero(axes):
+        between = penalised(B, difference[:, axis], up * down / (up + down), lines.penalty).coefficients
+        bias[:, axis] -= way * np.interp(soak.T, grid, lines.values(grid) @ between / 2)
+    return bias
+
+
+def _with_spread(fitted: FittedMap, memory: MemoryVerdict, axes: Flags) -> FittedMap:
+    """Return the map with what noise may hide in the difference of the ways of `axes` (d,), which was taken off."""
+    error, some = fitted.record.error, np.isfinite(memory.spread[:, 0])
+    if error is None:
+        return fitted
+    half = np.stack([np.interp(error.T, memory.T[some], column / 2) for column in memory.spread[some].T], axis=1)
+    return fitted.noting(error=error.model_copy(update={"modes": (*nested((half * axes)[None]), *error.modes)}))
 
 
 def _to_fit(soak: GatheredSoak) -> Array:
@@ -211,9 +251,15 @@ class GatheredSoak:
     steps: Steps = NO_STEPS  # of the thermometer
     off: Array | None = None  # (N,): how far T may be off between them (`between_steps`), K^2 s
 
-    def brief(self) -> SoakSummary:
-        """Return the summary that an assessment needs."""
+    @cached_property
+    def summary(self) -> SoakSummary:
+        """The summary that an assessment needs."""
         return brief(self.T, self.bias, self.starts, self.interval, self.t, self.off)
+
+    @cached_property
+    def memory(self) -> MemoryVerdict:
+        """The verdict on whether the bias remembers which temperatures came before."""
+        return memory_of(self.summary)
 
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""

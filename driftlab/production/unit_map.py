@@ -136,7 +136,7 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus:
     """
     settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
-    fitted = fit_gathered(config, settings, soak)
+    fitted = fit_gathered(config, settings, soak, memory=soak.memory)
     triad = None
     if stimulus:
         with_bias = _with_map(config, settings, fitted)
@@ -144,7 +144,7 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus:
         fitted = triad.map
         for text in triad.faults.doubts:
             faults.doubt(f"its stimulus: {text}")
-    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
+    verdict = MapVerdict(fitted, settings, soak.summary, soak.placements, soak.used, faults.doubts, soak.memory)
     return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict, triad)
 
 

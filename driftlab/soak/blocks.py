@@ -188,6 +188,17 @@ class SoakSummary(SoakRows):
         row = _ROW[way]
         return self.count[row], self.cell_T[row], self.cell_bias[row]
 
+    def between_ways(self) -> tuple[Array, Array, Array, Array]:
+        """Return T (C,), warming less cooling (C, d), and the samples (C,) on either way, of cells with some on both.
+
+        The two means of a cell are of temperatures that differ: what the curve between them rises is taken off.
+        """
+        (n, T, bias), (below_n, below_T, below) = self.cells(WAYS["warming"]), self.cells(WAYS["cooling"])
+        both = (n > 0) & (below_n > 0)
+        middle, apart, mean = (T[both] + below_T[both]) / 2, (T - below_T)[both], (bias + below)[both] / 2
+        slope = np.gradient(mean, middle, axis=0) if len(middle) > 1 else np.zeros_like(mean)
+        return middle, (bias - below)[both] - slope * apart[:, None], n[both], below_n[both]
+
 
 def brief(
     T: Array, bias: Array, starts: Sequence[int], interval: float, times: Array | None = None, off: Array | None = None

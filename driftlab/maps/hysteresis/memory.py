@@ -13,7 +13,7 @@ from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, Foll
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence, of_a_jump
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Flags
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
 ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be distinguished from it
@@ -88,6 +88,11 @@ class MemoryVerdict:
         return float(1 / (1 + np.exp(-np.clip(self.evidence, -500, 500)))) if np.isfinite(self.evidence) else 0.0
 
     @property
+    def apart(self) -> Flags:
+        """Axes (d,) on which up and down are seen to differ."""
+        return np.asarray((self.answer == "seen") & (np.abs(self.size) > CLEAR * self.sigma), dtype=np.bool_)
+
+    @property
     def called(self) -> str:
         """The kinds that the soak cannot tell from one another, in words; of several there together, that too."""
         if self.together:
@@ -159,24 +164,21 @@ def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
     Blocks of a soak are too wide for it. Differences of cells are as unsure as their samples' white noise and a robust
     deviation of all cells say. One recording alone is looked at: several have levels of their own.
     """
-    (n, T, bias), (below_n, below_T, below) = soak.cells(WAYS["warming"]), soak.cells(WAYS["cooling"])
-    both, d = (n > 0) & (below_n > 0), bias.shape[1]
-    if len(np.unique(soak.recording)) > 1 or np.sum(both) < MIN_CONTRASTS:
+    T, difference, n, below_n = soak.between_ways()
+    if len(np.unique(soak.recording)) > 1 or len(T) < MIN_CONTRASTS:
         return None
-    T, apart, mean = (T[both] + below_T[both]) / 2, (T - below_T)[both], (bias + below)[both] / 2
-    difference = (bias - below)[both] - np.gradient(mean, T, axis=0) * apart[:, None]
     own = np.arange(-BESIDE, BESIDE + 1) != 0
     off = difference[BESIDE:-BESIDE] - np.median(sliding_window_view(difference, len(own), axis=0)[..., own], axis=2)
-    white = (1 / n[both] + 1 / below_n[both])[BESIDE:-BESIDE, None] * soak.white**2
+    white = (1 / n + 1 / below_n)[BESIDE:-BESIDE, None] * soak.white**2
     usual = np.median(off**2, axis=0) / 0.455  # of chi-square with one degree of freedom
-    long = (n + below_n)[both][BESIDE:-BESIDE, None]  # in a cell: a walk grows with it
+    long = (n + below_n)[BESIDE:-BESIDE, None]  # in a cell: a walk grows with it
     sigma = np.sqrt(white + np.maximum(usual - np.median(white, axis=0), 0.0) * np.maximum(long / np.median(long), 1.0))
     beyond = np.abs(off) / np.maximum(sigma, np.finfo(float).tiny)
     cell, axis = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
     if not beyond[cell, axis] > NARROW:
         return None
-    name = "xyz"[axis] if d == 3 else str(axis + 1)
-    return {"width": float(np.ptp(soak.domain)) / len(n), "T": float(T[BESIDE + cell]), "axis": name}
+    name = "xyz"[axis] if soak.bias.shape[1] == 3 else str(axis + 1)
+    return {"width": float(np.ptp(soak.domain)) / CELLS, "T": float(T[BESIDE + cell]), "axis": name}
 
 
 @dataclass(frozen=True, eq=False)

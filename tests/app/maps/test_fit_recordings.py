@@ -39,7 +39,7 @@ def pan(recordings):
 def test_the_blocks_of_a_soak_stand_where_they_were_recorded(recordings):
     """Bursts of 5 s, one every 305 s, twice: the second recording begins where the first has ended."""
     path = str(recordings / "data/pan_tvc_lsm6dsm/pan_tvc_50hz_bursts.csv")
-    soak = gather(pan(recordings), [path, path], Faults()).brief()
+    soak = gather(pan(recordings), [path, path], Faults()).summary
     one, two = (soak.t[soak.recording == k] for k in (0, 1))
     assert 24 * 305 < np.ptp(one) < 24 * 305 + 10
     np.testing.assert_allclose(two - two[0], one - one[0], atol=1e-6)
