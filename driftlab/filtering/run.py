@@ -32,13 +32,14 @@ from driftlab.recordings.prefetch import prefetch
 from driftlab.recordings.screening import read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
-from fusion_core.contracts import Alignment
+from fusion_core.contracts import Alignment, FittedMap, Sensor, ThermalBias
 from fusion_core.contracts.effect import as_measured
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT
 from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
+from fusion_core.units import convert
 
 
 class Moment(NamedTuple):
@@ -88,6 +89,8 @@ class Run:
             if (fitted := followed_map(sensor.bias)) is not None:
                 check_map(fitted, sensor)
                 followed[sensor.channel] = fitted
+            if (of_sensor := fitted or loaded.get(sensor.channel)) is not None:
+                _note_memory(sensor, of_sensor, journal.faults)
         self.maps = [*loaded.values(), *followed.values()]
         self.limited = [effect for sensor in self.model.sensors for effect in with_domain(sensor.bias)]
         gate = gate_of(self.model.m, self.model.patience.false_alarm)
@@ -237,6 +240,23 @@ class Run:
             f"looked at{left_out}); use a longer recording, set filter.align lower, or check "
             f"{self.model.tracked.section}.noise and the units"
         )
+
+
+def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
+    """Note that the soak of a sensor's map showed a memory which no effect of its bias has."""
+    memory = fitted.record.memory
+    if memory is None or memory.get("answer") != "seen":
+        return
+    effects = sensor.bias.effects if isinstance(sensor.bias, ThermalBias) else ()
+    if {effect.kind for effect in effects} & set(memory["kinds"]):
+        return
+    size = np.abs(np.array(memory["size"], dtype=np.float64))
+    axis, factor = int(np.nanargmax(size)), convert(1.0, sensor.unit, sensor.shown)
+    faults.note(
+        f"the soak of the {sensor.channel}'s map showed a {' or '.join(memory['kinds'])}: up and down differ by up to "
+        f"{size[axis] * factor:.3g} {sensor.shown}, {sensor.axes[axis]}, which no effect of the config follows and no "
+        "sigma has in it; `driftlab explain` finds it"
+    )
 
 
 def _last_two_joined(chunks: Iterable[Chunk]) -> Generator[Chunk]:

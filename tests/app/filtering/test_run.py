@@ -206,6 +206,22 @@ def test_temperature_outside_the_domain_names_the_time(maps):
         go(config(gyro={**GYRO, "bias": bias}), unit)
 
 
+@pytest.mark.parametrize(("answer", "effects", "noted"), [
+    ("seen", [], True), ("none", [], False), ("seen", [{"kind": "hysteresis", "width": "2 K"}], False),
+])  # fmt: skip
+def test_a_memory_of_the_maps_soak_that_nothing_follows_is_noted(maps, tmp_path, answer, effects, noted):
+    fitted = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "path": maps}).load()
+    size = np.deg2rad([0.0, -30.0, 5.0]) / 3600
+    memory = {"answer": answer, "kinds": ["hysteresis"], "size": size.tolist()}
+    fitted.noting(memory=memory).save(tmp_path / "map.json")
+    settings = {"kind": "polynomial", "path": str(tmp_path / "map.json")}
+    bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": settings, "effects": effects}
+    journal = RunLog()
+    Run(config(gyro={**GYRO, "bias": bias}), journal)
+    said = [text for text in journal.faults.found if "up and down differ by up to 30 deg/h, y" in text]
+    assert len(said) == noted
+
+
 def test_missing_channels_and_axes_are_named(maps):
     unit = unit_at_rest(seconds=100)
     unit.channels = lambda: {"gyro": unit.gyro}
