@@ -15,6 +15,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.identification.config_edit import the_map, with_host
 from driftlab.identification.cross_validation import level_prior
+from driftlab.identification.least_squares import AxisFit
 from driftlab.identification.records import Evidence, map_inputs
 from driftlab.identification.state import Search
 from driftlab.maps.fit import provenance
@@ -55,8 +56,8 @@ def joint(search: Search) -> Joint:
     for axis, y in enumerate(scale):
         fit = search.fit(model, axis)
         beta = fit.beta * y / columns.scale[fit.cols]
-        noise = float(search.squares.colour[axis] * np.mean(search.squares.residual(axis, fit) ** 2))
-        variance = noise * fit.equations.variances * (y / columns.scale[fit.cols]) ** 2
+        covariance = _covariance(search, axis, fit)
+        variance = np.diag(covariance) * (y / columns.scale[fit.cols]) ** 2
         of_map, others = np.arange(q), np.r_[np.arange(q), np.arange(q + R, len(fit.cols))]
         curve[:, axis] = columns.raw(fit.cols[of_map]) @ beta[of_map]
         rest = evidence.rate[:, axis] - columns.raw(fit.cols[others]) @ beta[others]
@@ -70,7 +71,7 @@ def joint(search: Search) -> Joint:
             at += len(places)
             weights[k][:, places] += [1 / variance[part], beta[part] / variance[part]]
             initial[k, axis] = fit.sd[k] * y
-            sizes[:, k, axis] = _size(search, k, axis, part, noise)
+            sizes[:, k, axis] = _size(search, k, axis, part, covariance)
     effects = tuple(
         _with_coefficients(term.effect, evidence, weights[k], initial[k] if term.free else np.zeros(d))
         for k, term in enumerate(model)
@@ -119,12 +120,27 @@ def _regressors(effect: Effect, evidence: Evidence) -> tuple[tuple[float, float]
     return tuple((float(a), float(b)) if a <= b else (0.0, 0.0) for a, b in zip(low, high, strict=True))
 
 
-def _size(search: Search, k: int, axis: int, own: slice, noise: float) -> tuple[float, float]:
+def _covariance(search: Search, axis: int, fit: AxisFit) -> Array:
+    """Return the covariance (k, k) of a fit's coefficients, in the columns' scale, by white noise and walk.
+
+    With the normal equations A, and r and q the residual's variances of a row and of the walk's step from row to row::
+
+        A^-1 (r X'X + q sum_m c_m c_m') A^-1,    c_m = sum of the rows x_k, k >= m, of a recording
+    """
+    noise, X = search.noises[axis], search.columns.W[:, fit.cols]
+    middle = noise.white * X.T @ X
+    for rows in search.evidence.slices:
+        ahead = np.cumsum(X[rows][::-1], axis=0)
+        middle += noise.walk * ahead.T @ ahead
+    return fit.equations.solve(fit.equations.solve(middle).T)
+
+
+def _size(search: Search, k: int, axis: int, own: slice, covariance: Array) -> tuple[float, float]:
     """Return half of what the k-th effect moves the bias of an axis by, and its deviation, SI.
 
-    `own` are its columns of the fit, `noise` the residual's density. One that acts on the map's input moves the map's
-    curve. The deviation is the larger of that of the noise and of how the size varies where one part after the
-    other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): the model's misfit is in it.
+    `own` are its columns of the fit, whose coefficients have the `covariance`. One that acts on the map's input moves
+    the map's curve. The deviation is the larger of that of the noise and of how the size varies where one part after
+    the other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): the model's misfit is in it.
     """
     squares, columns, model = search.squares, search.columns, search.model
     fit, effects = search.fit(model, axis), [term.effect for term in model]
@@ -139,7 +155,7 @@ def _size(search: Search, k: int, axis: int, own: slice, noise: float) -> tuple[
     between = regressors[int(np.argmax(moved))] - regressors[int(np.argmin(moved))]
     p, g = len(squares.fixed(model, axis)), len(search.everything)
     others = [between[:p] @ squares.fit(model, axis, columns.all_but(part)).beta[:p] for part in search.everything]
-    variance = max((g - 1) * float(np.var(others)), noise * float(between @ fit.equations.solve(between)), 0.0)
+    variance = max((g - 1) * float(np.var(others)), float(between @ covariance @ between), 0.0)
     return float(np.ptp(moved)) / 2, float(np.sqrt(variance)) / 2
 
 

@@ -13,8 +13,9 @@ from driftlab.identification.least_squares import Term
 from driftlab.identification.model import joint
 from driftlab.identification.result import summary
 from driftlab.identification.search import search
-from fusion_core.contracts import on_each_axis
+from fusion_core.contracts import Effect, on_each_axis
 from fusion_core.errors import ConfigError
+from fusion_core.host.registry import registry
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 
@@ -50,6 +51,7 @@ def searched(monkeypatch, *classes, without=(), kinds=("channel", "hysteresis"))
 
 def test_an_effect_that_another_shows_already_changes_no_verdict(monkeypatch):
     """Scaled, shifted and first in the alphabet: the built-in one is named, and as sure as without the other."""
+    registry().classes(Effect)  # those that came with driftlab are known as such
     alone, verdict = searched(monkeypatch)
     beside, twice = searched(monkeypatch, TWICE)
     assert twice.word == verdict.word == "explained"
