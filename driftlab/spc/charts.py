@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from driftlab.family.baseline import Baseline, FrozenLimits, ScaleName
 from driftlab.family.record import PER
 from driftlab.spc.capability import D2, Capability
-from driftlab.spc.stratification import GroupDifference
 from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
@@ -236,6 +235,37 @@ class TSquaredChart:
     def beyond(self) -> NDArray[np.bool_]:
         """Alarms (m,)."""
         return np.asarray(self.value > self.limit)
+
+
+@dataclass(frozen=True)
+class GroupDifference:
+    """A figure of an axis that differs between the groups of a column.
+
+    Attributes
+    ----------
+    quantity, axis, column : str
+    p : float
+        Probability of such a difference by chance.
+    group : str
+        The group that is furthest from the others.
+    units : int
+        Its units.
+    value, others : float
+        Middle of its units, and of all others, SI.
+    """
+
+    quantity: str
+    axis: str
+    column: str
+    p: float
+    group: str
+    units: int
+    value: float
+    others: float
+
+    def as_json(self, unit: str) -> dict[str, Any]:
+        """Return it as `fleet.json` has it; `unit` is the quantity's, SI."""
+        return {**vars(self), "unit": unit}
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,17 +12,14 @@ Experiments, 8th ed., chapter 4.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import UnitRecord
+from driftlab.spc.charts import ControlChart, GroupDifference, LineReport
 from fusion_core.chunk import Array, Flags, Integers
-
-if TYPE_CHECKING:
-    from driftlab.spc.charts import ControlChart, LineReport
 
 COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
     "lot": lambda record: record.lot,
@@ -38,37 +35,6 @@ NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
 LEAST = 3  # values of a group that is compared
 ALPHA = 0.05  # chance, over all columns and figures, that one is said to differ where none does
-
-
-@dataclass(frozen=True)
-class GroupDifference:
-    """A figure of an axis that differs between the groups of a column.
-
-    Attributes
-    ----------
-    quantity, axis, column : str
-    p : float
-        Probability of such a difference by chance.
-    group : str
-        The group that is furthest from the others.
-    units : int
-        Its units.
-    value, others : float
-        Middle of its units, and of all others, SI.
-    """
-
-    quantity: str
-    axis: str
-    column: str
-    p: float
-    group: str
-    units: int
-    value: float
-    others: float
-
-    def as_json(self, unit: str) -> dict[str, Any]:
-        """Return it as `fleet.json` has it; `unit` is the quantity's, SI."""
-        return {**vars(self), "unit": unit}
 
 
 def groups_of(records: Iterable[UnitRecord], column: str) -> list[str]:
