@@ -38,6 +38,7 @@ from driftlab.family.reml import (
     RemlFit,
     VarianceComponents,
     fit_axis,
+    inverse,
     means_of,
     outlier_weights,
     root_of,
@@ -230,10 +231,10 @@ def _of_their_lots(
     for (soaked, _), g in zip(units, lot.tolist(), strict=True):
         J, h = marginalised(soaked, knots)
         A, a = back @ J @ L, back @ h[..., None]
-        K = one - np.linalg.inv(A + one)
+        K = one - inverse(A + one)
         z = (a - K @ (a + centres[g][..., None]))[..., 0]
         w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
-        V = np.linalg.inv(A + w * one)
+        V = inverse(A + w * one)
         own = w * (one - w * V), (w * V @ a)[..., 0]
         sums[g] = added(sums[g], own) if g in sums else own
     return sums
@@ -275,7 +276,7 @@ class Posterior:
         """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
         L, _ = self.root
         back = L.transpose(0, 2, 1)
-        V = np.linalg.inv(np.eye(L.shape[2]) + back @ J @ L)
+        V = inverse(np.eye(L.shape[2]) + back @ J @ L)
         a = back @ (h[..., None] - J @ self.c[..., None])
         return Posterior(self.c + (L @ (V @ a))[..., 0], L @ V @ back)
 

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import TERM_FIGURES, UnitRecord
-from driftlab.family.reml import WEIGHT
+from driftlab.family.reml import WEIGHT, inverse
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_records import at_places, figure_of, figures_in, of_units
@@ -113,7 +113,7 @@ class CurveStatistics:
         total, weights = self.family.sampled + WEIGHT, self.family.weights.get(soaked.unit, (1.0,) * len(h))
         table = np.empty((len(CURVES), len(h)))
         for axis, shape in enumerate(self.shapes(lot)):
-            V = np.linalg.inv(np.eye(len(shape.c)) + shape.L.T @ J[axis] @ shape.L)
+            V = inverse(np.eye(len(shape.c)) + shape.L.T @ J[axis] @ shape.L)
             z = V @ (shape.L.T @ (h[axis] - J[axis] @ shape.c))
             own = CurveDeviation(z, np.eye(len(z)) - V, float(weights[axis]) / total if self._fitted else 0.0)
             curve = own.squared()
