@@ -24,7 +24,7 @@ from statistics import NormalDist
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, Posterior, fit_family
+from driftlab.family.mixed_model import Family, Posterior, fit_some, stacked
 from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, Partitions, UnitOfLot, in_partitions
 from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
@@ -60,17 +60,18 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
         Its units and their lots, or a sample of them; with their rows.
     """
     units = in_partitions(units, A_FEW)
-    rows = [row for own in units.map(_ranges) for row in own]
-    first, last = np.array([domain for domain, *_ in rows]).T
+    domains, noise, known, lots = zip(*(row for own in units.map(_ranges) for row in own), strict=True)
+    first, last = np.array(domains).T
     whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
     long = long[sample_of(len(long), MAX_LEFT_OUT)]
-    folds, have = [long[k::FOLDS] for k in range(FOLDS)], [k for k, (*_, known) in enumerate(rows) if known]
-    others = [Partitions(units.chosen(np.setdiff1d(np.arange(len(units)), fold)).parts) for fold in folds]
+    folds, have = [long[k::FOLDS] for k in range(FOLDS)], np.flatnonzero(known)
+    others = (np.setdiff1d(np.arange(len(units)), fold) for fold in folds)
     alike = units.chosen((have[k] for k in sample_of(len(have), ALIKE)), ALIKE).parts
-    jobs = [*(partial(fit_family, some, start=family) for some in others), *(partial(_common_walk, p) for p in alike)]
+    fit = partial(fit_some, family, Partitions(stacked(units, family.knots).parts), lots)
+    jobs = [*(partial(fit, some) for some in others), *(partial(_common_walk, p) for p in alike)]
     found = [*units.engine(call, jobs)]
     todo = [(own, part) for own, fold in zip(found, folds, strict=False) for part in units.chosen(fold, A_FEW).parts]
     of_units = [*chain.from_iterable(units.engine(partial(_measured, whole), todo))]
@@ -81,13 +82,13 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
             parts.append(part)
             factors.append(_factors([scores for scores, _ in pairs], len(long)))
             far.append(tuple(np.quantile([distances for _, distances in pairs], 1 - FAR, axis=0).tolist()))
-    noise = _typical(np.array([noise for _, noise, _ in rows]), *found[FOLDS:])
-    return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
+    typical = _typical(np.array(noise), *found[FOLDS:])
+    return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=typical) if parts else None
 
 
-def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array], bool]]:
-    """Return the range of each unit, degC, the densities of its white noise and its walk, and whether it has rows."""
-    return [(soaked.knots.domain, (soaked.white, soaked.walk), bool(soaked.recordings)) for soaked, _ in units]
+def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array], bool, str]]:
+    """Return the range of each unit, degC, the densities of its noise, white and walk, if it has rows, and its lot."""
+    return [(soaked.knots.domain, (soaked.white, soaked.walk), bool(soaked.recordings), lot) for soaked, lot in units]
 
 
 def _measured(
