@@ -103,14 +103,15 @@ def _measured(
         low, high = soaked.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
         B, of_parts = family.knots.values(T), list[tuple[Array, Array] | None]()
+        after = deviation(B, more.covariance) ** 2
         for part in PARTS:
             low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
             if (short := soaked.between(low, high)) is None:
                 of_parts.append(None)
                 continue
             J, h = family.information_of(short)
-            beyond = B[(low > T) | (high < T)]
-            of_parts.append((_scores(beyond, before.informed(J, h), more), before.distance(J, h)))
+            beyond, less = (low > T) | (high < T), before.informed(J, h)
+            of_parts.append((_scores(B[beyond], less, more.c, after[beyond]), before.distance(J, h)))
         measured.append(of_parts)
     return measured
 
@@ -141,15 +142,16 @@ def _typical(noise: Array, common: tuple[Array, Array] | None = None) -> Typical
     )  # fmt: skip
 
 
-def _scores(B: Array, less: Posterior, more: Posterior) -> Array:
+def _scores(B: Array, less: Posterior, c: Array, after: Array) -> Array:
     """Return z and g (N, d, 2) of a part of a soak, at temperatures with the splines B (N, q).
 
-    z is not a number where the part knew nearly as much as the whole.
+    Against the map with the coefficients c (d, q) of the whole soak, of the variance `after` (N, d). z is not a number
+    where the part knew nearly as much as the whole.
     """
-    own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
+    own = deviation(B, less.covariance) ** 2
     gained = np.maximum(own - after, 0.0)
     known = np.where(gained > GAINED * own, gained, np.nan)
-    return np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
+    return np.stack([B @ (less.c - c).T / np.sqrt(known), gained / own], axis=2)
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
