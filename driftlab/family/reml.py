@@ -99,24 +99,26 @@ def root_of(Sigma: Array) -> tuple[Array, Array]:
 def inverse(matrices: Array) -> Array:
     """Inverses of symmetric matrices (..., q, q) without an eigenvalue of zero or less; the lower triangle is read."""
     q = matrices.shape[-1]
-    swept: Array = _swept(np.ascontiguousarray(matrices.reshape(-1, q, q)))
+    swept: Array = _swept(np.ascontiguousarray(matrices.reshape(-1, q, q)))[0]
     return swept.reshape(matrices.shape)
 
 
 @compiled
-def _swept(matrices: Array) -> Array:
-    """Return the inverses of matrices (n, q, q): of small ones LAPACK's takes five times as long.
+def _swept(matrices: Array) -> tuple[Array, Array]:
+    """Return the inverses of matrices (n, q, q), and the pivots (n, q), whose products are the determinants.
 
-    Source: J. H. Goodnight, A tutorial on the SWEEP operator, Am. Stat. 33 (1979) 149.
+    Of small ones LAPACK's take four times as long. Source: J. H. Goodnight, A tutorial on the SWEEP operator, Am. Stat.
+    33 (1979) 149.
     """
     inverses, (n, q, _) = np.empty_like(matrices), matrices.shape
-    row = np.empty(q)
+    pivots, row = np.empty((n, q)), np.empty(q)
     for i in range(n):
         S = inverses[i]
         for j in range(q):
             for m in range(j + 1):
                 S[j, m] = matrices[i, j, m]
         for k in range(q):
+            pivots[i, k] = S[k, k]
             pivot = 1.0 / S[k, k]
             for m in range(q):
                 row[m] = S[max(k, m), min(k, m)]
@@ -131,7 +133,7 @@ def _swept(matrices: Array) -> Array:
         for j in range(q):
             for m in range(j + 1):
                 S[j, m] = S[m, j] = -S[j, m]
-    return inverses
+    return inverses, pivots
 
 
 class OfAxes(NamedTuple):
@@ -202,7 +204,7 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
     """
     q = weighted.shape[1]
     root, one = np.sqrt(lots), np.eye(q)
-    cov = root[:, None] * np.linalg.inv(one + root[:, None] * information * root) * root  # of a shift, mu known
+    cov = root[:, None] * inverse(one + root[:, None] * information * root) * root  # of a shift, mu known
     taken = cov @ information
     own = information - information @ taken
     total = own.sum(axis=0)
@@ -408,16 +410,26 @@ def _nearest(expected: EStep) -> Array:
     return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 
+@compiled
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
     a0, a1, s, length, r = np.exp(numbers)
-    distance = np.abs(peaks[:, None] - peaks)
+    q, by_numbers = len(peaks), np.empty((5, len(peaks), len(peaks)))
     u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
-    k = np.sqrt(3.0) * distance / (3 * max(peaks[1] - peaks[0], 1e-9))
-    curve, tiny = s**2 * np.exp(-0.5 * (distance / length) ** 2), 1e-9 * np.eye(len(peaks))
-    parts = [a0**2 * (1 + tiny), a1**2 * (np.outer(u, u) + tiny), curve + s**2 * tiny, r**2 * (1 + k) * np.exp(-k)]
-    by_length = curve * (distance / length) ** 2
-    return np.sum(parts, axis=0), np.stack([2 * parts[0], 2 * parts[1], 2 * parts[2], by_length, 2 * parts[3]])
+    k = np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9))
+    Psi = np.empty((q, q))
+    for i in range(q):
+        for j in range(i + 1):
+            distance, tiny = peaks[i] - peaks[j], 1e-9 if i == j else 0.0
+            curve = s**2 * np.exp(-0.5 * (distance / length) ** 2)
+            rough = r**2 * (1 + k * distance) * np.exp(-k * distance)
+            level, slope = a0**2 * (1 + tiny), a1**2 * (u[i] * u[j] + tiny)
+            curve_alone = curve + s**2 * tiny
+            Psi[i, j] = Psi[j, i] = level + slope + curve_alone + rough
+            parts = (2 * level, 2 * slope, 2 * curve_alone, curve * (distance / length) ** 2, 2 * rough)
+            for m in range(5):
+                by_numbers[m, i, j] = by_numbers[m, j, i] = parts[m]
+    return Psi, by_numbers
 
 
 def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) -> Array:
@@ -435,7 +447,7 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) ->
         with_units, inverse_with = _log_det(nu * Psi + scatter)
         slope = nu / 2 * ((nu + count) * inverse_with - nu * inverse)
         value = ((nu + count) * with_units - nu * own) / 2
-        return value / count, np.tensordot(by_numbers, slope, 2) / count
+        return value / count, by_numbers.reshape(5, -1) @ slope.ravel() / count
 
     begin, bounds = np.clip(start, low + 1e-6, high - 1e-6), Bounds(low, high)
     best: Array = minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}).x
@@ -445,5 +457,5 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) ->
 def _log_det(matrix: Array) -> tuple[float, Array]:
     """Return the logarithm of the determinant of a covariance (q, q), and its inverse."""
     scale = np.sqrt(np.diag(matrix))
-    root = np.linalg.inv(np.linalg.cholesky(matrix / np.outer(scale, scale))) / scale
-    return -2 * float(np.log(np.diag(root)).sum()), root.T @ root
+    inverses, pivots = _swept((matrix / np.outer(scale, scale))[None])
+    return float(np.sum(np.log(pivots)) + 2 * np.sum(np.log(scale))), inverses[0] / np.outer(scale, scale)
