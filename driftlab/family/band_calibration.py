@@ -97,21 +97,21 @@ def _measured(
     """Return z and g of each part of each unit by a family that it was left out of, and its distances; None of none."""
     (family, units), measured = job, []
     first, last = family.knots.domain
+    parts = whole[0] + (whole[1] - whole[0]) * np.array(PARTS)
     for soaked, lot in units.read():
-        before = family.marginal(lot)
-        more = before.informed(*family.information_of(soaked))
-        low, high = soaked.knots.domain
+        before, (low, high) = family.marginal(lot), soaked.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
-        B, of_parts = family.knots.values(T), list[tuple[Array, Array] | None]()
-        after = deviation(B, more.covariance) ** 2
-        for part in PARTS:
-            low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
-            if (short := soaked.between(low, high)) is None:
+        shorts = [soaked.between(*part) for part in parts]
+        known = [family.information_of(one) for one in (soaked, *shorts) if one is not None]
+        informed = before.informed(*(np.stack(values) for values in zip(*known, strict=True)))
+        found = zip(_scores(family.knots.values(T), informed), known[1:], strict=True)
+        of_parts = list[tuple[Array, Array] | None]()
+        for (low, high), short in zip(parts, shorts, strict=True):
+            if short is None:
                 of_parts.append(None)
                 continue
-            J, h = family.information_of(short)
-            beyond, less = (low > T) | (high < T), before.informed(J, h)
-            of_parts.append((_scores(B[beyond], less, more.c, after[beyond]), before.distance(J, h)))
+            scores, (J, h) = next(found)
+            of_parts.append((scores[(low > T) | (high < T)], before.distance(J, h)))
         measured.append(of_parts)
     return measured
 
@@ -142,16 +142,19 @@ def _typical(noise: Array, common: tuple[Array, Array] | None = None) -> Typical
     )  # fmt: skip
 
 
-def _scores(B: Array, less: Posterior, c: Array, after: Array) -> Array:
-    """Return z and g (N, d, 2) of a part of a soak, at temperatures with the splines B (N, q).
+def _scores(B: Array, informed: Posterior) -> Array:
+    """Return z and g (P, N, d, 2) of P parts of a soak, at temperatures with the splines B (N, q).
 
-    Against the map with the coefficients c (d, q) of the whole soak, of the variance `after` (N, d). z is not a number
-    where the part knew nearly as much as the whole.
+    `informed` is the unit's law by the whole soak, and by each part. z is not a number where a part knew nearly as much
+    as the whole.
     """
-    own = deviation(B, less.covariance) ** 2
-    gained = np.maximum(own - after, 0.0)
+    (P, d, q), N = informed.c.shape, len(B)
+    variances = deviation(B, informed.covariance.reshape(P * d, q, q)).T.reshape(P, d, N).transpose(0, 2, 1) ** 2
+    curves = B @ informed.c.transpose(0, 2, 1)
+    own = variances[1:]
+    gained = np.maximum(own - variances[0], 0.0)
     known = np.where(gained > GAINED * own, gained, np.nan)
-    return np.stack([B @ (less.c - c).T / np.sqrt(known), gained / own], axis=2)
+    return np.stack([(curves[1:] - curves[0]) / np.sqrt(known), gained / own], axis=3)
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
