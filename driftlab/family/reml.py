@@ -410,26 +410,30 @@ def _nearest(expected: EStep) -> Array:
     return np.where((share <= np.quantile(share, NEAREST)) | (len(share) < 8), 1.0, MIN_WEIGHT)
 
 
-@compiled
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
-    a0, a1, s, length, r = np.exp(numbers)
-    q, by_numbers = len(peaks), np.empty((5, len(peaks), len(peaks)))
     u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
-    k = np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9))
-    Psi = np.empty((q, q))
+    parts: Array = _parts_of_prior(peaks, u, np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9)), np.exp(numbers))
+    return parts[0], parts[1:]
+
+
+@compiled
+def _parts_of_prior(peaks: Array, u: Array, shorter: float, numbers: Array) -> Array:
+    """Return Psi and its derivatives (6, q, q); k is |T - T'| times `shorter`."""
+    q, (a0, a1, s, length, r) = len(peaks), (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    parts = np.empty((6, q, q))
     for i in range(q):
         for j in range(i + 1):
-            distance, tiny = peaks[i] - peaks[j], 1e-9 if i == j else 0.0
-            curve = s**2 * np.exp(-0.5 * (distance / length) ** 2)
-            rough = r**2 * (1 + k * distance) * np.exp(-k * distance)
-            level, slope = a0**2 * (1 + tiny), a1**2 * (u[i] * u[j] + tiny)
-            curve_alone = curve + s**2 * tiny
-            Psi[i, j] = Psi[j, i] = level + slope + curve_alone + rough
-            parts = (2 * level, 2 * slope, 2 * curve_alone, curve * (distance / length) ** 2, 2 * rough)
-            for m in range(5):
-                by_numbers[m, i, j] = by_numbers[m, j, i] = parts[m]
-    return Psi, by_numbers
+            distance, tiny = abs(peaks[i] - peaks[j]), 1e-9 if i == j else 0.0
+            k, square = shorter * distance, (distance / length) ** 2
+            level, slope, curve = a0**2 * (1 + tiny), a1**2 * (u[i] * u[j] + tiny), s**2 * np.exp(-0.5 * square)
+            smooth_curve, rough = curve + s**2 * tiny, r**2 * (1 + k) * np.exp(-k)
+            parts[0, i, j] = level + slope + smooth_curve + rough
+            parts[1, i, j], parts[2, i, j], parts[3, i, j] = 2 * level, 2 * slope, 2 * smooth_curve
+            parts[4, i, j], parts[5, i, j] = curve * square, 2 * rough
+            for m in range(6):
+                parts[m, j, i] = parts[m, i, j]
+    return parts
 
 
 def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) -> Array:
