@@ -185,13 +185,6 @@ class EStep:
         return np.asarray(total**2 / np.maximum(self.spread[:, 1], 1e-24))
 
 
-def inside(J: Array, L: Array) -> Array:
-    """Return L'JL (n, q, q) of J (n, q, q)."""
-    n, q, r = *J.shape[:2], L.shape[1]
-    half = (J.reshape(n * q, q) @ L).reshape(n, q, r).transpose(0, 2, 1)
-    return np.asarray((np.ascontiguousarray(half).reshape(n * r, q) @ L).reshape(n, r, r))
-
-
 def means_of(information: Array, weighted: Array, lots: Array) -> Means:
     """Return the means in the coordinates z.
 
@@ -242,7 +235,7 @@ class _PartUnderLaw:
 
     def __init__(self, L: Array, J: Array, h: Array, lot: Integers) -> None:
         self.L, self.J, self.h, self.lot, self.one = L, J, h, lot, np.eye(len(L))
-        self.A, self.a = inside(J, L), h @ L
+        self.A, self.a = L.T @ (J @ L), h @ L
         V = inverse(self.A + self.one)
         self.alike = V, np.einsum("nij,nj->ni", V, self.a), self.one - V  # V, V a and K of the weight 1
 
@@ -270,9 +263,9 @@ class _PartUnderLaw:
         z = self.Va - np.einsum("nij,nj->ni", K, centre)
         scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, self.V)
         for g in np.unique(self.lot):
-            own = K[self.lot == g]
-            half = (own @ means.of_lot[g]) * w[self.lot == g, None, None]
-            scatter += np.tensordot(half, own, axes=((0, 2), (0, 2)))
+            own, q = K[self.lot == g], len(scatter)
+            half = (means.of_lot[g] @ own) * w[self.lot == g, None, None]  # K is symmetric
+            scatter += half.reshape(-1, q).T @ own.reshape(-1, q)
         if not shares:
             return scatter, []
         if len(low):  # their distance is that of a unit like any other, or none would ever be weighted up again
