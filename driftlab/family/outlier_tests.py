@@ -354,13 +354,12 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
 
 def _off(u: Array, lots: Texts) -> dict[str, float]:
     """Return the shift, in widths, of each lot that is off as a whole."""
-    from scipy.ndimage import median
-
     known = np.isfinite(u)
     if not np.any(known):
         return {}
     names, number, count = np.unique(lots[known], return_inverse=True, return_counts=True)
-    middle = np.asarray(median(u[known], number, np.arange(len(names))))
+    ordered, first = u[known][np.lexsort((u[known], number))], np.cumsum(count) - count
+    middle = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2
     off = np.abs(middle) > np.maximum(1.0, LOT_OFF * 1.2533 / np.sqrt(count))
     off &= (count >= MIN_UNITS_OF_LOT) & (count <= len(u) / 2)
     return dict(zip(names[off].tolist(), middle[off].tolist(), strict=True))
