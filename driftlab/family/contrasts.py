@@ -262,7 +262,8 @@ def _weighted_sums(values: Array, weight: Array, n: int) -> Array:
 @lru_cache(maxsize=8)
 def _cosines(R: int) -> Array:
     """Return cosines (R, 2 J + 1) of 0 to 2 J half waves over R rows: what products of two waves are made of."""
-    return np.cos(np.pi * np.outer((np.arange(R) + 0.5) / R, np.arange(2 * PLACEBOS + 1)))
+    waves: Array = np.cos(np.pi * np.outer((np.arange(R) + 0.5) / R, np.arange(2 * PLACEBOS + 1)))
+    return waves
 
 
 _WAVES = np.arange(1, PLACEBOS + 1)
@@ -290,10 +291,7 @@ def _apart(G: Array, b: Array, least: Array) -> Array:
     K, J = b.shape
     for k in range(K):
         for j in range(J):
-            if not G[k, j, j] > least[k]:
-                b[k, j] = 0.0
-                continue
-            root = np.sqrt(G[k, j, j])
+            root = np.sqrt(G[k, j, j]) if G[k, j, j] > least[k] else np.inf
             b[k, j] /= root
             for i in range(j + 1, J):
                 column = G[k, i, j] / root

@@ -81,15 +81,13 @@ def fit_family(units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "r
     """
     units = in_partitions(units)
     knots, axes, lots, lot, seen = _survey(units)
-    n, d = len(units), len(axes)
+    n = len(units)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
     present, own = np.unique(lot[chosen], return_inverse=True)
     sample = stacked(units if n <= SAMPLE else units.chosen(chosen), knots)
-    fits = [
-        *sample.engine(partial(_fit_of, sample.parts, slice(None), own, knots.peaks), [(k, None) for k in range(d)])
-    ]
+    fits = [*sample.engine(partial(_fit_of, sample.parts, slice(None), own, knots.peaks), range(len(axes)))]
     means = _means_of_all(units, knots, fits, present, lot) if n > SAMPLE else [fit.means for fit in fits]
     w = np.stack([fit.w for fit in fits], axis=1)
     low = np.flatnonzero(np.any(w < 0.5, axis=1))
@@ -106,17 +104,16 @@ def fit_some(family: Family, sample: Partitions[OfAxes], lots: Sequence[str], so
 
     Its knots are kept, and EM begins with its law.
     """
-    counts = Counter(lots[k] for k in some)
-    numbers = numbered(counts, len(some))
-    lot, laws = np.array([numbers[lots[k]] for k in some]), map(VarianceComponents, family.Sigma, family.Lambda)
-    fits = [_fit_of(sample.parts, some, lot, family.knots.peaks, job) for job in enumerate(laws)]
-    of_lots = {name: (number, counts[name]) for name, number in numbers.items()}
-    more = {"units": len(some), "sampled": len(some), **_laws(fits, [fit.means for fit in fits], of_lots)}
-    return family.model_copy(update=more)
+    n, counts = len(some), Counter(lots[k] for k in some)
+    numbers, laws = numbered(counts, n), map(VarianceComponents, family.Sigma, family.Lambda)
+    fit = partial(_fit_of, sample.parts, some, np.array([numbers[lots[k]] for k in some]), family.knots.peaks)
+    fits = [fit(axis, law) for axis, law in enumerate(laws)]
+    laws_of_some = _laws(fits, [fit.means for fit in fits], {name: (k, counts[name]) for name, k in numbers.items()})
+    return family.model_copy(update={"units": n, "sampled": n, **laws_of_some})
 
 
 def _laws(fits: Sequence[RemlFit], means: Sequence[Means], lots: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return what fits and means of the axes say of a family, by its attributes."""
+    """Return the laws of a family by its attributes; of each lot its number and its units."""
     return {
         "mu": np.stack([m.mu for m in means]), "mu_covariance": _symmetric([m.covariance for m in means]),
         "Sigma": np.stack([fit.law.Sigma for fit in fits]), "Lambda": _symmetric([fit.law.Lambda for fit in fits]),
@@ -211,11 +208,10 @@ def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
 
 
 def _fit_of(
-    sample: Sequence[Partition[OfAxes]], some: Integers | slice, lot: Integers, peaks: Array,
-    job: tuple[int, VarianceComponents | None],
+    sample: Sequence[Partition[OfAxes]], some: Integers | slice, lot: Integers, peaks: Array, axis: int,
+    law: VarianceComponents | None = None,
 ) -> RemlFit:  # fmt: skip
     """Return the fit of an axis of `some` of a sample, of lots `lot` (n,), from a law on, in parts of SIZE units."""
-    axis, law = job
     contents = ((own.J[:, axis].copy(), own.h[:, axis]) for own in (part.read() for part in sample))
     J, h = (np.concatenate(part)[some] for part in zip(*contents, strict=True))
     cuts = [slice(k, k + SIZE) for k in range(0, len(lot), SIZE)]

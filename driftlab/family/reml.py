@@ -110,16 +110,12 @@ def _swept(matrices: Array) -> tuple[Array, Array]:
     Of small ones LAPACK's take four times as long. Source: J. H. Goodnight, A tutorial on the SWEEP operator, Am. Stat.
     33 (1979) 149.
     """
-    inverses, (n, q, _) = np.empty_like(matrices), matrices.shape
+    inverses, (n, q, _) = matrices.copy(), matrices.shape
     pivots, row = np.empty((n, q)), np.empty(q)
     for i in range(n):
         S = inverses[i]
-        for j in range(q):
-            for m in range(j + 1):
-                S[j, m] = matrices[i, j, m]
         for k in range(q):
-            pivots[i, k] = S[k, k]
-            pivot = 1.0 / S[k, k]
+            pivots[i, k], pivot = S[k, k], 1.0 / S[k, k]
             for m in range(q):
                 row[m] = S[max(k, m), min(k, m)]
             row[k] = 0.0
@@ -406,26 +402,25 @@ def _nearest(expected: EStep) -> Array:
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
     u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
-    parts: Array = _parts_of_prior(peaks, u, np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9)), np.exp(numbers))
+    parts: Array = _parts_of_prior(peaks, u, np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9)), *np.exp(numbers))
     return parts[0], parts[1:]
 
 
 @compiled
-def _parts_of_prior(peaks: Array, u: Array, shorter: float, numbers: Array) -> Array:
+def _parts_of_prior(
+    peaks: Array, u: Array, shorter: float, a0: float, a1: float, s: float, length: float, r: float
+) -> Array:
     """Return Psi and its derivatives (6, q, q); k is |T - T'| times `shorter`."""
-    q, (a0, a1, s, length, r) = len(peaks), (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    parts = np.empty((6, q, q))
-    for i in range(q):
+    parts = np.empty((6, len(peaks), len(peaks)))
+    for i in range(len(peaks)):
         for j in range(i + 1):
             distance, tiny = abs(peaks[i] - peaks[j]), 1e-9 if i == j else 0.0
             k, square = shorter * distance, (distance / length) ** 2
-            level, slope, curve = a0**2 * (1 + tiny), a1**2 * (u[i] * u[j] + tiny), s**2 * np.exp(-0.5 * square)
-            smooth_curve, rough = curve + s**2 * tiny, r**2 * (1 + k) * np.exp(-k)
-            parts[0, i, j] = level + slope + smooth_curve + rough
-            parts[1, i, j], parts[2, i, j], parts[3, i, j] = 2 * level, 2 * slope, 2 * smooth_curve
-            parts[4, i, j], parts[5, i, j] = curve * square, 2 * rough
-            for m in range(6):
-                parts[m, j, i] = parts[m, i, j]
+            curve = s**2 * np.exp(-0.5 * square)
+            four = a0**2 * (1 + tiny), a1**2 * (u[i] * u[j] + tiny), curve + s**2 * tiny, r**2 * (1 + k) * np.exp(-k)
+            psi = four[0] + four[1] + four[2] + four[3]
+            for m, part in enumerate((psi, 2 * four[0], 2 * four[1], 2 * four[2], curve * square, 2 * four[3])):
+                parts[m, i, j] = parts[m, j, i] = part
     return parts
 
 
