@@ -254,7 +254,9 @@ def _weighted_sums(values: Array, weight: Array, n: int) -> Array:
     `soak.blocks.means` takes ten times as long where rows are wide and n is small.
     """
     K = len(values) // n
-    sums = np.einsum("Kn,Kn...->K...", weight[: K * n].reshape(K, n), values[: K * n].reshape(K, n, *values.shape[1:]))
+    sums: Array = np.einsum(
+        "Kn,Kn...->K...", weight[: K * n].reshape(K, n), values[: K * n].reshape(K, n, *values.shape[1:])
+    )
     sums[-1] += np.einsum("n,n...->...", weight[K * n :], values[K * n :])
     return sums
 
