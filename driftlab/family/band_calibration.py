@@ -24,7 +24,7 @@ from statistics import NormalDist
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, Posterior, fit_family
+from driftlab.family.mixed_model import Family, Posterior, fit_some, stacked
 from driftlab.family.partitions import A_FEW, FamilyUnits, Partition, Partitions, UnitOfLot, in_partitions
 from driftlab.family.unit_noise import common_walk
 from fusion_core.chunk import Array
@@ -60,17 +60,18 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
         Its units and their lots, or a sample of them; with their rows.
     """
     units = in_partitions(units, A_FEW)
-    rows = [row for own in units.map(_ranges) for row in own]
-    first, last = np.array([domain for domain, *_ in rows]).T
+    domains, noise, known, lots = zip(*(row for own in units.map(_ranges) for row in own), strict=True)
+    first, last = np.array(domains).T
     whole = float(np.quantile(first, 0.25)), float(np.quantile(last, 0.75))  # of most: one may have seen more
     long = np.flatnonzero((last - first) / (whole[1] - whole[0]) >= SEEN)
     if len(long) < MIN_UNITS:
         return None
     long = long[sample_of(len(long), MAX_LEFT_OUT)]
-    folds, have = [long[k::FOLDS] for k in range(FOLDS)], [k for k, (*_, known) in enumerate(rows) if known]
-    others = [Partitions(units.chosen(np.setdiff1d(np.arange(len(units)), fold)).parts) for fold in folds]
+    folds, have = [long[k::FOLDS] for k in range(FOLDS)], np.flatnonzero(known)
+    others = (np.setdiff1d(np.arange(len(units)), fold) for fold in folds)
     alike = units.chosen((have[k] for k in sample_of(len(have), ALIKE)), ALIKE).parts
-    jobs = [*(partial(fit_family, some, start=family) for some in others), *(partial(_common_walk, p) for p in alike)]
+    fit = partial(fit_some, family, Partitions(stacked(units, family.knots).parts), lots)
+    jobs = [*(partial(fit, some) for some in others), *(partial(_common_walk, p) for p in alike)]
     found = [*units.engine(call, jobs)]
     todo = [(own, part) for own, fold in zip(found, folds, strict=False) for part in units.chosen(fold, A_FEW).parts]
     of_units = [*chain.from_iterable(units.engine(partial(_measured, whole), todo))]
@@ -81,13 +82,13 @@ def measure_bands(family: Family, units: FamilyUnits) -> Bands | None:
             parts.append(part)
             factors.append(_factors([scores for scores, _ in pairs], len(long)))
             far.append(tuple(np.quantile([distances for _, distances in pairs], 1 - FAR, axis=0).tolist()))
-    noise = _typical(np.array([noise for _, noise, _ in rows]), *found[FOLDS:])
-    return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=noise) if parts else None
+    typical = _typical(np.array(noise), *found[FOLDS:])
+    return Bands(units=len(long), parts=parts, factors=factors, far=far, noise=typical) if parts else None
 
 
-def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array], bool]]:
-    """Return the range of each unit, degC, the densities of its white noise and its walk, and whether it has rows."""
-    return [(soaked.knots.domain, (soaked.white, soaked.walk), bool(soaked.recordings)) for soaked, _ in units]
+def _ranges(units: Sequence[UnitOfLot]) -> list[tuple[tuple[float, float], tuple[Array, Array], bool, str]]:
+    """Return the range of each unit, degC, the densities of its noise, white and walk, if it has rows, and its lot."""
+    return [(soaked.knots.domain, (soaked.white, soaked.walk), bool(soaked.recordings), lot) for soaked, lot in units]
 
 
 def _measured(
@@ -96,20 +97,21 @@ def _measured(
     """Return z and g of each part of each unit by a family that it was left out of, and its distances; None of none."""
     (family, units), measured = job, []
     first, last = family.knots.domain
+    parts = whole[0] + (whole[1] - whole[0]) * np.array(PARTS)
     for soaked, lot in units.read():
-        before = family.marginal(lot)
-        more = before.informed(*family.information_of(soaked))
-        low, high = soaked.knots.domain
+        before, (low, high) = family.marginal(lot), soaked.knots.domain
         T = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
-        B, of_parts = family.knots.values(T), list[tuple[Array, Array] | None]()
-        for part in PARTS:
-            low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
-            if (short := soaked.between(low, high)) is None:
+        shorts = [soaked.between(*part) for part in parts]
+        known = [family.information_of(one) for one in (soaked, *shorts) if one is not None]
+        informed = before.informed(*(np.stack(values) for values in zip(*known, strict=True)))
+        found = zip(_scores(family.knots.values(T), informed), known[1:], strict=True)
+        of_parts = list[tuple[Array, Array] | None]()
+        for (low, high), short in zip(parts, shorts, strict=True):
+            if short is None:
                 of_parts.append(None)
                 continue
-            J, h = family.information_of(short)
-            beyond = B[(low > T) | (high < T)]
-            of_parts.append((_scores(beyond, before.informed(J, h), more), before.distance(J, h)))
+            scores, (J, h) = next(found)
+            of_parts.append((scores[(low > T) | (high < T)], before.distance(J, h)))
         measured.append(of_parts)
     return measured
 
@@ -140,15 +142,19 @@ def _typical(noise: Array, common: tuple[Array, Array] | None = None) -> Typical
     )  # fmt: skip
 
 
-def _scores(B: Array, less: Posterior, more: Posterior) -> Array:
-    """Return z and g (N, d, 2) of a part of a soak, at temperatures with the splines B (N, q).
+def _scores(B: Array, informed: Posterior) -> Array:
+    """Return z and g (P, N, d, 2) of P parts of a soak, at temperatures with the splines B (N, q).
 
-    z is not a number where the part knew nearly as much as the whole.
+    `informed` is the unit's law by the whole soak, and by each part. z is not a number where a part knew nearly as much
+    as the whole.
     """
-    own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
-    gained = np.maximum(own - after, 0.0)
+    (P, d, q), N = informed.c.shape, len(B)
+    variances = deviation(B, informed.covariance.reshape(P * d, q, q)).T.reshape(P, d, N).transpose(0, 2, 1) ** 2
+    curves = B @ informed.c.transpose(0, 2, 1)
+    own = variances[1:]
+    gained = np.maximum(own - variances[0], 0.0)
     known = np.where(gained > GAINED * own, gained, np.nan)
-    return np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
+    return np.stack([(curves[1:] - curves[0]) / np.sqrt(known), gained / own], axis=3)
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:

@@ -65,10 +65,10 @@ class SplineBasis:
         """Return the splines (N, q) at T (N,) degC; beyond the domain those at its ends."""
         x = np.clip(T / self.step - self.first, 0, self.intervals)
         k = np.minimum(x.astype(np.intp), self.intervals - 1)
-        u = x - k
-        rows = np.stack([(1 - u) ** 3, (3 * u - 6) * u**2 + 4, ((3 - 3 * u) * u + 3) * u + 1, u**3], axis=1) / 6
+        u, rows = x - k, np.arange(len(x))
         B = np.zeros((len(x), self.q))
-        np.put_along_axis(B, k[:, None] + np.arange(DEGREE + 1), rows, axis=1)
+        for j, spline in enumerate(((1 - u) ** 3, (3 * u - 6) * u**2 + 4, ((3 - 3 * u) * u + 3) * u + 1, u**3)):
+            B[rows, k + j] = spline / 6
         return B
 
     @lru_cache(maxsize=16)  # noqa: B019  # of a family's knots, which all its units have

@@ -38,6 +38,7 @@ from driftlab.family.reml import (
     RemlFit,
     VarianceComponents,
     fit_axis,
+    inverse,
     means_of,
     outlier_weights,
     root_of,
@@ -61,9 +62,7 @@ ENTERED = 0.199  # of an interval of the knots, for a unit to have seen it
 MIN_SHARE = 0.02  # of all units, likewise
 
 
-def fit_family(
-    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, start: Family | None = None
-) -> Family:
+def fit_family(units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0) -> Family:
     """Return the family of units.
 
     Parameters
@@ -73,8 +72,6 @@ def fit_family(
         Whose bias, and its SI unit.
     seed : int
         Of the sample of SAMPLE units that Sigma is of, where there are more.
-    start : Family, optional
-        One of nearly these units: its domain is taken, and EM begins with its law.
 
     Raises
     ------
@@ -83,28 +80,45 @@ def fit_family(
         was seen by MIN_UNITS of them.
     """
     units = in_partitions(units)
-    knots, axes, lots, lot, by_enough = _survey(units)
-    knots, seen = (knots, by_enough) if start is None else (start.knots, start.seen)
-    n, d = len(units), len(axes)
+    knots, axes, lots, lot, seen = _survey(units)
+    n = len(units)
     chosen = np.arange(n)
     if n > SAMPLE:
         chosen = np.sort(np.random.default_rng(seed).choice(n, SAMPLE, replace=False))
     present, own = np.unique(lot[chosen], return_inverse=True)
-    sample = (units if n <= SAMPLE else units.chosen(chosen)).keep("sample", partial(_stacked, knots))
-    laws = [None] * d if start is None else map(VarianceComponents, start.Sigma, start.Lambda)
-    fits = [*sample.engine(partial(_fit_of, sample.parts, own, knots.peaks), enumerate(laws))]
-    w = np.stack([fit.w for fit in fits], axis=1)
+    sample = stacked(units if n <= SAMPLE else units.chosen(chosen), knots)
+    fits = [*sample.engine(partial(_fit_of, sample.parts, slice(None), own, knots.peaks), range(len(axes)))]
     means = _means_of_all(units, knots, fits, present, lot) if n > SAMPLE else [fit.means for fit in fits]
+    w = np.stack([fit.w for fit in fits], axis=1)
     low = np.flatnonzero(np.any(w < 0.5, axis=1))
     names = [soaked.unit for soaked, _ in units.chosen(chosen[low]).read()]
     return Family(
         channel=channel, bias_unit=bias_unit, axes=axes, first=knots.first, intervals=knots.intervals,
-        step=knots.step, seen=seen, units=n, sampled=len(chosen), mu=np.stack([m.mu for m in means]),
-        mu_covariance=_symmetric([m.covariance for m in means]), Sigma=np.stack([fit.law.Sigma for fit in fits]),
-        Lambda=_symmetric([fit.law.Lambda for fit in fits]), lots=_lots(lots, means),
+        step=knots.step, seen=seen, units=n, sampled=len(chosen), **_laws(fits, means, lots),
         weights={name: w[k].tolist() for name, k in zip(names, low, strict=True)},
-        steps=[fit.steps for fit in fits], moved=[fit.moved for fit in fits],
     )  # fmt: skip
+
+
+def fit_some(family: Family, sample: Partitions[OfAxes], lots: Sequence[str], some: Integers) -> Family:
+    """Return the family of `some` of its units, by their places in a `sample`, which are of these `lots`.
+
+    Its knots are kept, and EM begins with its law.
+    """
+    n, counts = len(some), Counter(lots[k] for k in some)
+    numbers, laws = numbered(counts, n), map(VarianceComponents, family.Sigma, family.Lambda)
+    fit = partial(_fit_of, sample.parts, some, np.array([numbers[lots[k]] for k in some]), family.knots.peaks)
+    fits = [fit(axis, law) for axis, law in enumerate(laws)]
+    laws_of_some = _laws(fits, [fit.means for fit in fits], {name: (k, counts[name]) for name, k in numbers.items()})
+    return family.model_copy(update={"units": n, "sampled": n, **laws_of_some})
+
+
+def _laws(fits: Sequence[RemlFit], means: Sequence[Means], lots: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    """Return the laws of a family by its attributes; of each lot its number and its units."""
+    return {
+        "mu": np.stack([m.mu for m in means]), "mu_covariance": _symmetric([m.covariance for m in means]),
+        "Sigma": np.stack([fit.law.Sigma for fit in fits]), "Lambda": _symmetric([fit.law.Lambda for fit in fits]),
+        "lots": _lots(lots, means), "steps": [fit.steps for fit in fits], "moved": [fit.moved for fit in fits],
+    }  # fmt: skip
 
 
 def _survey(
@@ -183,19 +197,23 @@ def numbered(lots: Iterable[str], units: int) -> dict[str, int]:
     return dict.fromkeys(names, 0) if len(names) == units else {name: k for k, name in enumerate(names)}
 
 
+def stacked(units: Partitions[Sequence[UnitOfLot]], knots: SplineBasis) -> Partitions[OfAxes]:
+    """Return the information of units on knots, which stays where it was made."""
+    return units.keep("stacked", partial(_stacked, knots))
+
+
 def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
-    """Return the information of units on knots."""
     J, h = zip(*(marginalised(soaked, knots) for soaked, _ in units), strict=True)
     return OfAxes(np.stack(J), np.stack(h))
 
 
 def _fit_of(
-    sample: Sequence[Partition[OfAxes]], lot: Integers, peaks: Array, job: tuple[int, VarianceComponents | None]
-) -> RemlFit:
-    """Return the fit of an axis of a sample, of the lots `lot` (n,), from a law on, in parts of SIZE units."""
-    axis, law = job
+    sample: Sequence[Partition[OfAxes]], some: Integers | slice, lot: Integers, peaks: Array, axis: int,
+    law: VarianceComponents | None = None,
+) -> RemlFit:  # fmt: skip
+    """Return the fit of an axis of `some` of a sample, of lots `lot` (n,), from a law on, in parts of SIZE units."""
     contents = ((own.J[:, axis].copy(), own.h[:, axis]) for own in (part.read() for part in sample))
-    J, h = (np.concatenate(part) for part in zip(*contents, strict=True))
+    J, h = (np.concatenate(part)[some] for part in zip(*contents, strict=True))
     cuts = [slice(k, k + SIZE) for k in range(0, len(lot), SIZE)]
     return fit_axis([(J[cut], h[cut], lot[cut]) for cut in cuts], peaks, law)
 
@@ -230,16 +248,16 @@ def _of_their_lots(
     for (soaked, _), g in zip(units, lot.tolist(), strict=True):
         J, h = marginalised(soaked, knots)
         A, a = back @ J @ L, back @ h[..., None]
-        K = one - np.linalg.inv(A + one)
+        K = one - inverse(A + one)
         z = (a - K @ (a + centres[g][..., None]))[..., 0]
         w = outlier_weights(np.sum(z**2, axis=1) / np.trace(K, axis1=1, axis2=2), limits)[:, None, None]
-        V = np.linalg.inv(A + w * one)
+        V = inverse(A + w * one)
         own = w * (one - w * V), (w * V @ a)[..., 0]
         sums[g] = added(sums[g], own) if g in sums else own
     return sums
 
 
-def _lots(lots: Mapping[str, tuple[int, int]], means: list[Means]) -> dict[str, LotEffect]:
+def _lots(lots: Mapping[str, tuple[int, int]], means: Sequence[Means]) -> dict[str, LotEffect]:
     """Return the effects of the lots that have a name, or of the only one; of each its number and its units."""
     if len({number for number, _ in lots.values()}) < len(lots):
         return {}
@@ -275,7 +293,7 @@ class Posterior:
         """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
         L, _ = self.root
         back = L.transpose(0, 2, 1)
-        V = np.linalg.inv(np.eye(L.shape[2]) + back @ J @ L)
+        V = inverse(np.eye(L.shape[2]) + back @ J @ L)
         a = back @ (h[..., None] - J @ self.c[..., None])
         return Posterior(self.c + (L @ (V @ a))[..., 0], L @ V @ back)
 

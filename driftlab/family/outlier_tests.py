@@ -30,7 +30,7 @@ import numpy.typing as npt
 from driftlab.family.mixed_model import Family
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import TERM_FIGURES, UnitRecord
-from driftlab.family.reml import WEIGHT
+from driftlab.family.reml import WEIGHT, inverse
 from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_records import at_places, figure_of, figures_in, of_units
@@ -113,7 +113,7 @@ class CurveStatistics:
         total, weights = self.family.sampled + WEIGHT, self.family.weights.get(soaked.unit, (1.0,) * len(h))
         table = np.empty((len(CURVES), len(h)))
         for axis, shape in enumerate(self.shapes(lot)):
-            V = np.linalg.inv(np.eye(len(shape.c)) + shape.L.T @ J[axis] @ shape.L)
+            V = inverse(np.eye(len(shape.c)) + shape.L.T @ J[axis] @ shape.L)
             z = V @ (shape.L.T @ (h[axis] - J[axis] @ shape.c))
             own = CurveDeviation(z, np.eye(len(z)) - V, float(weights[axis]) / total if self._fitted else 0.0)
             curve = own.squared()
@@ -354,13 +354,12 @@ def _usual(name: str, values: Array, sigma: Array) -> float:
 
 def _off(u: Array, lots: Texts) -> dict[str, float]:
     """Return the shift, in widths, of each lot that is off as a whole."""
-    from scipy.ndimage import median
-
     known = np.isfinite(u)
     if not np.any(known):
         return {}
     names, number, count = np.unique(lots[known], return_inverse=True, return_counts=True)
-    middle = np.asarray(median(u[known], number, np.arange(len(names))))
+    ordered, first = u[known][np.lexsort((u[known], number))], np.cumsum(count) - count
+    middle = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2
     off = np.abs(middle) > np.maximum(1.0, LOT_OFF * 1.2533 / np.sqrt(count))
     off &= (count >= MIN_UNITS_OF_LOT) & (count <= len(u) / 2)
     return dict(zip(names[off].tolist(), middle[off].tolist(), strict=True))

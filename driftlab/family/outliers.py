@@ -44,6 +44,7 @@ from driftlab.family.outlier_tests import (
 )
 from driftlab.family.partitions import FamilyUnits, UnitOfLot, in_partitions
 from driftlab.family.record import PER, TERM_FIGURES, UnitRecord, figure_name
+from driftlab.family.reml import inverse
 from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.family.unit_information import UnitInformation
 from driftlab.units import BiasUnit, axis_name, default_unit, number
@@ -487,7 +488,7 @@ def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tupl
     Beside it these sizes (G,), and the deviation of the coefficients that is left.
     """
     M = np.eye(L.shape[1]) + L.T @ J @ L
-    V = np.linalg.inv(M)
+    V = inverse(M)
     a = L.T @ (h - J @ c)
     z, K = V @ a, np.eye(len(a)) - V
     cost = float(c @ J @ c - 2 * h @ c - a @ z + np.linalg.slogdet(M)[1])

@@ -78,9 +78,9 @@ class UnitInformation:
             if not np.any(where):
                 continue
             parts.append(rows.part(where))
-            B = knots.values(parts[-1].T)
+            columns = np.column_stack([knots.values(parts[-1].T), parts[-1].t])
             for axis in range(d):
-                columns = np.column_stack([B, parts[-1].bias[:, axis]])
+                columns[:, q] = parts[-1].bias[:, axis]
                 X = parts[-1].whitened(columns, white[axis], walk[axis], free=k > 0, start=rows.t[0])
                 N = X.T @ X
                 J[axis] += N[:q, :q]

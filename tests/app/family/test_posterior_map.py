@@ -13,7 +13,7 @@ from driftlab.family import band_calibration
 from driftlab.family.band_calibration import PARTS, measure_bands
 from driftlab.family.bands import LEVELS
 from driftlab.family.file import load_family, save_family
-from driftlab.family.mixed_model import Family, fit_family
+from driftlab.family.mixed_model import Family, fit_family, fit_some
 from driftlab.family.posterior_map import UnitPosterior, unit_posterior, with_pooled_noise
 from driftlab.family.unit_information import UnitInformation
 from driftlab.soak.blocks import SoakRows
@@ -144,7 +144,7 @@ def test_bands_measure_that_a_family_is_surer_than_it_may_be(monkeypatch: pytest
     units = [(_unit(seed), "") for seed in range(60)]
     family = fit_family(units)
     right = measure_bands(family, units)
-    monkeypatch.setattr(band_calibration, "fit_family", lambda own, start: _scaled(fit_family(own, start=start), 1 / 9))
+    monkeypatch.setattr(band_calibration, "fit_some", lambda *given: _scaled(fit_some(*given), 1 / 9))
     narrow = measure_bands(family, units)
     assert right is not None
     assert narrow is not None
