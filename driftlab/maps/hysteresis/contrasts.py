@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from driftlab.soak.blocks import CELLS, OFF, SoakRows, SoakSummary, means, runs
 from fusion_core.chunk import Array, Flags, Integers
+from fusion_core.thermal.soak_noise import Complement, basis_of
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about; half as many miss one more memory in a hundred
@@ -121,11 +122,10 @@ class SoakContrasts:
         laws = [self.root * C * self.root.T for C in laws_of(self.blocks, recording)]
         self.curve, self.splines = self._curve(soak, laws[0])
         self.X = np.column_stack([self.splines * self.root, self.more])
-        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
-        within = _Complement(U[:, s > RANK * s[0]])
-        self.Z = within.Z
+        free_of_X = Complement(basis_of(self.X, RANK))
+        self.Z = free_of_X.Z
         self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
-        self.laws = [np.linalg.eigh(within.of(C)) for C in self.covariances[:-1]]
+        self.laws = [np.linalg.eigh(free_of_X.both(C)) for C in self.covariances[:-1]]
         self.laws += [_of_drift(C, self.Z) for C in self.covariances[-1:]]
         self._fits: dict[int, tuple[Array, Array, Array]] = {}
 
@@ -383,26 +383,6 @@ class SoakContrasts:
         thin = np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         log_w = self.log_w[thin, None]
         return np.asarray((log_w - log_size / 2)[..., None] - len(self.u) / 2 * np.log(left))
-
-
-class _Complement:
-    """Contrasts Z (K, m) of independent columns (K, p), Z' columns = 0: p reflections, by Householder."""
-
-    def __init__(self, columns: Array) -> None:
-        from scipy.linalg.lapack import dgeqrf, dormqr
-
-        K, self.p = columns.shape
-        self._reflections, self._scales, _, _ = dgeqrf(columns)
-        self._room = 64 * K
-        self.Z = np.asarray(dormqr("L", "N", self._reflections, self._scales, np.eye(K), self._room)[0][:, self.p :])
-
-    def of(self, C: Array) -> Array:
-        """Return Z' C Z (m, m) of C (K, K), without its products by all of Z."""
-        from scipy.linalg.lapack import dormqr
-
-        turned = dormqr("L", "T", self._reflections, self._scales, C, self._room)[0]
-        turned = dormqr("R", "N", self._reflections, self._scales, turned, self._room, overwrite_c=1)[0]
-        return np.asarray(turned[self.p :, self.p :])
 
 
 def _of_drift(C: Array, Z: Array) -> tuple[Array, Array]:
