@@ -145,6 +145,16 @@ class WalkContrasts:
     of_wandering: Array
     inside: float
 
+    @cached_property
+    def v(self) -> Array:
+        """The variance (R, m) of each under RATIOS, where that of white noise is 1."""
+        return np.asarray(self.of_white + RATIOS[:, None] * self.of_wandering)
+
+    @cached_property
+    def log_v(self) -> Array:
+        """The sum (R,) of their logarithms."""
+        return np.asarray(np.sum(np.log(self.v), axis=1))
+
 
 def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     """Return the contrasts of what P (K, K) leaves of rows, by each law."""
@@ -187,12 +197,11 @@ def bounds(
     free = rows.count - len(r) if rows.size > 1 else 0
     best, each_law = np.inf, []
     for one, (a, b) in zip(each, wanted, strict=True):
-        v = one.of_white + RATIOS[:, None] * one.of_wandering  # (R, m), of w = 1
         v_inside = 1 + RATIOS * one.inside
-        squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
+        squares = np.sum((one.V @ r) ** 2 / one.v, axis=1) + within / v_inside
         n = len(one.V) + free
         w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
-        cost = n * np.log(w) + squares / w + np.sum(np.log(v), axis=1) + free * np.log(v_inside)
+        cost = n * np.log(w) + squares / w + one.log_v + free * np.log(v_inside)
         each_law.append((cost, w * (a + RATIOS * b)))
         best = min(best, float(np.min(cost)))
     near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]

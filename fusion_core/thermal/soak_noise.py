@@ -236,11 +236,17 @@ def walk_covariance(blocks: Blocks) -> Array:
     its samples, also of such as were measured in turn with another's.
     """
     during = blocks.during
-    S = during.shape[1]
-    # sum of during(s) min(s, r) over s: twice the sum, over the stretches before r, of what is still to come after them
-    later = np.cumsum(during.T.toarray()[::-1], axis=0)[::-1]
-    least = np.zeros_like(later)
-    np.cumsum(later[1:], axis=0, out=least[1:])
+    K, S = during.shape
+    first, row = during.indices[during.indptr[:-1]], np.repeat(np.arange(K), np.diff(during.indptr))
+    own = np.zeros((K, int(np.max(during.indices - first[row])) + 1))
+    own[row, during.indices - first[row]] = during.data
+    # sum of during(s) min(s, r) over s: r before a block, its mean stretch after it; within, as much more from r to r + 1
+    # as is still to come
+    within = first[:, None] + np.cumsum(own[:, ::-1], axis=1)[:, ::-1].cumsum(axis=1) - 1.0
+    least = np.minimum(np.arange(S, dtype=np.float64)[:, None], within[:, -1])
+    r = first[:, None] + np.arange(own.shape[1])
+    inside = r < S
+    least[r[inside], np.nonzero(inside)[0]] = within[inside]
     covariance = (during @ least + 0.5 - (during @ during.T).toarray() / 6) / S
     return np.asarray((covariance + covariance.T) / 2)
 
