@@ -143,13 +143,19 @@ class ShapeEvidence:
     @property
     def _gram(self) -> Array:
         """Inner products (R', P, d) of the shapes of each pair."""
-        gram, (m, _, d) = [], self.z.shape
-        some, places = np.unique(self._both, return_inverse=True)
-        i, k = places.reshape(2, -1)
+        gram, (m, _, d), (i, k) = [], self.z.shape, self._both
+        alike, some = k < self.added, np.unique(self._both)  # those that add are alike on all axes
+        first, other = some[some < self.added], some[some >= self.added]
+        i, k, inputs = np.searchsorted(some, i), np.searchsorted(some, k), np.flatnonzero(~alike)
         for own, V in self.contrasts.laws:
-            few = (V.T @ self.z[:, some].reshape(m, -1)).reshape(m, len(some), d)
+            added = V.T @ self.z[:, first, 0]
+            follows = (V.T @ self.z[:, other].reshape(m, -1)).reshape(m, -1, d)
             w = self.contrasts.weights(own)[::THIN]
-            gram.append((w @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(len(w), len(i), d))
+            each = np.empty((len(w), len(i), d))
+            each[:, alike] = (w @ (added[:, i[alike]] * added[:, k[alike]]))[:, :, None]
+            mixed = added[:, i[inputs], None] * follows[:, k[inputs] - len(first)]
+            each[:, inputs] = (w @ mixed.reshape(m, -1)).reshape(len(w), -1, d)
+            gram.append(each)
         return np.concatenate(gram)
 
     def _of(self, noises: Integers | slice, t2: Array, p: int) -> Array:

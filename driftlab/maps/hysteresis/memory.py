@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEv
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array
+from fusion_core.threads import one_thread
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
 ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be distinguished from it
@@ -121,7 +122,7 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
     reason = _unseen(soak)
     if reason:
         return MemoryVerdict.unknown(d, WHY[reason])
-    with _threads().limit(limits=1):  # of small matrices
+    with one_thread():
         contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
         if not contrasts.laws or not shapes.kinds:
             return MemoryVerdict.unknown(d, WHY["short" if np.all(contrasts.known) else "coarse"])
@@ -133,13 +134,6 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
             slots, more, followed, curves = contrasts.added_by_inputs(shapes.inputs, noises)
             added, z = np.concatenate([added, slots], axis=1), np.concatenate([z, more], axis=1)
         return _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), added, shapes, curves).verdict()
-
-
-@cache
-def _threads() -> Any:
-    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
-
-    return ThreadpoolController()
 
 
 def _unseen(soak: SoakSummary) -> str:

@@ -206,11 +206,11 @@ class Sweeps:
 
 def _over(grid: Array, T: Array, values: Array) -> Array:
     order = np.argsort(T, kind="stable")
-    T, flat = T[order], values[order].reshape(len(T), -1)
+    T, flat = T[order], values.reshape(len(T), -1)
     place = np.clip(np.searchsorted(T, grid) - 1, 0, len(T) - 2)
     width = T[place + 1] - T[place]
     share = np.clip(np.divide(grid - T[place], width, out=np.zeros_like(grid), where=width > 0), 0.0, 1.0)[:, None]
-    values_there = flat[place] * (1 - share) + flat[place + 1] * share
+    values_there = flat[order[place]] * (1 - share) + flat[order[place + 1]] * share
     values_there[(grid < T[0]) | (grid > T[-1])] = np.nan
     return np.asarray(values_there.reshape(len(grid), *values.shape[1:]))
 
