@@ -25,6 +25,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from fusion_core.chunk import Array
+from fusion_core.thermal.soak_noise import Complement
 
 REACH = 1.96**2  # of twice the log-likelihood: 1.645^2 were 93 % on one side, of so few squares as these
 UNLIKELY = 6.0  # of twice the log-likelihood: a law so far below the best is left out
@@ -168,12 +169,21 @@ def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     return each
 
 
+def contrasts_beside(rows: BiasMeans, columns: Array) -> list[WalkContrasts]:
+    """Return the contrasts of rows, of which columns (K, p), independent, take what they can, by each law."""
+    each, beside = [], Complement(columns)
+    for W, inside in zip(rows.covariances, rows.inside, strict=True):
+        value, V = np.linalg.eigh(beside.both(W))
+        each.append(WalkContrasts((beside.Z @ V).T, np.full(len(V), 1 / rows.size), np.maximum(value, 0.0), inside))
+    return each
+
+
 def mean_squares(rows: BiasMeans, P: Array) -> list[tuple[float, float]]:
     """Return the mean squares a and b that P (K, K) leaves of all averages, of white noise and of wandering, by law."""
-    free = rows.count - len(P)
-    white = (free + float(np.sum(P**2))) / rows.count
+    free, square = rows.count - len(P), P.T @ P
+    white = (free + float(np.trace(square))) / rows.count
     laws = zip(rows.covariances, rows.inside, strict=True)
-    return [(white, float(np.sum((P @ W) * P)) / len(P) + free * inside / rows.count) for W, inside in laws]
+    return [(white, float(np.sum(square * W)) / len(P) + free * inside / rows.count) for W, inside in laws]
 
 
 def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:
@@ -184,7 +194,7 @@ def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:
 @lru_cache(maxsize=8)
 def _about_level(t: bytes, lasted: float, size: int, count: int) -> list[WalkContrasts]:
     rows = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), count)
-    return contrasts(rows, np.eye(len(rows.t)) - 1 / len(rows.t))
+    return contrasts_beside(rows, np.ones((len(rows.t), 1)))
 
 
 def bounds(

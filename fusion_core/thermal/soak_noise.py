@@ -68,21 +68,20 @@ class Blocks:
         return self._spread(np.arange(N) * stretches // N, stretches)
 
     def _spread(self, which: Integers, count: int) -> csr_array:
-        from scipy.sparse import csr_array
-
-        K = len(self.T)
-        places, counts = np.unique(self.of_sample * count + which, return_counts=True)
-        of_block = places // count
-        return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
+        return _shares(self.of_sample, which, (len(self.T), count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
         """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples."""
-        from scipy.sparse import csr_array
+        return _shares(group, self.of_sample, (count, len(self.T)))
 
-        K = len(self.T)
-        places, counts = np.unique(group * K + self.of_sample, return_counts=True)
-        of_group, of_block = np.divmod(places, K)
-        return csr_array((counts / np.bincount(group)[of_group], (of_group, of_block)), shape=(count, K))
+
+def _shares(group: Integers, part: Integers, shape: tuple[int, int]) -> csr_array:
+    """Return the share of each part in the samples (N,) of each group, sparse."""
+    from scipy.sparse import csr_array
+
+    shares = csr_array((np.ones(len(group)), (group, part)), shape=shape)
+    shares.data /= np.repeat(np.bincount(group), np.diff(shares.indptr))
+    return shares
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
