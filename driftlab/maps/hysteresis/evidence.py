@@ -22,7 +22,7 @@ likelihoods to a power where no model is the true one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,9 +66,22 @@ class ShapeEvidence:
     @cached_property
     def _sums(self) -> tuple[Array, Array]:
         """A and B (R, J, d)."""
-        each = zip(self._sums_of(self.z[:, : self.added, :1]), self._sums_of(self.z[:, self.added :]), strict=True)
-        A, B = (np.concatenate(both, axis=1) for both in each)
+        A, B = (np.concatenate(both, axis=1) for both in zip(self._of_added, self._of_inputs, strict=True))
         return A, B
+
+    @cached_property
+    def _of_added(self) -> tuple[Array, Array]:
+        return self._sums_of(self.z[:, : self.added, :1])
+
+    @property
+    def _of_inputs(self) -> tuple[Array, Array]:
+        return self._sums_of(self.z[:, self.added :])
+
+    def with_inputs(self, z: Array) -> ShapeEvidence:
+        """Return the evidence with other shapes (m, I, d) of the inputs."""
+        other = replace(self, z=np.concatenate([self.z[:, : self.added], z], axis=1))
+        vars(other)["_of_added"] = self._of_added
+        return other
 
     def _sums_of(self, z: Array) -> tuple[Array, Array]:
         """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""

@@ -239,8 +239,7 @@ class _MemoryTest:
         if self.curves is None:
             return self
         slots = self.curves.added
-        z = np.concatenate([self.evidence.z[:, : self.evidence.added], self.contrasts.of(slots)], axis=1)
-        return replace(self, evidence=replace(self.evidence, z=z), slots=slots)
+        return replace(self, evidence=self.evidence.with_inputs(self.contrasts.of(slots)), slots=slots)
 
     @property
     def _divided(self) -> bool:
