@@ -25,7 +25,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.thermal.soak_noise import Complement
 
 REACH = 1.96**2  # of twice the log-likelihood: 1.645^2 were 93 % on one side, of so few squares as these
 UNLIKELY = 6.0  # of twice the log-likelihood: a law so far below the best is left out
@@ -147,34 +146,22 @@ class WalkContrasts:
     inside: float
 
     @cached_property
-    def v(self) -> Array:
-        """The variance (R, m) of each under RATIOS, where that of white noise is 1."""
-        return np.asarray(self.of_white + RATIOS[:, None] * self.of_wandering)
-
-    @cached_property
-    def log_v(self) -> Array:
-        """The sum (R,) of their logarithms."""
-        return np.asarray(np.sum(np.log(self.v), axis=1))
+    def variances(self) -> tuple[Array, Array]:
+        """The variance of each under RATIOS, where white noise has one of 1 (R, m), and the sum of logarithms (R,)."""
+        v = self.of_white + RATIOS[:, None] * self.of_wandering
+        return v, np.sum(np.log(v), axis=1)
 
 
-def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
-    """Return the contrasts of what P (K, K) leaves of rows, by each law."""
-    each = []
+def contrasts(rows: BiasMeans, P: Array, Z: Array | None = None) -> list[WalkContrasts]:
+    """Return the contrasts of what P (K, K) leaves of rows, by each law; Z (K, m), orthonormal, may span all that."""
+    Z, each = np.eye(len(P)) if Z is None else Z, []
+    left = P.T @ Z
     for W, inside in zip(rows.covariances, rows.inside, strict=True):
-        value, V = np.linalg.eigh(P @ W @ P.T)
-        of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
+        value, V = np.linalg.eigh(left.T @ W @ left)
+        of_white = np.sum((left @ V) ** 2, axis=0) / rows.size
         free_of_map = of_white > TAKEN / rows.size
         wandering = np.maximum(value[free_of_map], 0.0)
-        each.append(WalkContrasts(V.T[free_of_map], of_white[free_of_map], wandering, inside))
-    return each
-
-
-def contrasts_beside(rows: BiasMeans, columns: Array) -> list[WalkContrasts]:
-    """Return the contrasts of rows, of which columns (K, p), independent, take what they can, by each law."""
-    each, beside = [], Complement(columns)
-    for W, inside in zip(rows.covariances, rows.inside, strict=True):
-        value, V = np.linalg.eigh(beside.both(W))
-        each.append(WalkContrasts((beside.Z @ V).T, np.full(len(V), 1 / rows.size), np.maximum(value, 0.0), inside))
+        each.append(WalkContrasts((Z @ V).T[free_of_map], of_white[free_of_map], wandering, inside))
     return each
 
 
@@ -194,7 +181,7 @@ def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:
 @lru_cache(maxsize=8)
 def _about_level(t: bytes, lasted: float, size: int, count: int) -> list[WalkContrasts]:
     rows = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), count)
-    return contrasts_beside(rows, np.ones((len(rows.t), 1)))
+    return contrasts(rows, np.eye(len(rows.t)) - 1 / len(rows.t))
 
 
 def bounds(
@@ -207,11 +194,11 @@ def bounds(
     free = rows.count - len(r) if rows.size > 1 else 0
     best, each_law = np.inf, []
     for one, (a, b) in zip(each, wanted, strict=True):
-        v_inside = 1 + RATIOS * one.inside
-        squares = np.sum((one.V @ r) ** 2 / one.v, axis=1) + within / v_inside
+        (v, log_v), v_inside = one.variances, 1 + RATIOS * one.inside
+        squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
         n = len(one.V) + free
         w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
-        cost = n * np.log(w) + squares / w + one.log_v + free * np.log(v_inside)
+        cost = n * np.log(w) + squares / w + log_v + free * np.log(v_inside)
         each_law.append((cost, w * (a + RATIOS * b)))
         best = min(best, float(np.min(cost)))
     near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]

@@ -239,8 +239,8 @@ def walk_covariance(blocks: Blocks) -> Array:
     first, row = during.indices[during.indptr[:-1]], np.repeat(np.arange(K), np.diff(during.indptr))
     own = np.zeros((K, int(np.max(during.indices - first[row])) + 1))
     own[row, during.indices - first[row]] = during.data
-    # sum of during(s) min(s, r) over s: r before a block, its mean stretch after it; within, as much more from r to r + 1
-    # as is still to come
+    # sum of during(s) min(s, r) over s: r before a block, its mean stretch after it, and within it as much more from r
+    # to r + 1 as is still to come
     within = first[:, None] + np.cumsum(own[:, ::-1], axis=1)[:, ::-1].cumsum(axis=1) - 1.0
     least = np.minimum(np.arange(S, dtype=np.float64)[:, None], within[:, -1])
     r = first[:, None] + np.arange(own.shape[1])

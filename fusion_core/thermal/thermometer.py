@@ -14,7 +14,6 @@ Source: B. Widrow and I. Kollar, Quantization Noise, Cambridge University Press 
 from __future__ import annotations
 
 from functools import lru_cache
-from hashlib import blake2b
 from typing import NamedTuple
 
 import numpy as np
@@ -60,25 +59,19 @@ class Steps(NamedTuple):
 NO_STEPS = Steps(0.0, 0.0)
 
 
-_KNOWN: dict[bytes, Steps] = {}  # of the last readings, by their hash: a soak and its map ask for the same
-
-
 def steps_of(T: Array) -> Steps:
     """Return the steps of a thermometer that shows T (N,) in degC, one after the other, as readings or as means.
 
     Those of a soak, which goes through many of them. Temperatures count by how far the unit moves there, so that a
     chamber which stays at whole degrees is not taken for steps.
     """
-    key = blake2b(np.ascontiguousarray(T)).digest()
-    steps = _KNOWN.get(key)
-    if steps is None:
-        steps = _steps_of(T)
-        _KNOWN.clear()
-        _KNOWN[key] = steps
-    return steps
+    return _steps_of(np.asarray(T, dtype=np.float64).tobytes())
 
 
-def _steps_of(T: Array) -> Steps:
+@lru_cache(maxsize=1)
+def _steps_of(shown: bytes) -> Steps:
+    """Return them of the bytes of T: a soak and its map ask for the same."""
+    T = np.frombuffer(shown)
     if len(T) < 2 * PASSAGES or not np.ptp(T) > 2 * STEPS[0]:
         return NO_STEPS
     moved = _movement(T)

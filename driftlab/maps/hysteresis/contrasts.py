@@ -236,11 +236,12 @@ class SoakContrasts:
     def curves_under(self, noise: int, axis: int, late: Array, regressors: Array) -> tuple[Array, Array, Array]:
         """Return the curve (P,) of an axis under a noise, those that follow inputs (P, J), and how uncertain they are.
 
-        `late` (J, K, P): what X is where the curve sees the inputs, and `regressors` (J, m, P) in the contrasts. Whoever fits a free curve of temperature to what
-        follows an input, bends the curve by a part of the memory. So each curve is the one of which generalised least
-        squares would make the curve that they make here: as many equations as coefficients, in which nothing of the
-        contrasts' noise is. What these leave open is some directions, each a standard deviation long where white noise
-        has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
+        `late` (J, K, P): what X is where the curve sees the inputs, and `regressors` (J, m, P) in the contrasts.
+        Whoever fits a free curve of temperature to what follows an input, bends the curve by a part of the memory. So
+        each curve is the one of which generalised least squares would make the curve that they make here: as many
+        equations as coefficients, in which nothing of the contrasts' noise is. What these leave open is some
+        directions, each a standard deviation long where white noise has one of 1; those that the contrasts show most
+        are returned, (P, J, RANKS).
         """
         w, V = self.under(noise)
         _, solved, spread = self.fit(noise)
@@ -323,8 +324,8 @@ class SoakContrasts:
     def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
 
-        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise. a ~ N(0, g s^2) in
-        units in which what is shown most has g, one of SIZES: Zellner's prior of a whole curve.
+        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise. a ~ N(0, g s^2)
+        in units in which what is shown most has g, one of SIZES: Zellner's prior of a whole curve.
         """
         w, V = self.under(noise)
         white = np.sqrt(w)[:, None] * (V.T @ shown)
@@ -358,17 +359,13 @@ class SoakContrasts:
         They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.
         """
         some, other = np.triu_indices(ways.shape[2])
-        grams, Bs, Qs = [], [], []
+        each = []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
             turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
-            for sums, values in (
-                (grams, turned[:, :, some] * turned[:, :, other]),
-                (Bs, turned[..., None] * u[:, :, None]),
-                (Qs, u**2),
-            ):
-                sums.append((w @ values.reshape(len(u), -1)).reshape(len(w), *values.shape[1:]))
-        flat, B, Q = map(np.concatenate, (grams, Bs, Qs))
+            products = turned[:, :, some] * turned[:, :, other], turned[..., None] * u[:, :, None], u**2
+            each.append([(w @ x.reshape(len(u), -1)).reshape(len(w), *x.shape[1:]) for x in products])
+        flat, B, Q = map(np.concatenate, zip(*each, strict=True))
         gram = np.empty((*flat.shape[:2], *B.shape[2:3] * 2))
         gram[:, :, some, other] = gram[:, :, other, some] = flat
         return gram, B, Q

@@ -66,16 +66,13 @@ class ShapeEvidence:
     @cached_property
     def _sums(self) -> tuple[Array, Array]:
         """A and B (R, J, d)."""
-        A, B = (np.concatenate(both, axis=1) for both in zip(self._of_added, self._of_inputs, strict=True))
+        of_inputs = self._sums_of(self.z[:, self.added :])
+        A, B = (np.concatenate(both, axis=1) for both in zip(self._of_added, of_inputs, strict=True))
         return A, B
 
     @cached_property
     def _of_added(self) -> tuple[Array, Array]:
         return self._sums_of(self.z[:, : self.added, :1])
-
-    @property
-    def _of_inputs(self) -> tuple[Array, Array]:
-        return self._sums_of(self.z[:, self.added :])
 
     def with_inputs(self, z: Array) -> ShapeEvidence:
         """Return the evidence with other shapes (m, I, d) of the inputs."""
