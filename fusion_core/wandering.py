@@ -145,25 +145,32 @@ class WalkContrasts:
     of_wandering: Array
     inside: float
 
+    @cached_property
+    def variances(self) -> tuple[Array, Array]:
+        """The variance of each under RATIOS, where white noise has one of 1 (R, m), and the sum of logarithms (R,)."""
+        v = self.of_white + RATIOS[:, None] * self.of_wandering
+        return v, np.sum(np.log(v), axis=1)
 
-def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
-    """Return the contrasts of what P (K, K) leaves of rows, by each law."""
-    each = []
+
+def contrasts(rows: BiasMeans, P: Array, Z: Array | None = None) -> list[WalkContrasts]:
+    """Return the contrasts of what P (K, K) leaves of rows, by each law; Z (K, m), orthonormal, may span all that."""
+    Z, each = np.eye(len(P)) if Z is None else Z, []
+    left = P.T @ Z
     for W, inside in zip(rows.covariances, rows.inside, strict=True):
-        value, V = np.linalg.eigh(P @ W @ P.T)
-        of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
+        value, V = np.linalg.eigh(left.T @ W @ left)
+        of_white = np.sum((left @ V) ** 2, axis=0) / rows.size
         free_of_map = of_white > TAKEN / rows.size
         wandering = np.maximum(value[free_of_map], 0.0)
-        each.append(WalkContrasts(V.T[free_of_map], of_white[free_of_map], wandering, inside))
+        each.append(WalkContrasts((Z @ V).T[free_of_map], of_white[free_of_map], wandering, inside))
     return each
 
 
 def mean_squares(rows: BiasMeans, P: Array) -> list[tuple[float, float]]:
     """Return the mean squares a and b that P (K, K) leaves of all averages, of white noise and of wandering, by law."""
-    free = rows.count - len(P)
-    white = (free + float(np.sum(P**2))) / rows.count
+    free, square = rows.count - len(P), P.T @ P
+    white = (free + float(np.trace(square))) / rows.count
     laws = zip(rows.covariances, rows.inside, strict=True)
-    return [(white, float(np.sum((P @ W) * P)) / len(P) + free * inside / rows.count) for W, inside in laws]
+    return [(white, float(np.sum(square * W)) / len(P) + free * inside / rows.count) for W, inside in laws]
 
 
 def contrasts_about_level(rows: BiasMeans) -> list[WalkContrasts]:
@@ -187,12 +194,11 @@ def bounds(
     free = rows.count - len(r) if rows.size > 1 else 0
     best, each_law = np.inf, []
     for one, (a, b) in zip(each, wanted, strict=True):
-        v = one.of_white + RATIOS[:, None] * one.of_wandering  # (R, m), of w = 1
-        v_inside = 1 + RATIOS * one.inside
+        (v, log_v), v_inside = one.variances, 1 + RATIOS * one.inside
         squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
         n = len(one.V) + free
         w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
-        cost = n * np.log(w) + squares / w + np.sum(np.log(v), axis=1) + free * np.log(v_inside)
+        cost = n * np.log(w) + squares / w + log_v + free * np.log(v_inside)
         each_law.append((cost, w * (a + RATIOS * b)))
         best = min(best, float(np.min(cost)))
     near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]

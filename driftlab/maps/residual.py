@@ -18,7 +18,7 @@ from driftlab.soak.blocks import means, runs
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.soak_noise import summed
-from fusion_core.wandering import WalkContrasts, bounds, contrasts, mean_squares, rows_of
+from fusion_core.wandering import BiasMeans, WalkContrasts, bounds, contrasts, mean_squares, rows_of
 
 AVERAGED = 30.0  # s: as the reference of every table of errors
 MAX_ROWS = 120  # rows whose covariance is written down
@@ -67,15 +67,17 @@ def residual_of(
             if np.allclose(answer @ answer, answer, atol=CHOSEN):
                 each, P = contrasts(rows, one - answer), one - answer
             else:
-                each, P = chosen = chosen or (contrasts(rows, _without(blocks.T, FREE)), _without(blocks.T, STIFF))
+                chosen = chosen or _of_polynomials(rows, blocks.T)
+                each, P = chosen
             wanted = mean_squares(rows, P)
         squares.append(bounds(rows, each, r, float(rows.within[axis]), wanted))
     low, high = np.sqrt(np.array(squares)).T
     return Residual(rms, np.minimum(low, rms), np.maximum(high, rms))
 
 
-def _without(T: Array, order: int) -> Array:
-    """Return the projection P (K, K) that takes the polynomial of an order off rows at T (K,)."""
+def _of_polynomials(rows: BiasMeans, T: Array) -> tuple[list[WalkContrasts], Array]:
+    """Return the contrasts of rows at T (K,) beside a polynomial of the order FREE, and what one of STIFF leaves."""
     low, high = float(T.min()), float(T.max())
-    V = np.linalg.qr(np.polynomial.chebyshev.chebvander((2 * T - low - high) / (high - low), order))[0]
-    return np.asarray(np.eye(len(T)) - V @ V.T)
+    V = np.linalg.qr(np.polynomial.chebyshev.chebvander((2 * T - low - high) / (high - low), FREE), mode="complete")[0]
+    free, stiff = V[:, FREE + 1 :], V[:, STIFF + 1 :]
+    return contrasts(rows, free @ free.T, free), stiff @ stiff.T

@@ -103,7 +103,7 @@ class LevelLikelihood:
 
     def _over(self, ratios: Sequence[float] | Array) -> tuple[Array, Array, int]:
         q, each = self.q, [self.rows(ratio) for ratio in ratios]
-        N = np.stack([np.sum([X.T @ X for X, _ in rows], axis=0) for rows in each])
+        N = np.stack([sum(X.T @ X for X, _ in rows) for rows in each])
         variances = np.stack([np.concatenate([S[np.isfinite(S)] for _, S in rows]) for rows in each])
         L, nu = np.linalg.cholesky(N[:, :q, :q]), max(variances.shape[1] - q, 1)
         taken = np.linalg.solve(L, N[:, :q, q:])

@@ -32,6 +32,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.faults import Faults
 from fusion_core.thermal.curve_uncertainty import expected_curve_error, measured_noise
+from fusion_core.threads import one_thread
 
 LITTLE = 0.05  # of sigma: an hour that gains less is not worth it
 EDGE = 0.02  # of the range, by which its end may be missed
@@ -135,13 +136,11 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
 
 def jointly(profile: Profile, before: RecordedSoak) -> RatedProfile:
     """Return the rating of the map that is fitted to the recordings and a further profile together."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     subject, chamber = before.subject, before.chamber
     new = profile.samples(chamber.lag, max(int(profile.duration / before.dt), 2))[1]
     T = np.concatenate([before.T, new])
     bias = np.concatenate([before.bias, subject.drawn(new, before.dt, seed=0)])
-    with threadpool_limits(1):
+    with one_thread():
         answer = subject.map.smoother(T, bias)
         error = expected_curve_error(T, before.dt, subject.noise, subject.walk, answer)
     grid = before.temperature

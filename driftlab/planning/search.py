@@ -17,6 +17,7 @@ from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.thermal.curve_uncertainty import expected_curve_error, expected_misfit
+from fusion_core.threads import one_thread
 
 Progress = Callable[..., None] | None
 
@@ -147,13 +148,11 @@ def possible(*profiles: Profile | None) -> list[Profile]:
 
 def judge(profile: Profile, subject: UnitModel, chamber: Chamber, draws: int = 1) -> RatedProfile:
     """Return the rating of a profile; the kind's smoothing is the mean of that of `draws` simulated soaks."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     count = int(np.clip(profile.duration / EVERY, *SAMPLES))
     T, dt = profile.samples(chamber.lag, count)[1], profile.duration / count
     grid = np.linspace(chamber.low, chamber.high, GRID)
     noise, misfit = np.zeros((2, GRID, subject.d))
-    with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
+    with one_thread():  # a few hundred blocks
         for seed in range(draws):
             answer = subject.map.smoother(T, subject.drawn(T, dt, seed))
             noise += expected_curve_error(T, dt, subject.noise, subject.walk, answer).variance(grid) / draws

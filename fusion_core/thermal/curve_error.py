@@ -107,10 +107,10 @@ class CurveError(Frozen):
         """Return the variance (N, d) of the error at T (N,), or of its difference from that at T_0."""
         at = np.asarray(T, dtype=np.float64)
         e, ends = self._modes(at), self._beyond(at)
-        if T_0 is None:
-            return np.asarray(np.sum(e**2, axis=0) + ends, dtype=np.float64)
-        start = np.array([T_0])
-        return np.asarray(np.sum((e - self._modes(start)) ** 2, axis=0) + ends + self._beyond(start))
+        if T_0 is not None:
+            start = np.array([T_0])
+            e, ends = e - self._modes(start), ends + self._beyond(start)
+        return np.asarray(np.einsum("rNd,rNd->Nd", e, e) + ends)
 
     def at(self, T: ArrayLike) -> Array:
         """Return the modes (N, r, d) at T (N,)."""
@@ -124,7 +124,7 @@ class CurveError(Frozen):
         grid, values = self._arrays
         k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
         share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
-        return np.asarray(values[:, k] * (1 - share) + values[:, k + 1] * share, dtype=np.float64)
+        return np.asarray(values[:, k] + np.diff(values, axis=1)[:, k] * share)
 
     def _beyond(self, T: Array) -> Array:
         x = np.maximum(np.maximum(self.T[0] - T, T - self.T[-1]), 0.0)

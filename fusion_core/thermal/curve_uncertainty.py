@@ -313,6 +313,7 @@ def _expected_to_be_left(contrasts: Contrasts, noise: BlockNoise, operator: Arra
     Source: G. Wahba, Bayesian "confidence intervals" for the cross-validated smoothing spline, J. R. Stat. Soc. B 45
     (1983) 133.
     """
-    of_noise = operator @ left @ noise.root
-    smoothed = (operator - operator @ left) * (noise.white * contrasts.white) @ (operator @ left).T
+    of_left = operator @ left
+    of_noise = of_left @ noise.root
+    smoothed = (operator - of_left) * (noise.white * contrasts.white) @ of_left.T
     return np.asarray(of_noise @ of_noise.T + (smoothed + smoothed.T) / 2)

@@ -40,8 +40,9 @@ class Penalised:
 def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAMBDAS) -> Penalised:
     """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); the undetermined are zero."""
     (m, n), w = B.shape, w / np.mean(w)
-    N = B.T @ (w[:, None] * B)
-    N += RIDGE * np.trace(N) / n * np.eye(n)
+    weighted = w[:, None] * B
+    N = B.T @ weighted
+    N[np.diag_indices(n)] += RIDGE * np.trace(N) / n
     P = penalty * (np.trace(N) / (np.trace(penalty) or 1.0))
     # with G'(N + P)G = I and G'PG = diag(e) every N + lambda P is diagonal: no more matrices to factor
     inverse = np.linalg.inv(np.linalg.cholesky(N + P))
@@ -54,7 +55,7 @@ def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAM
     free = m - INFLATED * trace
     best = int(np.argmin(np.where(free > 0, squares / np.where(free > 0, free, 1.0) ** 2, np.inf)))
     variance = squares[best] / max(m - trace[best], 1.0)
-    operator = (G * gain[best]) @ (G.T @ (B.T * w))
+    operator = (G * gain[best]) @ (weighted @ G).T
     return Penalised(coefficients[:, best], operator, G * np.sqrt(variance * gain[best]))
 
 

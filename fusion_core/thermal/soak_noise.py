@@ -15,7 +15,6 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -38,6 +37,7 @@ FINE = 1000
 STRETCHES = 1920  # of time, at most: resolution of the times of a block
 RANK = 1e-9  # of the largest singular value: columns that are combinations of others
 TAKEN = 1e-6  # of the largest eigenvalue: a contrast of which the map leaves less says nothing
+ESTIMATED = 100.0  # times as much is left of every one by an estimate, where none is looked at by itself
 RATIOS = np.logspace(-6, 6, 241)  # of the walk's variance over a soak to the white noise of a block
 
 
@@ -68,21 +68,20 @@ class Blocks:
         return self._spread(np.arange(N) * stretches // N, stretches)
 
     def _spread(self, which: Integers, count: int) -> csr_array:
-        from scipy.sparse import csr_array
-
-        K = len(self.T)
-        places, counts = np.unique(self.of_sample * count + which, return_counts=True)
-        of_block = places // count
-        return csr_array((counts / self.n[of_block], (of_block, places % count)), shape=(K, count))
+        return _shares(self.of_sample, which, (len(self.T), count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
         """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples."""
-        from scipy.sparse import csr_array
+        return _shares(group, self.of_sample, (count, len(self.T)))
 
-        K = len(self.T)
-        places, counts = np.unique(group * K + self.of_sample, return_counts=True)
-        of_group, of_block = np.divmod(places, K)
-        return csr_array((counts / np.bincount(group)[of_group], (of_group, of_block)), shape=(count, K))
+
+def _shares(group: Integers, part: Integers, shape: tuple[int, int]) -> csr_array:
+    """Return the share of each part in the samples (N,) of each group, sparse."""
+    from scipy.sparse import csr_array
+
+    shares = csr_array((np.ones(len(group)), (group, part)), shape=shape)
+    shares.data /= np.repeat(np.bincount(group), np.diff(shares.indptr))
+    return shares
 
 
 Smoother = Callable[[Blocks, Array, int], Array]
@@ -136,6 +135,40 @@ class BlockNoise:
     white: float
 
 
+class Complement:
+    """Contrasts of which independent columns (K, p) have no part, by p reflections: Z' columns = 0, Z (K, m)."""
+
+    def __init__(self, columns: Array) -> None:
+        from scipy.linalg.lapack import dgeqrf
+
+        self.p = columns.shape[1]
+        self._reflections = dgeqrf(columns)[:2]
+
+    def _reflected(self, x: Array, side: str, way: str) -> Array:
+        from scipy.linalg.lapack import dormqr
+
+        return np.asarray(dormqr(side, way, *self._reflections, x, 64 * len(x))[0])
+
+    @cached_property
+    def Z(self) -> Array:
+        """The contrasts (K, m), orthonormal."""
+        return self._reflected(np.eye(len(self._reflections[0])), "L", "N")[:, self.p :]
+
+    def of(self, x: Array) -> Array:
+        """Return Z' x (m, n) of x (K, n)."""
+        return self._reflected(x, "L", "T")[self.p :]
+
+    def both(self, C: Array) -> Array:
+        """Return Z' C Z (m, m) of C (K, K)."""
+        return self._reflected(self._reflected(C, "L", "T"), "R", "N")[self.p :, self.p :]
+
+
+def basis_of(columns: Array, rank: float = RANK) -> Array:
+    """Return orthonormal columns (K, p) that span others (K, q), combinations of which are left out."""
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > rank * s[0]])
+
+
 class Contrasts:
     """Contrasts of K blocks that no free curve of T can make: straight pieces X (K, p) between `knots` (p,).
 
@@ -146,13 +179,12 @@ class Contrasts:
         self.knots, pieces = _pieces(blocks)
         self.X = np.asarray(blocks.over @ pieces)
         self.covariance, self.white = walk_covariance(blocks), np.mean(blocks.n) / blocks.n
-        self._free = self.X if more is None else np.hstack([self.X, more])
+        self._free = basis_of(self.X if more is None else np.hstack([self.X, more]))
 
     @cached_property
     def Z(self) -> Array:
         """Contrasts (K, m): Z' X = 0, and of other columns (K, q) of the blocks that are to be free too."""
-        U, s, _ = np.linalg.svd(self._free)
-        return np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
+        return Complement(self._free).Z
 
     @cached_property
     def walk(self) -> Array:
@@ -162,10 +194,9 @@ class Contrasts:
     def noise(self, y: Array, left: Array) -> BlockNoise:
         """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
-        A = self.Z.T @ left  # the map has taken its part of the noise already
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
-        if len(A) >= MIN_BLOCKS:
-            k2, s2 = _expected(*self._turned(A, self.Z.T @ (y / scale)))
+        if K - self._free.shape[1] >= MIN_BLOCKS:
+            k2, s2 = _expected(*self._turned(y / scale, left))
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
@@ -173,28 +204,27 @@ class Contrasts:
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
         return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
-    def _turned(self, A: Array, u: Array) -> tuple[Array, Array]:
-        """Return the walk's covariance (r, r) and u (r,) in contrasts A (m, K) turned so that white noise has one of 1.
+    def _turned(self, y: Array, left: Array) -> tuple[Array, Array]:
+        """Return the walk's covariance (r, r) and u (r,) in contrasts turned so that white noise has one of 1.
 
-        What the map leaves nothing of is left out.
+        The contrasts are A = Z' left of the noise: the map has taken its part of it already. As Z' U = 0 of the basis U
+        of the free columns, A = Z' M with M = left + U U'. Where M has an inverse, A says nothing of M^-1 U alone, and
+        M^-1 y is as much to A as the noise itself. Where it hardly has one, what the map leaves nothing of is left out.
         """
-        white, walk = (A * self.white) @ A.T, A @ self.covariance @ A.T
-        root = _inverse_root(white)
-        return root @ walk @ root.T, root @ u
+        from scipy.linalg.lapack import dgecon, dgetrf, dgetrs
 
-
-def _inverse_root(covariance: Array) -> Array:
-    """Return R (r, m), R covariance R' = 1, of all directions but those of less than TAKEN of the largest variance."""
-    from scipy.linalg.lapack import dtrtri
-
-    with suppress(np.linalg.LinAlgError):
-        inverse = dtrtri(np.linalg.cholesky(covariance), lower=1)[0]
-        # at least the inverse of the least variance, times at least the largest: nothing is to be left out
-        if np.sum(inverse**2) * np.trace(covariance) < 1 / TAKEN:
-            return np.asarray(inverse)
-    values, V = np.linalg.eigh(covariance)
-    free = values > TAKEN * values[-1]
-    return np.asarray((V[:, free] / np.sqrt(values[free])).T)
+        M, root = left + self._free @ self._free.T, np.sqrt(self.white)[:, None]
+        factors, order, singular = dgetrf(M)
+        inverse_condition = dgecon(factors, np.max(np.sum(np.abs(M), axis=0)))[0] * np.min(root) / np.max(root)
+        if not singular and inverse_condition**2 > ESTIMATED * TAKEN:
+            solved = dgetrs(factors, order, np.column_stack([self._free, y]))[0] / root
+            seen = Complement(solved[:, :-1])
+            return seen.both(self.covariance / (root * root.T)), seen.of(solved[:, -1:])[:, 0]
+        A = self.Z.T @ left
+        values, V = np.linalg.eigh((A * self.white) @ A.T)
+        some = values > TAKEN * values[-1]
+        R = (V[:, some] / np.sqrt(values[some])).T
+        return R @ (A @ self.covariance @ A.T) @ R.T, R @ (self.Z.T @ y)
 
 
 def walk_covariance(blocks: Blocks) -> Array:
@@ -205,11 +235,17 @@ def walk_covariance(blocks: Blocks) -> Array:
     its samples, also of such as were measured in turn with another's.
     """
     during = blocks.during
-    S = during.shape[1]
-    # sum of during(s) min(s, r) over s: twice the sum, over the stretches before r, of what is still to come after them
-    later = np.cumsum(during.T.toarray()[::-1], axis=0)[::-1]
-    least = np.zeros_like(later)
-    np.cumsum(later[1:], axis=0, out=least[1:])
+    K, S = during.shape
+    first, row = during.indices[during.indptr[:-1]], np.repeat(np.arange(K), np.diff(during.indptr))
+    own = np.zeros((K, int(np.max(during.indices - first[row])) + 1))
+    own[row, during.indices - first[row]] = during.data
+    # sum of during(s) min(s, r) over s: r before a block, its mean stretch after it, and within it as much more from r
+    # to r + 1 as is still to come
+    within = first[:, None] + np.cumsum(own[:, ::-1], axis=1)[:, ::-1].cumsum(axis=1) - 1.0
+    least = np.minimum(np.arange(S, dtype=np.float64)[:, None], within[:, -1])
+    r = first[:, None] + np.arange(own.shape[1])
+    inside = r < S
+    least[r[inside], np.nonzero(inside)[0]] = within[inside]
     covariance = (during @ least + 0.5 - (during @ during.T).toarray() / 6) / S
     return np.asarray((covariance + covariance.T) / 2)
 

@@ -65,6 +65,13 @@ def steps_of(T: Array) -> Steps:
     Those of a soak, which goes through many of them. Temperatures count by how far the unit moves there, so that a
     chamber which stays at whole degrees is not taken for steps.
     """
+    return _steps_of(np.asarray(T, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=1)
+def _steps_of(shown: bytes) -> Steps:
+    """Return them of the bytes of T: a soak and its map ask for the same."""
+    T = np.frombuffer(shown)
     if len(T) < 2 * PASSAGES or not np.ptp(T) > 2 * STEPS[0]:
         return NO_STEPS
     moved = _movement(T)

@@ -30,9 +30,10 @@ LARGE = 2e-2  # of gravity: the bias that one may have all the same
 
 def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
     """Return True if the unit was at rest over the epochs of `window`."""
+    root = np.sqrt(window["tau"])[:, None]
     for sensor in sensors:
         values = window[sensor.channel]
-        away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
+        away = np.abs(values - _median(values)) * root / sensor.noise
         scatter = _median(away) / 0.6745
         level = np.all(scatter <= FAR_BEYOND) and np.all(away <= OUTLIER * np.maximum(scatter, 1.0))
         if not (level or _follows_temperature(window, sensor)):
@@ -178,12 +179,13 @@ def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
     The scatter is taken from differences of neighbours (a drift over the stretch does not count); 1 where there are
     none.
     """
-    ratios = {}
+    ratios, tau = {}, window["tau"]
+    root = np.sqrt(1 / tau[1:] + 1 / tau[:-1])[:, None]
     for sensor in sensors:
         values = window[sensor.channel]
         if len(values) < 2:
             ratios[sensor.channel] = np.ones(values.shape[1])
             continue
-        spread = np.diff(values, axis=0) / np.sqrt(1 / window["tau"][1:] + 1 / window["tau"][:-1])[:, None]
+        spread = (values[1:] - values[:-1]) / root
         ratios[sensor.channel] = np.sqrt(np.mean(spread**2, axis=0)) / sensor.noise
     return ratios

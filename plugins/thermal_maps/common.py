@@ -24,6 +24,7 @@ from fusion_core.contracts import MapRecord, record_of
 from fusion_core.thermal.curve_uncertainty import Curve, curve_error
 from fusion_core.thermal.soak_noise import Smoother
 from fusion_core.thermal.thermometer import steps_of
+from fusion_core.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +86,7 @@ def record_fit(
     SingularFit
         If the temperatures have a hole that the curve cannot bridge.
     """
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
-    with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
+    with one_thread():  # a few hundred blocks
         error = curve_error(kind, T, bias, predict, smoother)
     resolution, dither = steps_of(T)
     return record_of(kind, T, bias, predict, provenance, resolution=resolution, dither=dither, error=error)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -193,9 +193,15 @@ def _basis(domain: tuple[float, float], count: int, T: Array) -> Array:
 
 
 def _sparse(domain: tuple[float, float], count: int, T: Array) -> csr_array:
+    return _design(domain, count, np.ascontiguousarray(T).tobytes())
+
+
+@lru_cache(maxsize=4)
+def _design(domain: tuple[float, float], count: int, T: bytes) -> csr_array:
+    """Return the B-splines at T: the axes of a fit ask for those of the same grid."""
     from scipy.interpolate import BSpline
 
-    return BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3)
+    return BSpline.design_matrix(np.clip(np.frombuffer(T), *domain), _knots(domain, count), 3)
 
 
 def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from driftlab.soak.blocks import CELLS, OFF, SoakRows, SoakSummary, means, runs
 from fusion_core.chunk import Array, Flags, Integers
+from fusion_core.thermal.soak_noise import Complement, basis_of
 from fusion_core.wandering import gauss_markov
 
 BLOCKS = 240  # about; half as many miss one more memory in a hundred
@@ -121,10 +122,11 @@ class SoakContrasts:
         laws = [self.root * C * self.root.T for C in laws_of(self.blocks, recording)]
         self.curve, self.splines = self._curve(soak, laws[0])
         self.X = np.column_stack([self.splines * self.root, self.more])
-        U, s, _ = np.linalg.svd(self.X)
-        self.Z = np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
+        free_of_X = Complement(basis_of(self.X, RANK))
+        self.Z = free_of_X.Z
         self.covariances = laws if self.Z.shape[1] >= MIN_CONTRASTS else []
-        self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
+        self.laws = [np.linalg.eigh(free_of_X.both(C)) for C in self.covariances[:-1]]
+        self.laws += [_of_drift(C, self.Z) for C in self.covariances[-1:]]
         self._fits: dict[int, tuple[Array, Array, Array]] = {}
 
     def _known(self, blocks: SoakRows, soak: SoakSummary) -> Flags:
@@ -210,20 +212,19 @@ class SoakContrasts:
         return self.weights(own)[noise % len(RATIOS)], V
 
     def fit(self, noise: int) -> tuple[Array, Array, Array]:
-        """Return C^-1 (K, K), C^-1 X (K, P) and (X' C^-1 X)^-1 (P, P) of generalised least squares under a noise.
+        """Return L (K, K), C^-1 X (K, P) and (X' C^-1 X)^-1 (P, P) of generalised least squares under a noise.
 
-        C is the covariance of the blocks, whose white part has a variance of 1.
+        C = L L' is the covariance of the blocks, whose white part has a variance of 1.
         """
-        from scipy.linalg.lapack import dpotrf, dpotri
+        from scipy.linalg.lapack import dpotrf, dpotrs
 
         if noise not in self._fits:
             law, ratio = divmod(noise, len(RATIOS))
             C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
             C[np.diag_indices(len(C))] += 1.0
-            half = np.tril(dpotri(dpotrf(C, lower=1)[0], lower=1)[0])
-            inverse = half + np.tril(half, -1).T
-            solved = inverse @ self.X
-            self._fits[noise] = inverse, solved, np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
+            root = dpotrf(C, lower=1)[0]
+            solved = dpotrs(root, self.X, lower=1)[0]
+            self._fits[noise] = root, solved, np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
         return self._fits[noise]
 
     def gram(self, noise: int, z: Array) -> Array:
@@ -232,14 +233,15 @@ class SoakContrasts:
         turned = V.T @ z
         return np.asarray((turned.T * w) @ turned)
 
-    def curves_under(self, noise: int, axis: int, late: Array) -> tuple[Array, Array, Array]:
+    def curves_under(self, noise: int, axis: int, late: Array, regressors: Array) -> tuple[Array, Array, Array]:
         """Return the curve (P,) of an axis under a noise, those that follow inputs (P, J), and how uncertain they are.
 
-        `late` (J, K, P): what X is where the curve sees the inputs. Whoever fits a free curve of temperature to what
-        follows an input, bends the curve by a part of the memory. So each curve is the one of which generalised least
-        squares would make the curve that they make here: as many equations as coefficients, in which nothing of the
-        contrasts' noise is. What these leave open is some directions, each a standard deviation long where white noise
-        has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
+        `late` (J, K, P): what X is where the curve sees the inputs, and `regressors` (J, m, P) in the contrasts.
+        Whoever fits a free curve of temperature to what follows an input, bends the curve by a part of the memory. So
+        each curve is the one of which generalised least squares would make the curve that they make here: as many
+        equations as coefficients, in which nothing of the contrasts' noise is. What these leave open is some
+        directions, each a standard deviation long where white noise has one of 1; those that the contrasts show most
+        are returned, (P, J, RANKS).
         """
         w, V = self.under(noise)
         _, solved, spread = self.fit(noise)
@@ -252,7 +254,7 @@ class SoakContrasts:
         left = free * (one - gain @ again)
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
         half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        shown = (np.sqrt(w)[:, None] * (V.T @ self.Z.T)) @ late @ half
+        shown = np.sqrt(w)[:, None] * (V.T @ regressors) @ half
         most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
@@ -276,12 +278,13 @@ class SoakContrasts:
             The likelier of the two.
         """
         there, late = self.late(inputs)
-        each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
+        regressors = self.Z.T @ late  # (J, m, P)
+        each = [self.curves_under(int(noise), axis, late, regressors) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
         here, p = self.curve(self.soak.T), self.splines.shape[1]
-        slots = np.stack([(one - here) @ bent[:p] for one in there], axis=1)
+        there -= here
+        slots = np.stack([one @ bent[:p] for one in there], axis=1)
         J, d = slots.shape[1:]
-        regressors = self.Z.T @ late  # (J, m, P)
         whole = np.einsum("jmp,pjd->mjd", regressors, curves)
         open_ = (regressors @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
         followed = self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
@@ -289,7 +292,7 @@ class SoakContrasts:
         part, parts = self.parts(regressors[:, :, :p] @ smooth, int(noises[0]))
         likelier = log_mean(part) > log_mean(followed)
         coefficients = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
-        added = np.stack([(one - here) @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
+        added = np.stack([one @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
         following = FollowingCurves(coefficients, likelier, added, late[:, :, :p])
         return slots, self.of(slots), np.stack([followed, part]), following
 
@@ -303,11 +306,14 @@ class SoakContrasts:
 
             g' (Sigma - a a' / (a' Sigma^-1 a)) g,    Sigma^-1 = S' C^-1 S / s^2 + 1
         """
+        from scipy.linalg.lapack import dtrtrs
+
         S, variances = curves.late, np.zeros(curves.partly.shape)
+        J, K, p = S.shape
         for axis, noise in enumerate(noises):
-            inverse, _, spread = self.fit(int(noise))
-            turned = np.swapaxes(S, 1, 2) @ inverse
-            of_X, whole = turned @ self.X, turned @ S  # (J, p, P) and (J, p, p)
+            root, solved, spread = self.fit(int(noise))
+            white = dtrtrs(root, S.swapaxes(0, 1).reshape(K, J * p), lower=1)[0].reshape(K, J, p).swapaxes(0, 1)
+            of_X, whole = np.swapaxes(S, 1, 2) @ solved, np.swapaxes(white, 1, 2) @ white  # (J, p, P) and (J, p, p)
             free = whole - of_X @ spread @ np.swapaxes(of_X, 1, 2)  # of the contrasts: the curve here is another
             M = np.where(curves.partly[:, axis, None, None], free, whole) / s2[axis] + np.eye(S.shape[2]) / FREE**2
             a, g = curves.coefficients[:, :, axis], between[:, axis]
@@ -318,52 +324,72 @@ class SoakContrasts:
     def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
 
-        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise.
+        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise. a ~ N(0, g s^2)
+        in units in which what is shown most has g, one of SIZES: Zellner's prior of a whole curve.
         """
         w, V = self.under(noise)
         white = np.sqrt(w)[:, None] * (V.T @ shown)
         most = np.linalg.eigh(np.swapaxes(white, 1, 2) @ white)[1][:, :, -PARTS:]
-        like, a = self.integrated(self.u[:, None], np.moveaxis(shown @ most, 0, 1), SIZES)
-        return like, most @ a
+        gram, B, Q = self._products(self.u[:, None], np.moveaxis(shown @ most, 0, 1))
+        size, along = np.linalg.eigh(gram)
+        size = np.maximum(size, FINEST * size[..., -1:] + TINY)
+        B = np.swapaxes(along, 2, 3) @ B / size[..., None]
+        g = SIZES[:, None, None, None] * size / size[..., -1:]
+        a = (g / (1 + g))[..., None] * B
+        like = self._integrated(Q, np.sum(a * B * size[..., None], axis=3), np.sum(np.log1p(g), axis=3))
+        top = np.argmax(like.reshape(-1, *like.shape[2:]), axis=0)  # (J, d)
+        k, noise_of, j, axis = *np.divmod(top, len(gram)), *np.indices(top.shape)
+        return log_mean(like), most @ np.einsum("jdhq,jdq->jhd", along[noise_of, j], a[k, noise_of, j, :, axis])
 
     def followed(self, z: Array, ways: Array) -> Array:
-        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, z (m, J, d), ways (m, J, d, q)."""
-        m, J, d, q = ways.shape
-        left = (self.u[:, None] - z).reshape(m, J * d, 1)
-        return self.integrated(left, ways.reshape(m, J * d, q))[0].reshape(-1, J, d)
+        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, z (m, J, d), ways (m, J, d, q).
 
-    def integrated(self, y: Array, ways: Array, sizes: Array | None = None) -> tuple[Array, Array]:
-        """Return log-likelihoods (R', J, e) under every THIN-th ratio, and the likeliest a (J, q, e).
-
-        Of y = ways a + noise, y (m, J, e) or (m, 1, e), ways (m, J, q), a ~ N(0, s^2): s and a are integrated out. With
-        `sizes`, a ~ N(0, g s^2) in units in which what is shown most has g, one of these: Zellner's prior of a
-        whole curve.
+        Of y = z + ways a + noise, a ~ N(0, s^2).
         """
-        m, J, q = ways.shape
-        some, other = np.triu_indices(q)
-        likes, each = [], []
+        m, J, d, q = ways.shape
+        gram, B, Q = self._products((self.u[:, None] - z).reshape(m, J * d, 1), ways.reshape(m, J * d, q))
+        root = np.linalg.cholesky(gram + np.eye(q))
+        explained = np.sum(np.linalg.solve(root, B) ** 2, axis=2)
+        log_size = 2 * np.sum(np.log(np.diagonal(root, axis1=2, axis2=3)), axis=2)
+        return self._integrated(Q, explained, log_size).reshape(-1, J, d)
+
+    def _products(self, y: Array, ways: Array) -> tuple[Array, Array, Array]:
+        """Return inner products under every THIN-th ratio (R', J, q, q), (R', J, q, e) and (R', J, e) or (R', 1, e).
+
+        They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.
+        """
+        some, other = np.triu_indices(ways.shape[2])
+        each = []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
-            turned, u = (np.reshape(V.T @ x.reshape(m, -1), x.shape) for x in (ways, y))
-            gram = np.empty((len(w), J, q, q))
-            gram[:, :, some, other] = gram[:, :, other, some] = np.reshape(
-                w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1), (len(w), J, -1)
-            )
-            size, along = np.linalg.eigh(gram)
-            size = np.maximum(size, FINEST * size[..., -1:] + 1e-300)
-            B = np.reshape(w @ (turned[..., None] * u[:, :, None]).reshape(m, -1), (len(w), J, q, -1))
-            B = np.swapaxes(along, 2, 3) @ B / size[..., None]
-            g = size[None] if sizes is None else sizes[:, None, None, None] * size / size[..., -1:]
-            a = (g / (1 + g))[..., None] * B
-            Q = np.reshape(w @ (u**2).reshape(m, -1), (len(w), *u.shape[1:]))
-            left = np.maximum(Q - np.sum(a * B * size[..., None], axis=3), 1e-9 * Q + 1e-300)
-            more = np.sum(np.log(w), axis=1)[:, None] - np.sum(np.log1p(g), axis=3)
-            likes.append((more[..., None] - m * np.log(left)) / 2)
-            each.append(along @ a)
-        like, estimates = np.concatenate(likes, axis=1), np.concatenate(each, axis=1)
-        top = np.argmax(like.reshape(-1, *like.shape[2:]), axis=0)
-        likeliest = np.take_along_axis(estimates.reshape(-1, *estimates.shape[2:]), top[None, :, None], axis=0)[0]
-        return log_mean(like), likeliest
+            turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
+            products = turned[:, :, some] * turned[:, :, other], turned[..., None] * u[:, :, None], u**2
+            each.append([(w @ x.reshape(len(u), -1)).reshape(len(w), *x.shape[1:]) for x in products])
+        flat, B, Q = map(np.concatenate, zip(*each, strict=True))
+        gram = np.empty((*flat.shape[:2], *B.shape[2:3] * 2))
+        gram[:, :, some, other] = gram[:, :, other, some] = flat
+        return gram, B, Q
+
+    def _integrated(self, Q: Array, explained: Array, log_size: Array) -> Array:
+        """Return log-likelihoods (..., R', J, e), s and coefficients integrated out.
+
+        The noise has the squares Q (R', J, e), of which so much is `explained`; `log_size` (..., R', J) is that of the
+        determinant of coefficients beside noise.
+        """
+        left = np.maximum(Q - explained, 1e-9 * Q + TINY)
+        thin = np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
+        log_w = self.log_w[thin, None]
+        return np.asarray((log_w - log_size / 2)[..., None] - len(self.u) / 2 * np.log(left))
+
+
+def _of_drift(C: Array, Z: Array) -> tuple[Array, Array]:
+    """Return eigenvalues (m,) and eigenvectors (m, m) of Z' C Z, C of rank 1: Householder's reflection of the last."""
+    k = int(np.argmax(np.diag(C)))
+    v = Z.T @ (C[k] / np.sqrt(C[k, k]))
+    own = np.zeros(len(v))
+    own[-1] = v @ v
+    v[-1] += np.copysign(np.sqrt(own[-1]), v[-1])
+    return own, np.eye(len(v)) - np.outer(v, v * (2 / (v @ v)))
 
 
 def log_mean(x: Array) -> Array:

@@ -22,7 +22,7 @@ likelihoods to a power where no model is the true one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,9 +66,19 @@ class ShapeEvidence:
     @cached_property
     def _sums(self) -> tuple[Array, Array]:
         """A and B (R, J, d)."""
-        each = zip(self._sums_of(self.z[:, : self.added, :1]), self._sums_of(self.z[:, self.added :]), strict=True)
-        A, B = (np.concatenate(both, axis=1) for both in each)
+        of_inputs = self._sums_of(self.z[:, self.added :])
+        A, B = (np.concatenate(both, axis=1) for both in zip(self._of_added, of_inputs, strict=True))
         return A, B
+
+    @cached_property
+    def _of_added(self) -> tuple[Array, Array]:
+        return self._sums_of(self.z[:, : self.added, :1])
+
+    def with_inputs(self, z: Array) -> ShapeEvidence:
+        """Return the evidence with other shapes (m, I, d) of the inputs."""
+        other = replace(self, z=np.concatenate([self.z[:, : self.added], z], axis=1))
+        vars(other)["_of_added"] = self._of_added
+        return other
 
     def _sums_of(self, z: Array) -> tuple[Array, Array]:
         """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
@@ -143,13 +153,19 @@ class ShapeEvidence:
     @property
     def _gram(self) -> Array:
         """Inner products (R', P, d) of the shapes of each pair."""
-        gram, (m, _, d) = [], self.z.shape
-        some, places = np.unique(self._both, return_inverse=True)
-        i, k = places.reshape(2, -1)
+        gram, (m, _, d), (i, k) = [], self.z.shape, self._both
+        alike, some = k < self.added, np.unique(self._both)  # those that add are alike on all axes
+        first, other = some[some < self.added], some[some >= self.added]
+        i, k, inputs = np.searchsorted(some, i), np.searchsorted(some, k), np.flatnonzero(~alike)
         for own, V in self.contrasts.laws:
-            few = (V.T @ self.z[:, some].reshape(m, -1)).reshape(m, len(some), d)
+            added = V.T @ self.z[:, first, 0]
+            follows = (V.T @ self.z[:, other].reshape(m, -1)).reshape(m, -1, d)
             w = self.contrasts.weights(own)[::THIN]
-            gram.append((w @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(len(w), len(i), d))
+            each = np.empty((len(w), len(i), d))
+            each[:, alike] = (w @ (added[:, i[alike]] * added[:, k[alike]]))[:, :, None]
+            mixed = added[:, i[inputs], None] * follows[:, k[inputs] - len(first)]
+            each[:, inputs] = (w @ mixed.reshape(m, -1)).reshape(len(w), -1, d)
+            gram.append(each)
         return np.concatenate(gram)
 
     def _of(self, noises: Integers | slice, t2: Array, p: int) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEv
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array, Flags
+from fusion_core.threads import one_thread
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
 ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be distinguished from it
@@ -126,25 +127,17 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
     reason = _unseen(soak)
     if reason:
         return MemoryVerdict.unknown(d, WHY[reason])
-    with _threads().limit(limits=1):  # of small matrices
+    with one_thread():
         contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
         if not contrasts.laws or not shapes.kinds:
             return MemoryVerdict.unknown(d, WHY["short" if np.all(contrasts.known) else "coarse"])
-        added = np.repeat(shapes.added[:, :, None], d, axis=2)
         z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-        followed, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), None
+        followed, slots, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), np.empty((len(soak.T), 0, d)), None
         if shapes.inputs.size:
             noises = np.argmax(contrasts.without, axis=0)
             slots, more, followed, curves = contrasts.added_by_inputs(shapes.inputs, noises)
-            added, z = np.concatenate([added, slots], axis=1), np.concatenate([z, more], axis=1)
-        return _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), added, shapes, curves).verdict()
-
-
-@cache
-def _threads() -> Any:
-    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
-
-    return ThreadpoolController()
+            z = np.concatenate([z, more], axis=1)
+        return _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), slots, shapes, curves).verdict()
 
 
 def _unseen(soak: SoakSummary) -> str:
@@ -183,12 +176,13 @@ def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, eq=False)
 class _MemoryTest:
-    """Shapes, their evidence, and the bias that they add on the slots (S, J, d)."""
+    """Shapes, their evidence, and the bias that inputs add on the slots (S, I, d)."""
 
     evidence: ShapeEvidence
-    added: Array
+    slots: Array
     shapes: MemoryShapes
     curves: FollowingCurves | None
+    lasting: bool = False  # whether what settles with the time alone opens nothing
 
     @property
     def contrasts(self) -> SoakContrasts:
@@ -205,7 +199,7 @@ class _MemoryTest:
         settles = self.evidence.alone(self.shapes.settling)
         sized = self if total <= HINT else self._following()
         if not (settles > HINT and total - settles < SEEN):  # how far it would open says nothing of a memory
-            sized = replace(sized, added=np.where(self.shapes.settling[:, None], 0.0, sized.added))
+            sized = replace(sized, lasting=True)
         noise = np.argmax(self.evidence.noises, axis=0)
         pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
@@ -246,10 +240,8 @@ class _MemoryTest:
         """Return the same of shapes whose curves follow their inputs, estimated from the soak: for their sizes."""
         if self.curves is None:
             return self
-        alone, curves = self.evidence.added, self.curves.added
-        both = (self.evidence.z, self.contrasts.of(curves)), (self.added, curves)
-        z, added = (np.concatenate([x[:, :alone], y], axis=1) for x, y in both)
-        return replace(self, evidence=replace(self.evidence, z=z), added=added)
+        slots = self.curves.added
+        return replace(self, evidence=self.evidence.with_inputs(self.contrasts.of(slots)), slots=slots)
 
     @property
     def _divided(self) -> bool:
@@ -259,7 +251,10 @@ class _MemoryTest:
 
     @cached_property
     def _sweeps(self) -> Sweeps:
-        return Sweeps(self.contrasts.soak, self.added)
+        sweeps = Sweeps(self.contrasts.soak, self.shapes.added[:, :, None], self.slots)
+        if self.lasting:
+            sweeps.shown[:, :, self.shapes.settling] *= 0.0
+        return sweeps
 
     @cached_property
     def _openings(self) -> tuple[Array, Array]:

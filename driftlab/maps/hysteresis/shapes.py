@@ -153,18 +153,19 @@ class Sweeps:
     `shown` (W, G, J, d) is what a coefficient of 1 adds there; NaN where the sweep is not.
     """
 
-    def __init__(self, soak: SoakSummary, values: Array) -> None:
-        """Take what shapes show on the slots, values (S, J, d)."""
+    def __init__(self, soak: SoakSummary, *values: Array) -> None:
+        """Take what shapes show on the slots, parts of (S, J, d) or, where all axes are alike, (S, J, 1)."""
         self.T = np.linspace(*soak.domain, GRID)
         key = soak.recording * 3 + soak.way
         cuts = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
-        up, shown = [], []
+        up, shown, d = [], [], max(part.shape[2] for part in values)
         for start, stop in zip(cuts, [*cuts[1:], len(key)], strict=True):
             if soak.way[start] and stop - start > 1:
                 up.append(soak.way[start] > 0)
-                shown.append(_over(self.T, soak.T[start:stop], values[start:stop]))
+                each = (_over(self.T, soak.T[start:stop], part[start:stop]) for part in values)
+                shown.append(np.concatenate([np.broadcast_to(x, (*x.shape[:2], d)) for x in each], axis=1))
         self.up = np.array(up, dtype=bool)
-        self.shown = np.array(shown).reshape(len(up), GRID, *values.shape[1:])
+        self.shown = np.array(shown).reshape(len(up), GRID, sum(part.shape[1] for part in values), d)
 
     def openings(self) -> tuple[Array, Array]:
         """Return the opening of each shape (J, d), warming less cooling, and at which temperature it is (J, d)."""
@@ -206,11 +207,11 @@ class Sweeps:
 
 def _over(grid: Array, T: Array, values: Array) -> Array:
     order = np.argsort(T, kind="stable")
-    T, flat = T[order], values[order].reshape(len(T), -1)
+    T, flat = T[order], values.reshape(len(T), -1)
     place = np.clip(np.searchsorted(T, grid) - 1, 0, len(T) - 2)
     width = T[place + 1] - T[place]
     share = np.clip(np.divide(grid - T[place], width, out=np.zeros_like(grid), where=width > 0), 0.0, 1.0)[:, None]
-    values_there = flat[place] * (1 - share) + flat[place + 1] * share
+    values_there = flat[order[place]] * (1 - share) + flat[order[place + 1]] * share
     values_there[(grid < T[0]) | (grid > T[-1])] = np.nan
     return np.asarray(values_there.reshape(len(grid), *values.shape[1:]))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve
 
-from fusion_core.thermal.soak_noise import Contrasts, blocks_of
+from fusion_core.thermal.soak_noise import Complement, Contrasts, blocks_of, walk_covariance
 
 
 @pytest.mark.parametrize("order", [None, 3])
@@ -62,3 +62,42 @@ def test_a_map_that_leaves_one_contrast_leaves_no_walk() -> None:
     assert found.walk == 0
     assert found.white > 0
     assert np.all(np.isfinite(found.root))
+
+
+@pytest.mark.parametrize("cycles", [1, 60])
+def test_the_walk_of_blocks_is_the_double_sum_over_their_stretches(cycles: int) -> None:
+    """Of blocks that follow one another, and of those that were measured in turn."""
+    T = 20 - 30 * np.cos(2 * np.pi * cycles * np.arange(5000) / 5000)
+    blocks = blocks_of(T, np.zeros((5000, 1)))
+    during, r = blocks.during.toarray(), np.arange(blocks.during.shape[1])
+    walk = (np.minimum.outer(r, r) + 0.5 - np.eye(len(r)) / 6) / len(r)
+    np.testing.assert_allclose(walk_covariance(blocks), during @ walk @ during.T, rtol=0, atol=1e-14)
+
+
+def test_the_complement_is_orthonormal_and_free_of_its_columns() -> None:
+    rng = np.random.default_rng(4)
+    columns, x, C = rng.normal(size=(30, 7)), rng.normal(size=(30, 2)), np.cov(rng.normal(size=(30, 90)))
+    free = Complement(columns)
+    np.testing.assert_allclose(free.Z.T @ np.column_stack([free.Z, columns]), np.eye(23, 30), atol=1e-12)
+    np.testing.assert_allclose(free.of(x), free.Z.T @ x, atol=1e-12)
+    np.testing.assert_allclose(free.both(C), free.Z.T @ C @ free.Z, atol=1e-12)
+
+
+@pytest.mark.parametrize("followed", [0.5, 1 - 1e-5])
+def test_what_a_map_leaves_is_turned_as_all_of_its_contrasts_are(followed: float) -> None:
+    """With and without an inverse of what it leaves, beside a root of the covariance: likelihoods are the same."""
+    rng = np.random.default_rng(6)
+    blocks = blocks_of(20 - 30 * np.cos(6 * np.pi * np.arange(4000) / 4000), rng.normal(size=(4000, 1)))
+    contrasts = Contrasts(blocks)
+    shape = contrasts.Z[:, :3]
+    left = np.eye(len(blocks.T)) - followed * shape @ shape.T
+    y = left @ blocks.y[:, 0]
+    walk, u = contrasts._turned(y, left)
+    A = contrasts.Z.T @ left
+    root = np.linalg.cholesky((A * contrasts.white) @ A.T)
+    white, dense = np.linalg.solve(root, contrasts.Z.T @ y), np.linalg.solve(root, A @ contrasts.covariance @ A.T)
+    dense = np.linalg.solve(root, dense.T)
+    if followed < 0.9:  # of the other, three shapes are left out
+        np.testing.assert_allclose(np.linalg.eigvalsh(walk), np.linalg.eigvalsh(dense), atol=1e-10)
+        np.testing.assert_allclose([u @ u, u @ walk @ u], [white @ white, white @ dense @ white], rtol=1e-9)
+    assert len(u) == len(white) - 3 * (followed > 0.9)
