@@ -93,11 +93,11 @@ def analyse(
     ConfigError, MapError
         If the known family cannot be used for these units.
     """
-    unit, records = tracked_unit(config.filter), status.sound
+    unit, records, why = tracked_unit(config.filter), status.sound, ""
     if known is None:
         family, common, apart, why = _fitted(units, status, progress)
     else:
-        (family, common), why = _read(known, units, status) if records else (None, NOTHING), ""
+        family, common = _read(known, units, status) if records else (None, NOTHING)
         apart = _kept(units, common)
     progress(Stage("what the line did"))
     levels = None if family is None else _levels(family, apart)

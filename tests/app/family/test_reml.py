@@ -9,7 +9,18 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from driftlab.family.reml import EStep, UnitsUnderLaw, VarianceComponents, change, e_step, m_step
+from driftlab.family.contrasts import OWN, PLACEBOS, _placebos
+from driftlab.family.reml import (
+    EStep,
+    UnitsUnderLaw,
+    VarianceComponents,
+    _log_det,
+    change,
+    e_step,
+    inverse,
+    m_step,
+    smooth,
+)  # fmt: skip
 
 
 def reml(
@@ -116,3 +127,57 @@ def test_lots_are_random_effects() -> None:
     assert_allclose(law.Lambda[0, 0], between, rtol=1e-2)
     shrunk = (np.array([y[lot == g].mean() for g in range(lots)]) - y.mean()) * between / (between + within / each)
     assert_allclose(found.means.shifts[:, 0], shrunk, rtol=2e-2, atol=1e-2)
+
+
+def covariances(n: int, q: int, condition: float) -> np.ndarray:
+    rng = np.random.default_rng(q)
+    turned = np.linalg.qr(rng.normal(size=(n, q, q)))[0]
+    return np.einsum("nij,j,nkj->nik", turned, np.geomspace(1, condition, q), turned)
+
+
+def test_inverses_by_sweeps_are_lapacks() -> None:
+    for q, condition in ((1, 1.0), (2, 1e2), (35, 1e6)):
+        matrices = covariances(7, q, condition)
+        scale = np.max(np.abs(np.linalg.inv(matrices)))
+        assert_allclose(inverse(matrices), np.linalg.inv(matrices), atol=1e-16 * 50 * condition * scale)
+        assert_allclose(inverse(matrices), inverse(np.tril(matrices)))  # the lower triangle is read
+        log_det, inverted = _log_det(matrices[0] * 1e-9)
+        assert_allclose(log_det, np.linalg.slogdet(matrices[0] * 1e-9)[1], rtol=1e-10)
+        assert_allclose(inverted * 1e-9, np.linalg.inv(matrices[0]), atol=1e-16 * 50 * condition * scale)
+
+
+def test_derivatives_of_the_smooth_prior_are_differences() -> None:
+    peaks, numbers = np.linspace(-20.0, 60.0, 9), np.log([1e-6, 2e-6, 3e-6, 15.0, 5e-7])
+    Psi, slopes = smooth(peaks, numbers)
+    u, apart = (peaks - 20) / 40, np.abs(peaks[:, None] - peaks)
+    k = np.sqrt(3) * apart / 30
+    curve = 9e-12 * (np.exp(-0.5 * (apart / 15) ** 2) + 1e-9 * np.eye(9))
+    tiny = 1e-9 * np.eye(9)
+    law = 1e-12 * (1 + tiny) + 4e-12 * (np.outer(u, u) + tiny) + curve + 25e-14 * (1 + k) * np.exp(-k)
+    assert_allclose(Psi, law, rtol=1e-12)
+    for m, slope in enumerate(slopes):
+        step = np.where(np.arange(5) == m, 1e-5, 0.0)
+        difference = (smooth(peaks, numbers + step)[0] - smooth(peaks, numbers - step)[0]) / 2e-5
+        assert_allclose(slope, difference, atol=1e-8 * np.max(np.abs(Psi)))
+
+
+def test_placebos_are_waves_of_a_contrast_apart_from_one_another() -> None:
+    """By Gram and Schmidt on the rows: e times a wave, less the curve, e itself, and the waves before."""
+    rng, R = np.random.default_rng(4), 60
+    Q = np.linalg.qr(rng.normal(size=(R, 3)))[0]
+    e, r = rng.normal(size=(R, 2)), rng.normal(size=R)
+    e -= Q @ (Q.T @ e)
+    r -= Q @ (Q.T @ r)
+    size = np.sum(e**2, axis=0)
+    found = _placebos(Q, r, e.copy(), size, e.T @ r / size)
+    for one, own in zip(e.T, found, strict=True):
+        base = [*Q.T, one / np.linalg.norm(one)]
+        for j in range(PLACEBOS):
+            wave = one * np.cos(np.pi * (np.arange(R) + 0.5) / R * (j + 1))
+            for vector in base:
+                wave = wave - vector * (vector @ wave)
+            if wave @ wave > OWN * (one @ one):
+                base.append(wave / np.linalg.norm(wave))
+                assert_allclose(own[j], base[-1] @ r, atol=1e-10)
+            else:
+                assert own[j] == 0
