@@ -100,8 +100,7 @@ def analyse(
         family, common = _read(known, units, status) if records else (None, NOTHING)
         apart = _kept(units, common)
     progress(Stage("what the line did"))
-    levels = None if family is None else _levels(family, apart)
-    before = None if known is None or family is None else family.baseline
+    levels, before = (None, None) if family is None else (_levels(family, apart), family.baseline if known else None)
     line = line_of(records, config.limits, unit=unit, levels=levels, baseline=before, rules=rules, by=by)
     if family is None:
         odd, lines = _doubted(doubted, status, None, common, unit)
@@ -111,8 +110,8 @@ def analyse(
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
         lots, line = reconcile(outliers.lots, line)
-        frozen = baseline_of(line, _level_law(family))
-        more = {"laws": outliers.laws, "baseline": frozen, "terms": fit_terms(records)}
+        baseline = baseline_of(line, _level_law(family))
+        more = {"laws": outliers.laws, "baseline": baseline, "terms": fit_terms(records)}
         family = family.model_copy(update=more)
     odd, about = _doubted(doubted, status, family, common, unit)
     lines = [
