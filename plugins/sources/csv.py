@@ -17,11 +17,12 @@ import io
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -47,6 +48,7 @@ from fusion_plugins.sources.dialect import (
 from fusion_plugins.sources.joining import TableSource
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
+Item = TypeVar("Item")
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line
 COLUMNS = 10_000  # of a file
@@ -190,13 +192,9 @@ class CsvLines(Table):
                 raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
         at = {part: self.columns.index(part) for part in parts}
         clocks = {path: _Clock() for path, form in self._dates(at) if not has_day(form)}
-        for _, block, final in self._pieces():
-            if self.separator == " ":
-                block = EDGES.sub(b"", BLANKS.sub(b" ", block))
-            unfinished = final and not block.endswith(b"\n")
-            values = None if unfinished else self._fast(block, at)
+        for block, final, values in _ahead(self._parsed(at)):
             if values is None:
-                cells = self._without(block)
+                cells, unfinished = self._without(block), final and not block.endswith(b"\n")
                 values = self._fast(cells, at) if cells and cells != block and not unfinished else None
                 values = self._careful(block, cells, at, final) if values is None else values
             values |= {path: clock.unwrapped(values[path]) for path, clock in clocks.items()}
@@ -207,6 +205,13 @@ class CsvLines(Table):
             else:
                 self._skip(len(block))
             self.line += block.count(b"\n")
+
+    def _parsed(self, at: dict[str, int]) -> Iterator[tuple[bytes, bool, dict[str, Array] | None]]:
+        """Yield blocks, whether the file ends there, and their columns; None of one that has to be looked at."""
+        for _, block, final in self._pieces():
+            if self.separator == " ":
+                block = EDGES.sub(b"", BLANKS.sub(b" ", block))
+            yield block, final, None if final and not block.endswith(b"\n") else self._fast(block, at)
 
     def _parts(self, path: str) -> list[str]:
         """Return the columns that a path names: those of a date and of a time may be two."""
@@ -451,6 +456,15 @@ class CsvLines(Table):
 
     def _number(self, cell: str) -> float | None:
         return _number(cell.translate(COMMA) if self.settings.decimal == "," else cell)
+
+
+def _ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """Yield items, none of them None, each made by another thread while the one before is used."""
+    with ThreadPoolExecutor(1) as thread:
+        made = thread.submit(next, items, None)
+        while (item := made.result()) is not None:
+            made = thread.submit(next, items, None)
+            yield item
 
 
 class _Clock:
