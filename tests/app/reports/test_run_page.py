@@ -228,5 +228,29 @@ def test_what_is_drawn_over_temperature_has_no_loop_that_the_unit_has_not(run):
 def test_without_an_axis_that_is_known_as_up_nothing_is_said_of_the_heading(run):
     scores = run[0].overview.yardsticks
     unknown = replace(scores, heading=dict.fromkeys(scores.heading, np.nan))
-    assert "turn the heading by" in result_sentences(scores, RATE, heading=True)[1]
-    assert "heading" not in result_sentences(unknown, RATE, heading=True)[1]
+    without = replace(run[0].run, overview=replace(run[0].overview, yardsticks=unknown))
+    assert "turn the heading by" in result_sentences(run[0].run)[1]
+    assert "heading" not in result_sentences(without)[1]
+
+
+def test_the_headline_is_of_all_predictions_as_their_limit_is(run, tmp_path):
+    """The bias goes away by 200 deg/h in a quarter of an hour, long after the first prediction."""
+    steady = {"seconds": 2600, "rate": 5.0, "walk": 2e-7}
+    made = unit_at_rest(**steady, temperature=lambda t: 20 + 9 * np.sin(2 * np.pi * t / 1000))
+    made.gyro[:, 1] += np.clip(made.t - 1300, 0, 900) / 900 * np.deg2rad(200 / 3600)
+    found = driftlab.run(run[1].parent / "unit.yaml", {"time": made.t, **made.channels()}, units=UNITS)
+    result, use = result_sentences(found.run)
+    (row,) = [row for row in found.judged if row.name == "coast"]
+    assert "4 predictions of 10 min" in row.note
+    value = f"{np.max(found.run.measured['coast'].values) * RATE.factor:.2f}"
+    first = f"{found.overview.yardsticks.coast['10 min'][1] * RATE.factor:.2f}"
+    assert result == (
+        f"Without updates the bias is predicted over 10 min to {value} deg/h rms of 4 predictions, y; "
+        f"the first of them is off by {first} deg/h."
+    )
+    assert use.startswith("the first 10 min without updates turn the heading by ")
+    found.save(tmp_path / "out")
+    (cells,) = re.findall(
+        r"<td>prediction, all 4 of 10 min</td><td>(.*?)</td></tr>", (tmp_path / "out" / "report.html").read_text()
+    )
+    assert cells.split("</td><td>")[1].startswith(f"{value} (")
