@@ -105,7 +105,8 @@ def result_sentences(run: ScoredRun) -> tuple[str, str]:
     verdict = "a right sigma allows" if ratios[unsure] <= REFUTED else "is too much: widen walk or map"
     size = f"{unit.number(sigmas[unsure])} {unit.shown}"
     times = f"the error {ratios[unsure]:.1f} times that and the noise of the reference together"
-    trust = f"its sigma{of} there is {size}, {times}, which {verdict}"
+    whose = f"of all {len(scores.coasts)} the sigma{of}" if several else f"its sigma{of} there"
+    trust = f"{whose} is {size}, {times}, which {verdict}"
     known = run.sensor.integral is not None  # without gravity no axis is known as up
     angle = float(np.rad2deg(scores.heading[length])) if known else np.nan
     turned = (
