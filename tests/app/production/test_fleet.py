@@ -69,6 +69,15 @@ def test_all_that_fail_are_an_error_and_a_table_all_the_same(fleet):
     with pytest.raises(DataError, match=r"^all 4 units failed; the first is 0000: "):
         fleet()
     assert table()["state"].to_list() == ["failed"] * COUNT
+    with pytest.raises(DataError, match=r"^the only unit, soak, failed: .*units.0000.soak\.h5: [^;]*; use kind: csv$"):
+        fleet("units/0000/soak.h5", out="one")
+
+
+def test_a_folder_in_place_of_a_pattern_is_said_to_be_one(fleet):
+    with pytest.raises(
+        DataError, match=r"^--units units/: is a folder, .* quotes, as 'units/\*\.csv', or name a manifest$"
+    ):
+        fleet("units/", out="one")
 
 
 @pytest.mark.parametrize("limited", [True, False])
