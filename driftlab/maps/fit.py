@@ -21,7 +21,7 @@ from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, duration
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
@@ -37,6 +37,7 @@ USUAL = "spline"  # kind of a map where neither the config nor the user names on
 ROW = 10.0  # s, of a row of a soak
 MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
+MOST = 0.5  # of a soak that is not used: that is then the error
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
@@ -89,8 +90,7 @@ def fit_gathered(
     try:
         fitted = settings.fit(_to_fit(soak), soak.bias, about)
     except (SingularFit, SwingTooSmall) as error:
-        unused = soak.used.sentence()
-        raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
+        raise type(error)(_likelier(error, soak)) from None
     if soak.used.low < soak.used.high:
         fitted = settings.over(fitted, (soak.used.low, soak.used.high))
     if soak.placements is not None:
@@ -98,6 +98,18 @@ def fit_gathered(
     residual = residual_of(fitted, settings, soak.T, soak.bias, soak.starts, soak.interval)
     fitted = fitted.noting(**residual.as_record(soak.interval * len(soak.T)))
     return of_sensor(config, of_thermometer(fitted, soak.steps, soak.T, soak.off, soak.interval))
+
+
+def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:
+    """Return the text of an error with what is likelier its cause: first that most is not used, then the length."""
+    unused, lasts = soak.used.sentence(), duration(soak.interval * len(soak.T))
+    if soak.used.share > MOST:
+        return f"{unused}; of the {lasts} that are left, {error}"
+    text = f"{error}; {unused}" if unused else str(error)
+    if isinstance(error, SingularFit):
+        return text
+    correct = "where length or swing are not what was recorded, correct unit and path of time and temperature"
+    return f"{text}; it lasts {lasts}: {correct}"
 
 
 def _to_fit(soak: GatheredSoak) -> Array:
