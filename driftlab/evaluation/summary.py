@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.evaluation.overview import ScoredRun, map_of
-from driftlab.evaluation.scores import CELL, FIRST, HORIZONS, LONGEST_FIRST, WHOLE, WINDOW, Scores, over_axes
+from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_remarks, turned
 from driftlab.units import EARTH, axis_name, number
@@ -216,7 +216,7 @@ def _scored(run: ScoredRun) -> list[str]:
 def mispredicted(run: ScoredRun) -> list[str]:
     """Return the longest prediction that is off by far more than its deviation, and what may be the cause."""
     unit = run.unit
-    for name, (error, _, ratio) in predictions(run).items():
+    for name, (error, _, ratio) in run.predictions.items():
         if np.any(ratio > FAR_OFF) and not _turned(run):  # one that was turned is another matter
             k = int(np.nanargmax(ratio))
             axis = axis_name(run.sensor.channel, run.yardsticks.axes[k])
@@ -234,42 +234,6 @@ def _turned(run: ScoredRun) -> bool:
     (first, *again), scores = run.journal.alignments, run.yardsticks
     seen = bool(run.journal.moving.spans) or (1 - scores.share[WHOLE] - scores.moved) * run.span > UNSEEN
     return bool(again) and (seen or any(turned(first, one, run.sensor.channel) for one in again))
-
-
-def predictions(run: ScoredRun) -> dict[str, tuple[Array, Array, Array]]:
-    """Return error, deviation and their ratio (d,) of each prediction by its name, rms, the longest first.
-
-    All of 10 minutes, one after the other, are one more where there are several. In the ratio the white noise of the
-    reference, a mean over WINDOW, counts too.
-    """
-    scores = run.yardsticks
-    noise = run.sensor.noise * np.maximum(run.alignment.noise_ratio[run.sensor.channel], 1.0) / np.sqrt(WINDOW)
-    first, *shorter = ((name, scores.coast[name], scores.coast_sigma[name]) for name in LONGEST_FIRST)
-    if (J := len(scores.coasts)) > 1:
-        shorter.insert(0, (f"all {J} of 10 min", np.sqrt(np.mean(scores.coasts**2, axis=0)), _sigma_of_coasts(run)))
-    return {name: (error, sigma, error / np.hypot(sigma, noise)) for name, error, sigma in (first, *shorter)}
-
-
-def _sigma_of_coasts(run: ScoredRun) -> Array:
-    """Return the rms deviation (d,) of all predictions of 10 minutes, each as if aligned right before it.
-
-    The variance v of the run's own prediction has a part of the map, m(T, T_0) from T_0 on, and the rest r. That of
-    a prediction from s on is m(T, T_s) and, of the rest, what r begins with, and the larger of what it grows by from s
-    on and from the run's own start on.
-    """
-    curves, fitted = run.overview.curves, map_of(run.config)
-    known = np.isfinite(curves["coast_sigma"][:, 0])
-    t, rest = curves["t"][known], curves["coast_sigma"][known] ** 2
-    at = run.alignment.t + run.yardsticks.starts[:, None] + np.arange(0, HORIZONS["10 min"] + CELL, CELL)
-    of_map: Array = np.zeros((*at.shape, rest.shape[1]))
-    if fitted is not None and "temperature" in curves:
-        T = curves["temperature"][known]
-        rest = rest - fitted.sigma(T, T[0]) ** 2
-        of_map = np.array([fitted.sigma(each, each[0]) ** 2 for each in np.interp(at, t, T)])
-    own = at[0] - run.yardsticks.starts[0]
-    first, later = (np.stack([np.interp(x, t, r) for r in rest.T], axis=-1) for x in (own, at))
-    grown = np.maximum(later - later[:, :1], first - first[0])
-    return np.asarray(np.sqrt(np.mean(first[0] + grown + of_map, axis=(0, 1))))
 
 
 def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from driftlab.evaluation.comparison import REFUTED
 from driftlab.evaluation.overview import SMOOTHED, Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS
-from driftlab.evaluation.summary import error_pairs, inconsistency, predictions, remarks
+from driftlab.evaluation.summary import error_pairs, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
 from driftlab.reports.charts import Chart, Clock, Line, Panel, Rule, Shade
@@ -77,7 +77,7 @@ def _errors(run: ScoredRun) -> list[tuple[str, list[str]]]:
         return unit.number(error, "–") + ("" if sigma is None else f" ({unit.number(sigma, '–')})")
 
     rows: list[tuple[str, list[str]]] = []
-    of_all = ((f"prediction, {name}", ((error, sigma),)) for name, (error, sigma, _) in predictions(run).items())
+    of_all = ((f"prediction, {name}", ((error, sigma),)) for name, (error, sigma, _) in run.predictions.items())
     for label, ((errors, sigmas),) in (*of_all, *error_pairs([run.yardsticks])[len(HORIZONS) :]):
         rows.append((label, [text(*pair) for pair in zip(errors, *([] if sigmas is None else [sigmas]), strict=True)]))
     return rows
@@ -88,7 +88,7 @@ def result_sentences(run: ScoredRun) -> tuple[str, str]:
 
     It is of all predictions of 10 minutes where there are several, and of the run's own first where there is one.
     """
-    scores, unit, of_all = run.yardsticks, run.unit, predictions(run)
+    scores, unit, of_all = run.yardsticks, run.unit, run.predictions
     name = next((name for name in list(of_all)[1:] if np.all(np.isfinite(of_all[name][0]))), None)
     if name is None:
         return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""

@@ -11,7 +11,7 @@ import driftlab
 from driftlab.config import Config
 from driftlab.evaluation.overview import Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
-from driftlab.evaluation.summary import FAR_OFF, jumps, predictions, remarks
+from driftlab.evaluation.summary import FAR_OFF, jumps, remarks
 from driftlab.filtering.segment import RunLog
 from fusion_core.consistency import NisTest
 from fusion_core.contracts import Alignment
@@ -159,7 +159,7 @@ def test_the_deviation_of_all_predictions_is_that_of_runs_that_begin_there(tmp_p
     driftlab.fit_map(tmp_path / "unit.yaml", samples(soak), units=UNITS).save(tmp_path / "map.json")
     made = unit_at_rest(seconds=2600, rate=5.0, temperature=lambda t: 20 + 9 * np.sin(np.maximum(t - 800, 0) / 200))
     whole = driftlab.run(tmp_path / "unit.yaml", samples(made), units=UNITS).run
-    _, sigma, _ = predictions(whole)["all 4 of 10 min"]
+    _, sigma, _ = whole.predictions["all 4 of 10 min"]
     anew = []
     for start in whole.yardsticks.starts + whole.alignment.t - 60:
         part = {name: values[(made.t >= start) & (made.t < start + 662)] for name, values in samples(made).items()}
