@@ -228,7 +228,7 @@ def _fitted(
     elif neurons is not None:
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
-    fitted = fit_gathered(config, settings, soak, more, soak.memory)
+    fitted = fit_gathered(config, settings, soak, more, of_both_ways=True)
     verdict = MapVerdict(fitted, settings, soak.summary, soak.placements, soak.used, faults.doubts, soak.memory)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 

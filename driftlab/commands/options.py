@@ -47,7 +47,7 @@ METAVARS = {
     "calibration": RECORDING, "channel": "CHANNEL", "columns": "CHANNEL=NAME,...",
     "data": RECORDING, "dates": "day|month", "decimal": "comma|point", "duration": "TIME",
     "export": "px4|ardupilot", "family": "FAMILY.json", "fit_map": "MAP", "heading": "ANGLE", "holdout": RECORDING,
-    "hours": "H", "interval": "TIME", "lag": "TIME", "latitude": "ANGLE", "operator": "NAME", "out": "DIR",
+    "hours": "TIME", "interval": "TIME", "lag": "TIME", "latitude": "ANGLE", "operator": "NAME", "out": "DIR",
     "pages": "NAME|GLOB|all", "range": "LOW..HIGH", "rate": "RATE", "record": "FILE.h5", "report": "DIR",
     "rules": "western-electric|nelson", "run": "DIR", "scheduler": "ADDRESS", "seed": "N", "settings": "KEY=VALUE",
     "sigma": "SIGMA", "start": "TEMPERATURE", "stimulus": "KIND",

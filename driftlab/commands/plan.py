@@ -22,7 +22,7 @@ from driftlab.planning.chamber import Profile
 from driftlab.planning.continuation import Continuation, continuation_of, of_samples, read_parts
 from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
 from driftlab.planning.discrimination import DiscriminationCriterion, preferred
-from driftlab.planning.request import PlanRequest, parse_request, quantity
+from driftlab.planning.request import PlanRequest, parse_request, quantity, read_hours
 from driftlab.planning.search import SearchResult, search
 from driftlab.planning.short_soak import ShortSoakPlan, shortened
 from driftlab.planning.simulated_search import still_channels
@@ -112,7 +112,7 @@ class PlanResult(Result):
 
 def plan(
     config: ConfigLike,
-    hours: float = 8.0,
+    hours: str | float = 8.0,
     *,
     range: str | tuple[float, float] | None = None,
     rate: str | None = None,
@@ -138,8 +138,8 @@ def plan(
     ----------
     config : as that of `run`
         With a map, and a filter or a simulated unit, whose noise is reckoned with.
-    hours : float
-        How long the chamber may take.
+    hours : str or float
+        How long the chamber may take; a number alone is in hours.
     range : str or (float, float), optional
         E.g. '-20..50 degC'; default: the config's.
         A pair is in degC. The config's is that of its fitted map, or of the chamber that its source simulates; after
@@ -194,7 +194,7 @@ def plan(
     if terms is None and table is not None:
         raise ConfigError("--table: is the rate of a turntable; say which terms it is to tell, e.g. --terms scale")
     options = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    inquiry = _Inquiry(understood, hours, range, options, effects, progress or (lambda *state: None))
+    inquiry = _Inquiry(understood, read_hours(hours), range, options, effects, progress or (lambda *state: None))
     if terms is not None:
         if family is not None or after is not None or effects or sigma is not None:
             raise ConfigError("--terms: plans a turntable; leave --family, --after, --effects and --sigma out")
@@ -274,7 +274,7 @@ class _Inquiry:
     def turned(self, terms: str, table: str) -> PlanResult:
         """Plan the sequence of a turntable."""
         wanted = [j for name in names_of_terms(terms) for j in GROUPS[name]]
-        request, rate = self.request(self.range), quantity("table", table, "rad/s")
+        request, rate = self.request(self.range), quantity("table", table, "rad/s", TABLE)
         subject = request.subject
         if len(subject.axes) != len(AXES) or subject.unit.si != "rad/s" or rate <= 0:
             raise ConfigError(

@@ -37,7 +37,7 @@ from driftlab.reports.certificate import FILES as CERTIFICATE
 from driftlab.reports.certificate import Certificate
 from driftlab.reports.charts import Chart
 from driftlab.reports.provenance import Sheet, sheet_of
-from driftlab.reports.run import bias_chart, page_of
+from driftlab.reports.run import bias_chart, page_of, result_sentences
 from driftlab.reports.tables import yardstick_table
 from driftlab.storage.folders import output_folder
 from driftlab.storage.hdf5 import Columns, reading
@@ -294,6 +294,7 @@ def show(result: RunResult, given: Mapping[str, Any]) -> None:
     print_verdict(result.verdict)
     say_lines((row.line(run.unit) for row in result.judged if row.verdict != "pass"), "  ")
     name = config.file.stem if config.file else config.name
+    say(f"{result_sentences(run)[0]}\n")
     terminal().print(yardstick_table({name: run.yardsticks}, config.recording, run.sensor))
     say_lines(result.lines(), "note: ")
     signed = ", certificate.html, certificate.json" * given.get("certificate", False)

@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.evaluation.limits import LimitResult, Measured, check_limits
 from driftlab.evaluation.measurements import Averages, of_coast, of_map
-from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, errors_of, moving_average
+from driftlab.evaluation.scores import (
+    CELL,
+    HORIZONS,
+    LONGEST_FIRST,
+    WINDOW,
+    ScoreAccumulator,
+    Scores,
+    errors_of,
+    moving_average,
+)
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog
 from driftlab.filtering.setup import noise_doubts
@@ -366,6 +375,22 @@ class ScoredRun:
         return self.overview.end - self.alignment.t
 
     @cached_property
+    def predictions(self) -> dict[str, tuple[Array, Array, Array]]:
+        """Error, deviation and their ratio (d,) of each prediction by its name, rms, the longest first.
+
+        All of 10 minutes, one after the other, are one more where there are several. In the ratio the white noise of
+        the reference, a mean over WINDOW, counts too.
+        """
+        scores = self.yardsticks
+        noise = self.sensor.noise * np.maximum(self.alignment.noise_ratio[self.sensor.channel], 1.0) / np.sqrt(WINDOW)
+        first, *shorter = ((name, scores.coast[name], scores.coast_sigma[name]) for name in LONGEST_FIRST)
+        if (J := len(scores.coasts)) > 1:
+            shorter.insert(
+                0, (f"all {J} of 10 min", np.sqrt(np.mean(scores.coasts**2, axis=0)), _sigma_of_coasts(self))
+            )
+        return {name: (error, sigma, error / np.hypot(sigma, noise)) for name, error, sigma in (first, *shorter)}
+
+    @cached_property
     def measured(self) -> dict[str, Measured]:
         """Measurements of the quantities that a config may limit, by their names.
 
@@ -394,6 +419,28 @@ class ScoredRun:
         if (fitted := map_of(self.config)) is not None and (why := fitted.record.provenance.get(DOUBT)):
             doubts.append(f"the soak of its map: {why}")
         return check_limits(self.config.limits, self.measured, doubts)
+
+
+def _sigma_of_coasts(run: ScoredRun) -> Array:
+    """Return the rms deviation (d,) of all predictions of 10 minutes, each as if aligned right before it.
+
+    The variance v of the run's own prediction has a part of the map, m(T, T_0) from T_0 on, and the rest r. That of
+    a prediction from s on is m(T, T_s) and, of the rest, what r begins with, and the larger of what it grows by from s
+    on and from the run's own start on.
+    """
+    curves, fitted = run.overview.curves, map_of(run.config)
+    known = np.isfinite(curves["coast_sigma"][:, 0])
+    t, rest = curves["t"][known], curves["coast_sigma"][known] ** 2
+    at = run.alignment.t + run.yardsticks.starts[:, None] + np.arange(0, HORIZONS["10 min"] + CELL, CELL)
+    of_map: Array = np.zeros((*at.shape, rest.shape[1]))
+    if fitted is not None and "temperature" in curves:
+        T = curves["temperature"][known]
+        rest = rest - fitted.sigma(T, T[0]) ** 2
+        of_map = np.array([fitted.sigma(each, each[0]) ** 2 for each in np.interp(at, t, T)])
+    own = at[0] - run.yardsticks.starts[0]
+    first, later = (np.stack([np.interp(x, t, r) for r in rest.T], axis=-1) for x in (own, at))
+    grown = np.maximum(later - later[:, :1], first - first[0])
+    return np.asarray(np.sqrt(np.mean(first[0] + grown + of_map, axis=(0, 1))))
 
 
 def accumulator_of(run: Run, whiteness: Whiteness | None = None) -> OverviewAccumulator:

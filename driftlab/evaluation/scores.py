@@ -50,6 +50,7 @@ class Scores:
     moved: float  # part of the whole interval in which the unit moved
     # (J, d) rms of prediction less reference over each 10 minutes, as if aligned right before
     coasts: Array = field(default_factory=lambda: np.empty((0, 0)))
+    starts: Array = field(default_factory=lambda: np.empty(0))  # (J,) of these, s from the alignment
     # (K, 1 + d) of each CELL at rest: time from the alignment, s, and mean of prediction less rate
     errors: Array = field(default_factory=lambda: np.empty((0, 0)))
 
@@ -138,7 +139,7 @@ class ScoreAccumulator:
         first, whole = (self._integrals[name].rms(length)[:d] for name in (FIRST, "to the end"))
         moved = self.moved / length if length > 0 else 0.0
         coasts = self._cells.coasts(HORIZONS["10 min"], align, coast["10 min"])
-        return Scores(axes, first, whole, coast, sigma, heading, share, moved, coasts, self._cells.errors())
+        return Scores(axes, first, whole, coast, sigma, heading, share, moved, *coasts, self._cells.errors())
 
 
 class Cells:
@@ -174,10 +175,10 @@ class Cells:
         cells = cells[cells[:, 1] >= MEASURED * CELL]
         return np.column_stack([(cells[:, 0] + 0.5) * CELL, cells[:, 2 + 2 * self.d :] / cells[:, 1:2]])
 
-    def coasts(self, length: float, align: float, first: Array) -> Array:
-        """Return the rms (J, d) of predictions of `length` s one after the other, the run's own first (d,)."""
+    def coasts(self, length: float, align: float, first: Array) -> tuple[Array, Array]:
+        """Return the rms (J, d) and starts (J,) s of predictions of `length` s in turn, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
-        coasts = [first] if np.all(np.isfinite(first)) else []
+        coasts, begun = ([first], [0.0]) if np.all(np.isfinite(first)) else ([], [])
         cells = np.concatenate(self._cells)
         starts = np.unique(cells[:, 0] // n) * n
         for start in starts[(starts >= n) & (starts + n <= self.size)]:
@@ -187,7 +188,8 @@ class Cells:
                 level = aligned[1 + 2 * d :] / aligned[0]
                 mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]
                 coasts.append(np.sqrt(np.maximum(square - 2 * level * mean + level**2, 0.0)))
-        return np.array(coasts).reshape(-1, d)
+                begun.append(start * CELL)
+        return np.array(coasts).reshape(-1, d), np.array(begun)
 
 
 @compiled

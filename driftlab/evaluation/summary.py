@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from driftlab.evaluation.overview import ScoredRun, map_of
-from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, WINDOW, Scores, over_axes
+from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
-from driftlab.filtering.setup import noise_remarks
+from driftlab.filtering.setup import noise_remarks, turned
 from driftlab.units import EARTH, axis_name, number
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
@@ -20,7 +20,10 @@ from fusion_core.errors import moment
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
 COMPLETE = 0.9  # of the time: a score that stands on less says why
-FAR_OFF = 4.0  # deviations of a prediction: a right model is off by more in one axis of 10,000
+# deviations of a prediction: by chi square of one degree of freedom, a right model is off by more in one of 15,000, and
+# more degrees make it rarer, however they depend on one another (Szekely and Bakirov 2003)
+FAR_OFF = 4.0
+UNSEEN = 1.0  # s in gaps: a unit may have been turned in as much
 CHANCE = 1e-3  # probability that innovations of a right model are said to add up
 SMALL = 1.3  # times that a deviation of the bias is too small: with less nothing is said
 AXES = 3  # of a gyro whose turns are seen
@@ -211,24 +214,26 @@ def _scored(run: ScoredRun) -> list[str]:
 
 
 def mispredicted(run: ScoredRun) -> list[str]:
-    """Return the longest prediction that is off by far more than its deviation, and what may be the cause.
-
-    The white noise of the reference, a mean over WINDOW, counts too.
-    """
-    scores, unit = run.yardsticks, run.unit
-    noise = run.sensor.noise * np.maximum(run.alignment.noise_ratio[run.sensor.channel], 1.0) / np.sqrt(WINDOW)
-    for name in () if len(run.journal.alignments) > 1 else LONGEST_FIRST:  # one that was turned is another matter
-        ratio = scores.coast[name] / np.hypot(scores.coast_sigma[name], noise)
-        if np.any(ratio > FAR_OFF):
+    """Return the longest prediction that is off by far more than its deviation, and what may be the cause."""
+    unit = run.unit
+    for name, (error, _, ratio) in run.predictions.items():
+        if np.any(ratio > FAR_OFF) and not _turned(run):  # one that was turned is another matter
             k = int(np.nanargmax(ratio))
-            axis = axis_name(run.sensor.channel, scores.axes[k])
-            by = f"{axis} {scores.coast[name][k] * unit.factor:.3g} {unit.shown}"
+            axis = axis_name(run.sensor.channel, run.yardsticks.axes[k])
+            by = f"{axis} {error[k] * unit.factor:.3g} {unit.shown}"
             return [
                 f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma and the reference's noise together, "
                 "so map or walk do not fit this recording; check that unit, axes and thermometer are those of the map, "
                 "and see with driftlab explain what is missing"
             ]
     return []
+
+
+def _turned(run: ScoredRun) -> bool:
+    """Return True if the unit was aligned again, and may have been turned before, seen or unseen."""
+    (first, *again), scores = run.journal.alignments, run.yardsticks
+    seen = bool(run.journal.moving.spans) or (1 - scores.share[WHOLE] - scores.moved) * run.span > UNSEEN
+    return bool(again) and (seen or any(turned(first, one, run.sensor.channel) for one in again))
 
 
 def jumps(run: ScoredRun, columns: Mapping[str, Array]) -> list[str]:

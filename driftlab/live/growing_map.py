@@ -180,7 +180,7 @@ class GrowingMap:
         domain = Used(low=self.used.low, high=self.used.high)
         name = self.config.source.name if self.config.source else ""
         soak = GatheredSoak(blocks.t, T, blocks.bias, [name], [0], interval, used=domain, steps=steps, off=off)
-        fitted = fit_gathered(self.config, self.settings, soak, memory=soak.memory)
+        fitted = fit_gathered(self.config, self.settings, soak, of_both_ways=True)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
             # of a thermometer with steps, what readings do within a block is rounding and not temperature

@@ -23,7 +23,7 @@ from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, duration
 from fusion_core.chunk import Array, Chunk, Flags, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
@@ -42,6 +42,7 @@ ROW = 10.0  # s, of a row of a soak
 MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
 GRID = 400  # temperatures at which the difference between up and down is looked at
+MOST = 0.5  # of a soak that is not used: that is then the error
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
@@ -87,24 +88,23 @@ def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults:
 
 
 def fit_gathered(
-    config: Config, settings: ThermalMap, soak: GatheredSoak, more: Mapping[str, str] | None = None,
-    memory: MemoryVerdict | None = None,
+    config: Config, settings: ThermalMap, soak: GatheredSoak, more: Mapping[str, str] | None = None, *,
+    of_both_ways: bool = False,
 ) -> FittedMap:  # fmt: skip
     """Fit a thermal map on samples; its provenance has `more` too.
 
-    Where the `memory` of the soak is seen, the curve is the mean of warming and cooling at each temperature.
+    A curve `of_both_ways` is the mean of warming and cooling at each temperature where these are seen to differ.
     """
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
-    bias, apart = soak.bias, memory.apart if memory is not None else np.zeros(soak.bias.shape[1], dtype=np.bool_)
-    if np.any(apart):
-        bias = _mean_of_ways(soak, apart)
+    looked_for = of_both_ways and np.ptp(soak.T) >= settings.min_swing
+    apart = soak.memory.apart if looked_for else np.zeros(soak.bias.shape[1], dtype=np.bool_)
+    bias = _mean_of_ways(soak, apart) if np.any(apart) else soak.bias
     try:
         fitted = settings.fit(_to_fit(soak), bias, about)
     except (SingularFit, SwingTooSmall) as error:
-        unused = soak.used.sentence()
-        raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
-    if memory is not None and np.any(apart):
-        fitted = _with_spread(fitted, memory, apart)
+        raise type(error)(_likelier(error, soak)) from None
+    if np.any(apart):
+        fitted = _with_spread(fitted, soak.memory, apart)
     if soak.used.low < soak.used.high:
         fitted = settings.over(fitted, (soak.used.low, soak.used.high))
     if soak.placements is not None:
@@ -138,6 +138,18 @@ def _with_spread(fitted: FittedMap, memory: MemoryVerdict, axes: Flags) -> Fitte
         return fitted
     half = np.stack([np.interp(error.T, memory.T[some], column / 2) for column in memory.spread[some].T], axis=1)
     return fitted.noting(error=error.model_copy(update={"modes": (*nested((half * axes)[None]), *error.modes)}))
+
+
+def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:
+    """Return the text of an error with what is likelier its cause: first that most is not used, then the length."""
+    unused, lasts = soak.used.sentence(), duration(soak.interval * len(soak.T))
+    if soak.used.share > MOST:
+        return f"{unused}; of the {lasts} that are left, {error}"
+    text = f"{error}; {unused}" if unused else str(error)
+    if isinstance(error, SingularFit):
+        return text
+    correct = "where length or swing are not what was recorded, correct unit and path of time and temperature"
+    return f"{text}; it lasts {lasts}: {correct}"
 
 
 def _to_fit(soak: GatheredSoak) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.planning.chamber import Chamber
 from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
-from driftlab.units import tracked_unit
+from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Twin
 from fusion_core.errors import ConfigError, UnitError, quote
@@ -45,13 +45,12 @@ def parse_request(
     ConfigError
         If a value cannot be meant, or neither option nor config has one that is needed.
     """
-    _check_hours(hours)
     unit = tracked_unit(config.filter)
-    subject = UnitModel.of(config, kind, None if walk is None else _walk(walk, unit.si))
+    subject = UnitModel.of(config, kind, None if walk is None else _walk(walk, unit))
     twin = twin_of(config)
     low, high = _range(config, range, twin)
-    fastest = quantity("rate", RATE if rate is None else rate, "delta_degC/s")
-    begin = quantity("start", START if start is None else start, "degC")
+    fastest = quantity("rate", RATE if rate is None else rate, "delta_degC/s", RATE)
+    begin = quantity("start", START if start is None else start, "degC", START)
     coldest, hottest, _ = RANGES["temperature"]
     if not all(coldest <= T <= hottest for T in (low, high, begin)):
         raise ConfigError(
@@ -64,36 +63,46 @@ def parse_request(
             "the lower temperature first, and more between"
         )
     lag_of = "--lag" if lag is not None else "the simulated unit's" if twin is not None else "the default"
-    behind = twin.lag if lag is None and twin is not None else quantity("lag", LAG if lag is None else lag, "s")
+    own = twin.lag if lag is None and twin is not None else None
+    behind = quantity("lag", LAG if lag is None else lag, "s", LAG) if own is None else own
     if fastest <= 0 or behind < 0:
         raise ConfigError(f"--rate {rate or RATE}, --lag {lag or LAG}: one is negative, or the rate zero; correct it")
-    target = None if sigma is None else quantity("sigma", sigma, unit.si)
+    target = None if sigma is None else quantity("sigma", sigma, unit.si, f"3 {unit.shown}")
     if target is not None and target <= 0:
         raise ConfigError(f"--sigma {sigma}: must be greater than zero; write e.g. --sigma '3 {unit.shown}'")
     return PlanRequest(Chamber(low, high, begin, fastest, behind), subject, target, lag_of)
 
 
-def _check_hours(hours: Any) -> None:
+def read_hours(hours: Any) -> float:
+    """Return a length in h, of a number or of a text, in which h is the unit where it has none.
+
+    Raises ConfigError where it cannot be meant.
+    """
+    if isinstance(hours, str):
+        bare = re.fullmatch(NUMBER, hours.strip())
+        hours = quantity("hours", f"{hours} h" if bare else hours, "s", "8 h") / 3600
     number = isinstance(hours, int | float | np.integer | np.floating)
     if not (number and HOURS[0] <= hours <= HOURS[1]):
         given = quote(repr(hours)) if not number else "beyond 1e300" if abs(hours) > 1e300 else f"{hours:g}"
         raise ConfigError(f"--hours {given}: is not a length that can be meant; write hours from 0.01 to 10000")
+    return float(hours)
 
 
-def quantity(name: str, text: str, unit: str) -> float:
-    """Return the value of an option in SI; raises ConfigError that names it."""
+def quantity(name: str, text: str, unit: str, example: str) -> float:
+    """Return the value of an option in SI; raises ConfigError that names it, with an example."""
     try:
         number = to_si(text, unit)
     except UnitError as error:
-        raise ConfigError(f"--{name}: {error}") from None
+        raise ConfigError(f"--{name}: {error} (here e.g. '{example}')") from None
     low, high = LIMITS.get(unit, (1e-30, 1e30))
     if number and not low <= abs(number) <= high:
         raise ConfigError(f"--{name} {quote(text)}: is not a size that can be meant; correct it")
     return number
 
 
-def _walk(text: str, unit: str) -> Array:
-    parts = [quantity("walk", part, f"{unit}/sqrt(s)") for part in text.split(",")]
+def _walk(text: str, unit: BiasUnit) -> Array:
+    example = f"0.02 {unit.shown}/sqrt(s)"
+    parts = [quantity("walk", part, f"{unit.si}/sqrt(s)", example) for part in text.split(",")]
     if min(parts) < 0:
         raise ConfigError(f"--walk {quote(text)}: is negative; write a density of zero or more")
     return np.array(parts)

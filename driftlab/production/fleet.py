@@ -159,11 +159,18 @@ def fleet(
         if database is not None:
             command.to_database(database, summary)
         if not command.status.done:
-            raise _none_done(command.status.failed)
+            raise _none_done(command.status.failed, str(units))
         return FleetResult(Path(out), summary)
 
 
-def _none_done(failed: RecordsOfUnits) -> DataError:
+def _none_done(failed: RecordsOfUnits, units: str) -> DataError:
+    if Path(units).is_dir():
+        return DataError(
+            f"--units {units}: is a folder, of which no source reads a recording ({failed[0].error}); write a pattern "
+            f"of its files in quotes, as '{units.rstrip('/')}/*.csv', or name a manifest"
+        )
+    if len(failed) == 1:
+        return DataError(f"the only unit, {failed[0].unit}, failed: {failed[0].error}")
     return DataError(
         f"all {len(failed)} units failed; the first is {failed[0].unit}: {failed[0].error}; the others' errors are in "
         "the column `error` of units.parquet"

@@ -371,6 +371,7 @@ def _overview(
         effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],
         links=dict(links),
         remarks=analysis.lines,
+        judged=analysis.judged,
     )
 
 

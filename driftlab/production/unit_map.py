@@ -136,7 +136,7 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults, stimulus:
     """
     settings = usual_settings(config, faults)
     soak = gather(config, soaks, faults, keep=True)
-    fitted = fit_gathered(config, settings, soak, memory=soak.memory)
+    fitted = fit_gathered(config, settings, soak, of_both_ways=True)
     triad = None
     if stimulus:
         with_bias = _with_map(config, settings, fitted)

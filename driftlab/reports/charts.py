@@ -50,7 +50,7 @@ LOOKS = {
     "series:3": Look("#a0457a", "#e08ebd"),
     "series:4": Look("#8a6d00", "#e8c547"),
     "series:5": Look("#5b4bb5", "#a99cf0"),
-    "refused": Look("#c24e00", "#ff9a4d"),
+    "refused": Look("#a0457a", "#e08ebd"),
     "moving": Look("#6b6b6b", "#a8a8a8"),
     "hole": Look("#b3261e", "#ff7a70"),
     "reached": Look("#00795a", "#3ecf9f"),

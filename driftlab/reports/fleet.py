@@ -46,7 +46,7 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         path,
         "fleet",
         title=overview.title,
-        lead=_lead(len(records), len(failed), odd, doubted, len(effects)),
+        lead=_lead(len(records), len(failed), odd, doubted, len(effects), judged=overview.judged),
         limits=verdict_of_units(record.limits for record in records if record.state == "done").capitalize(),
         outcome=_outcome(record for record in records if record.state == "done"),
         verdict=_headline(line, odd, doubted, done, odd - len(lists["odd"])),
@@ -97,9 +97,10 @@ def _outcome(records: Iterable[UnitRecord]) -> str | None:
     return worst([{"verdict": word} for word in {worst(record.limits) for record in records}])
 
 
-def _lead(units: int, failed: int, odd: int, doubted: int, effects: int) -> str:
+def _lead(units: int, failed: int, odd: int, doubted: int, effects: int, *, judged: bool) -> str:
     """Return the numbers of units and of effects that they share."""
-    parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    out = f"{odd:,} odd" if judged or odd else "whether any is odd was not judged"
+    parts = [f"{units:,} unit{'s' * (units != 1)}: {units - failed:,} done, {failed:,} failed", out]
     parts[-1] += f", {doubted:,} of them in doubt" if doubted else ""
     parts += [f"{effects} effect{'s' * (effects != 1)} that they share"] if effects else []
     return "; ".join(parts)

@@ -96,6 +96,8 @@ class FleetOverview:
         By unit, of those whose alarms are all known.
     notes : sequence of Acknowledgement
         All notes, the latest last.
+    judged : bool
+        Whether odd units were looked for.
     """
 
     title: str
@@ -114,6 +116,7 @@ class FleetOverview:
     gauge: GaugeStudy | None = None
     acknowledged: Mapping[str, Acknowledgement] = field(default_factory=dict)
     notes: Sequence[Acknowledgement] = ()
+    judged: bool = True
 
 
 def map_charts(overview: FleetOverview, ranges: Array) -> list[Chart]:

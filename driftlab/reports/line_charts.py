@@ -111,8 +111,11 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     every = chart.value
     value = every[np.isfinite(every)]
     low, high = without_spikes(value, MANY)
+    spikes = bool(np.any((value < low) | (value > high)))
+    wide = not spikes and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
+    span = None if wide else _span(chart, (low, high), unit.factor)
+    low, high = (0.0, np.inf) if span is None else (span[0] / unit.factor, span[1] / unit.factor)
     cut = np.flatnonzero((every < low) | (every > high))
-    wide = not len(cut) and bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
     drawn_at, (ewma, *ewma_limits) = np.clip(every, low, high), chart.ewma
     lines = [
         *_usual(chart, shown),
@@ -123,7 +126,6 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
         *_limits(place, few, (ewma_limits[0], ewma_limits[1]), shown, ewma=True),
     ]
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
-    span = None if wide else _span(chart, (low, high), unit.factor)
     names = ", ".join(f"{line.units[chart.at[k]]} at {every[k] * unit.factor:.3g}" for k in cut[:NAMED])
     names += f" and {len(cut) - NAMED} more" if len(cut) > NAMED else ""
     label = f"{figure_name(chart.quantity)} {chart.axis} [{unit.shown}]{'; beyond the axis: ' if names else ''}{names}"

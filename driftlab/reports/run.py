@@ -15,7 +15,7 @@ import numpy as np
 
 from driftlab.evaluation.comparison import REFUTED
 from driftlab.evaluation.overview import SMOOTHED, Overview, ScoredRun
-from driftlab.evaluation.scores import Scores
+from driftlab.evaluation.scores import HORIZONS
 from driftlab.evaluation.summary import error_pairs, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
 from driftlab.reports import charts
@@ -49,7 +49,7 @@ def page_of(
         title=title,
         lead=f"{overview.count:,} updates over {duration(overview.end - overview.start)}, aligned at {aligned}",
         sheet=sheet,
-        results=result_sentences(scores, unit, heading=sensor.integral is not None),
+        results=result_sentences(run),
         remarks=[*remarks(run), *notes],
         channel=sensor.channel,
         known="Earth rate" if sensor.integral is not None else "its known input",
@@ -58,7 +58,7 @@ def page_of(
         domain=domain,
         axes=sensor.axes,
         unit=unit.shown,
-        rows=_errors(scores, unit),
+        rows=_errors(run),
         headings=[f"{name} {formatted(np.rad2deg(angle), '.2f')}" for name, angle in headings],
         nis=nis_sentence(overview.nis),
         nis_chart=nis_chart(overview, model.m),
@@ -69,36 +69,51 @@ def page_of(
     )
 
 
-def _errors(scores: Scores, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+def _errors(run: ScoredRun) -> list[tuple[str, list[str]]]:
     """Return the errors of each axis, the sigma of a prediction in brackets: a label, and a text an axis."""
+    unit = run.unit
 
     def text(error: float, sigma: float | None = None) -> str:
         return unit.number(error, "–") + ("" if sigma is None else f" ({unit.number(sigma, '–')})")
 
-    rows = []
-    for label, ((errors, sigmas),) in error_pairs([scores]):
+    rows: list[tuple[str, list[str]]] = []
+    of_all = ((f"prediction, {name}", ((error, sigma),)) for name, (error, sigma, _) in run.predictions.items())
+    for label, ((errors, sigmas),) in (*of_all, *error_pairs([run.yardsticks])[len(HORIZONS) :]):
         rows.append((label, [text(*pair) for pair in zip(errors, *([] if sigmas is None else [sigmas]), strict=True)]))
     return rows
 
 
-def result_sentences(scores: Scores, unit: BiasUnit, *, heading: bool) -> tuple[str, str]:
-    """Return the result of a run in a sentence, and its meaning for use; the second is empty where none is known."""
-    known = (name for name in ("10 min", "5 min", "1 min") if np.all(np.isfinite(scores.coast[name])))
-    name = next(known, None)
+def result_sentences(run: ScoredRun) -> tuple[str, str]:
+    """Return the result of a run in a sentence, and its meaning for use; the second is empty where none is known.
+
+    It is of all predictions of 10 minutes where there are several, and of the run's own first where there is one.
+    """
+    scores, unit, of_all = run.yardsticks, run.unit, run.predictions
+    name = next((name for name in list(of_all)[1:] if np.all(np.isfinite(of_all[name][0]))), None)
     if name is None:
         return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""
-    worst = int(np.argmax(scores.coast[name]))
-    unsure = int(np.nanargmax(scores.coast[name] / scores.coast_sigma[name]))
-    error, sigma = float(scores.coast[name][worst]), float(scores.coast_sigma[name][unsure])
-    ratio = float(scores.coast[name][unsure]) / sigma
+    errors, sigmas, ratios = of_all[name]
+    worst, unsure = int(np.argmax(errors)), int(np.nanargmax(ratios))
     axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
-    result = f"Without updates the bias is predicted over {name} to {unit.number(error)} {unit.shown} rms{axis}"
+    several, length = name not in HORIZONS, "10 min" if name not in HORIZONS else name
+    which = f" of {len(scores.coasts)} predictions" if several else ""
+    size = f"{unit.number(errors[worst])} {unit.shown}"
+    result = f"Without updates the bias is predicted over {length} to {size} rms{which}{axis}"
+    if several and np.all(np.isfinite(own := scores.coast[length])):
+        result += f"; the first of them is off by {unit.number(own[worst])} {unit.shown}"
     of = axis and f" of {scores.axes[unsure]}"
-    verdict = "a right sigma allows" if ratio <= REFUTED else "is too much: widen walk or map"
-    size = f"{unit.number(sigma)} {unit.shown}"
-    trust = f"its sigma{of} there is {size}, the error {ratio:.1f} times that, which {verdict}"
-    angle = float(np.rad2deg(scores.heading[name])) if heading else np.nan  # without gravity no axis is known as up
-    turned = f"{name} without updates turn the heading by {angle:.2g} deg; " if np.isfinite(angle) else ""
+    verdict = "a right sigma allows" if ratios[unsure] <= REFUTED else "is too much: widen walk or map"
+    size = f"{unit.number(sigmas[unsure])} {unit.shown}"
+    times = f"the error {ratios[unsure]:.1f} times that and the noise of the reference together"
+    whose = f"of all {len(scores.coasts)} the sigma{of}" if several else f"its sigma{of} there"
+    trust = f"{whose} is {size}, {times}, which {verdict}"
+    known = run.sensor.integral is not None  # without gravity no axis is known as up
+    angle = float(np.rad2deg(scores.heading[length])) if known else np.nan
+    turned = (
+        f"{'the first ' * several}{length} without updates turn the heading by {angle:.2g} deg; "
+        if np.isfinite(angle)
+        else ""
+    )
     return f"{result}.", f"{turned}{trust}."
 
 

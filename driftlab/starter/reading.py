@@ -258,7 +258,9 @@ def _framings() -> Iterator[tuple[str | None, Framing]]:
 
 
 def nothing_reads(path: Path, tried: list[FusionError]) -> UnreadableFile:
-    """Return the error of a file that no source reads."""
+    """Return the error of a file, or a folder, that no source reads."""
+    if path.is_dir():
+        return UnreadableFile(f"{path}: is a folder, and none of a bag that can be read; name a file in it")
     why = f" ({tried[0]})" if tried else ""
     return UnreadableFile(
         f"{path}: no installed source reads it{why}, and no framing finds frames in it; convert it to CSV, or describe "

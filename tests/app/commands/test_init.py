@@ -241,6 +241,15 @@ def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
         init(tmp_path / "unknown.bin", out=tmp_path / "unknown.yaml")
 
 
+def test_a_folder_that_is_no_bag_is_said_to_be_one(tmp_path):
+    (tmp_path / "soaks").mkdir()
+    (tmp_path / "soaks" / "a.csv").write_text("t,gx\n0,1\n")
+    with pytest.raises(
+        UnreadableFile, match=r"soaks: is a folder, and none of a bag that can be read; name a file in it$"
+    ):
+        init(tmp_path / "soaks", out=tmp_path / "soaks.yaml")
+
+
 def without_a_clock(k, gyro, g):
     """Message of Xsens, with the packet counter alone."""
     three = [(0x4020, struct.pack(">3f", *9.8 * g)), (0x8020, struct.pack(">3f", *gyro))]

@@ -15,7 +15,7 @@ from driftlab.cli import app
 from driftlab.commands.inputs import config_of
 from driftlab.errors import ConfigError
 from driftlab.planning.chamber import Chamber, Profile
-from driftlab.planning.request import parse_request
+from driftlab.planning.request import parse_request, read_hours
 from driftlab.planning.search import MIN_COVERAGE, candidates, judge, ranked
 from driftlab.planning.unit_model import UnitModel, twin_of
 
@@ -66,7 +66,7 @@ def run(*args):
 
 
 def test_what_it_writes_is_one_plan_and_its_page_shows_it(opened):
-    done = run("unit.yaml", "--range", "-20..50 degC", "--hours", 4, "--lag", "5 min", "--out", "soak", "--json")
+    done = run("unit.yaml", "--range", "-20..50 degC", "--hours", "4 h", "--lag", "5 min", "--out", "soak", "--json")
     assert done.exit_code == 0
     printed, held = json.loads(done.stdout), json.loads(Path("soak/plan.json").read_text())
     assert held.pop("written")
@@ -110,7 +110,17 @@ def test_a_plan_is_a_table_over_temperature(target):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hours": "3"}, "hours='3': is not a length that can be meant; write hours from"),
+        ({"hours": "0"}, "hours 0: is not a length that can be meant; write hours from"),
+        ({"hours": "-3 h"}, "hours -3: is not a length that can be meant; write hours from"),
+        ({"hours": "long"}, "hours: 'long' is not a quantity, it begins with 'l' and not with a number; "),
+        (
+            {"hours": "3 K"},
+            "hours: '3 K' cannot be converted to s; write a quantity of that dimension (here e.g. '8 h')",
+        ),
+        ({"range": (-20.0, 50.0), "lag": "5"}, "lag: '5' has no unit (here e.g. '10 min')"),
+        ({"range": (-20.0, 50.0), "rate": "5"}, "rate: '5' has no unit (here e.g. '2 K/min')"),
+        ({"range": (-20.0, 50.0), "sigma": "5"}, "sigma: '5' has no unit (here e.g. '3 deg/h')"),
+        ({"range": (-20.0, 50.0), "walk": "5"}, "walk: '5' has no unit (here e.g. '0.02 deg/h/sqrt(s)')"),
         ({"hours": None}, "hours None: is not a length"),
         ({"hours": float("nan")}, "hours nan: is not a length"),
         ({"range": "3"}, "range 3: is no range of temperature; write e.g. range='-20..50 degC'"),
@@ -121,6 +131,11 @@ def test_a_plan_is_a_table_over_temperature(target):
 def test_a_function_speaks_of_its_arguments_and_the_command_of_its_options(given, message):
     with pytest.raises(ConfigError, match=f"^{re.escape(message)}"):
         driftlab.plan("unit.yaml", **given)
+
+
+@pytest.mark.parametrize("text", ["4", "4 h", "240 min", "14400s", 4, 4.0])
+def test_hours_are_a_time_with_its_unit_or_a_number_of_hours(text):
+    assert read_hours(text) == pytest.approx(4.0, rel=1e-12)
 
 
 def test_a_walk_asks_for_cycles_and_white_noise_does_not(target):

@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
+from units_at_rest import UNITS, unit_at_rest
 
+import driftlab
 from driftlab.config import Config
 from driftlab.evaluation.overview import Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
-from driftlab.evaluation.summary import jumps, remarks
+from driftlab.evaluation.summary import FAR_OFF, jumps, remarks
 from driftlab.filtering.segment import RunLog
 from fusion_core.consistency import NisTest
 from fusion_core.contracts import Alignment
@@ -107,6 +110,66 @@ def test_a_prediction_far_beyond_its_sigma_is_named_and_one_within_is_not():
     assert "34 times its sigma" in line
     near = {**SCORES.coast, "to the end": np.array([1.0, 3.5, 2.0])}
     assert said(replace(QUIET, yardsticks=replace(SCORES, coast=near)), journal()) == []
+
+
+def test_one_that_was_aligned_again_as_it_lay_is_judged_and_one_that_was_turned_is_not():
+    coast = {**SCORES.coast, "to the end": np.array([1.0, 34.0, 2.0])}
+    off = replace(QUIET, yardsticks=replace(SCORES, coast=coast))
+    again = journal(90.0)
+    lying = [replace(one, inputs={"gyro": np.array([5e-5, 0.0, 5e-5])}) for one in again.alignments]
+    again.alignments[:] = lying
+    assert [line[:27] for line in said(off, again)] == ["prediction, to the end: off", "aligned again at 90.0 s: st"]
+    again.alignments[1:] = [replace(lying[1], inputs={"gyro": np.array([0.0, 5e-5, 5e-5])})]
+    assert not any("prediction" in line for line in said(off, again))
+    again.alignments[:] = lying
+    gone = replace(SCORES, coast=coast, share={**SCORES.share, "whole": 0.95})  # in gaps it may have been turned
+    assert not any("prediction" in line for line in said(replace(QUIET, yardsticks=gone), again))
+    again.moving.spans.append((70.0, 80.0))
+    assert not any("prediction" in line for line in said(off, again))
+
+
+def test_predictions_that_depend_on_one_another_are_off_by_far_no_more_often_than_one():
+    """Mean squares of right deviations, by draws: of one number, of walks, and of walks that all have a part alike."""
+    rng, n, tests = np.random.default_rng(0), 40_000, 15
+    one = rng.normal(size=(n, 1)) ** 2
+    walks = np.cumsum(rng.normal(size=(n, 60)), axis=1) ** 2
+    alike = (rng.normal(size=(n, 1)) + rng.normal(size=(n, 30))) ** 2
+    ratios = [np.sqrt(np.mean(e2, axis=1) / np.mean(e2)) for e2 in (one, walks, alike)]
+    assert all(np.mean(ratio > 2.5) <= 1.2 * np.mean(ratios[0] > 2.5) for ratio in ratios)
+    assert tests * 2 * norm.sf(FAR_OFF) < 0.01  # each run: of 5 lengths and 3 axes
+
+
+TEMPERED = """
+latitude: 40.9 deg
+heading: 0 deg
+filter:
+  update_interval: 1 s
+  gyro:
+    noise: 3.18 deg/h/sqrt(Hz)
+    bias: {kind: thermal_derivative, walk: 1.5e-4 deg/s/sqrt(s), map: {kind: polynomial, order: 3, path: map.json}}
+  accel: {noise: 0.05 m/s/sqrt(h), bias: {kind: random_walk, walk: 2e-3 m/s/h/sqrt(s)}}
+"""
+
+
+def test_the_deviation_of_all_predictions_is_that_of_runs_that_begin_there(tmp_path):
+    """First the temperature stands, then it swings: later predictions have more of the map's error."""
+    (tmp_path / "unit.yaml").write_text(TEMPERED)
+    soak = unit_at_rest(seconds=1000, rate=5.0, temperature=lambda t: 20 + 10 * np.sin(2 * np.pi * t / 1000), seed=1)
+    soak.gyro += 3e-5 * np.sin(soak.temperature * 2)[:, None]  # which a cubic does not follow
+    driftlab.fit_map(tmp_path / "unit.yaml", samples(soak), units=UNITS).save(tmp_path / "map.json")
+    made = unit_at_rest(seconds=2600, rate=5.0, temperature=lambda t: 20 + 9 * np.sin(np.maximum(t - 800, 0) / 200))
+    whole = driftlab.run(tmp_path / "unit.yaml", samples(made), units=UNITS).run
+    _, sigma, _ = whole.predictions["all 4 of 10 min"]
+    anew = []
+    for start in whole.yardsticks.starts + whole.alignment.t - 60:
+        part = {name: values[(made.t >= start) & (made.t < start + 662)] for name, values in samples(made).items()}
+        anew.append(driftlab.run(tmp_path / "unit.yaml", part, units=UNITS).overview.yardsticks.coast_sigma["10 min"])
+    assert sigma == pytest.approx(np.sqrt(np.mean(np.square(anew), axis=0)), rel=0.02)
+    assert np.all(sigma > 1.1 * whole.yardsticks.coast_sigma["10 min"])
+
+
+def samples(made):
+    return {"time": made.t, **made.channels()}
 
 
 def test_the_noise_of_the_reference_is_no_error_of_a_prediction():

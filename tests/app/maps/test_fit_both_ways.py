@@ -55,7 +55,7 @@ def off(fitted, grid, truth):
 def test_the_curve_is_the_mean_of_warming_and_cooling(seed):
     samples, grid, truth = soak(60.0, seed)
     assert samples.memory.answer == "seen"
-    plain, both = (fit_gathered(Config(), Spline(), samples, memory=memory) for memory in (None, samples.memory))
+    plain, both = (fit_gathered(Config(), Spline(), samples, of_both_ways=both) for both in (False, True))
     before, after = (np.sqrt(np.mean(off(fitted, grid, truth)[:, 0] ** 2)) for fitted in (plain, both))
     assert before > 8.0  # it follows the way that stays there longer
     assert after < 1.0
@@ -67,6 +67,6 @@ def test_the_curve_is_the_mean_of_warming_and_cooling(seed):
 def test_samples_without_a_memory_are_left_as_they_are():
     samples, *_ = soak(0.0)
     assert samples.memory.answer != "seen"
-    plain, both = (fit_gathered(Config(), Spline(), samples, memory=memory) for memory in (None, samples.memory))
+    plain, both = (fit_gathered(Config(), Spline(), samples, of_both_ways=both) for both in (False, True))
     T = np.linspace(*plain.domain, 50)
     np.testing.assert_array_equal(plain.bias(T), both.bias(T))

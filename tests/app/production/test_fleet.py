@@ -69,6 +69,15 @@ def test_all_that_fail_are_an_error_and_a_table_all_the_same(fleet):
     with pytest.raises(DataError, match=r"^all 4 units failed; the first is 0000: "):
         fleet()
     assert table()["state"].to_list() == ["failed"] * COUNT
+    with pytest.raises(DataError, match=r"^the only unit, soak, failed: .*units.0000.soak\.h5: [^;]*; use kind: csv$"):
+        fleet("units/0000/soak.h5", out="one")
+
+
+def test_a_folder_in_place_of_a_pattern_is_said_to_be_one(fleet):
+    with pytest.raises(
+        DataError, match=r"^--units units/: is a folder, .* quotes, as 'units/\*\.csv', or name a manifest$"
+    ):
+        fleet("units/", out="one")
 
 
 @pytest.mark.parametrize("limited", [True, False])
@@ -416,7 +425,9 @@ def test_the_yield_is_told_by_the_columns_that_are_asked_for(fleet):
     assert [(one["chamber"], one["units"]) for one in told["chamber"]["groups"]] == [("K0", 2), ("K1", 2)]
     assert told["T_low"]["groups"][-1]["T_low"] == "not known"  # of the unit that failed
     assert any(line.startswith(f"yield: {passed} of {COUNT} units, ") for line in again.lines())
-    assert "By chamber" in (Path("made") / "report.html").read_text()
+    page = (Path("made") / "report.html").read_text()
+    assert "By chamber" in page
+    assert "whether any is odd was not judged" in page  # so few are not
     assert sum(len(why) > 0 for why in rows["reasons"]) == COUNT - passed
     assert rows["reasons"].to_list()[3][0].startswith("not calibrated: ")
     assert {reason for why in rows["reasons"] for reason in why} == set(whole["reasons"])

@@ -254,6 +254,7 @@ def test_yield_reasons_and_groups_are_on_the_page_and_fit_a_phone(opened, tmp_pa
         shown = opened(path, width=width)
         text = shown.locator("body").inner_text()
         assert overflow(shown) == 0
+        assert "keeps every limit, with its uncertainty. None of them is in doubt." in text
         assert f"{told.whole.accepted} of 300 units are accepted: {100 * told.whole.share:.3g} % (" in text
         assert "noise above limit" in shown.locator(".pareto").inner_text()
         counts = shown.eval_on_selector_all(".pareto tbody tr", "rows => rows.map((row) => row.cells[1].textContent)")
@@ -268,6 +269,13 @@ def test_yield_reasons_and_groups_are_on_the_page_and_fit_a_phone(opened, tmp_pa
         assert bar["x"] < stroke["x"] + 2 <= bar["x"] + bar["width"] + 4
         assert shown.locator(".yields").last.locator("tbody tr").count() == 180  # of 300 days, 20 before them
         assert "100 more are in fleet.json" in shown.locator("body").text_content()
+
+
+def test_units_that_nobody_judged_are_not_said_to_be_fine(tmp_path):
+    found = fleet(6, failed=(), odd=())
+    for judged, said in ((False, "6 done, 0 failed; whether any is odd was not judged"), (True, "0 failed; 0 odd")):
+        write_fleet_report(tmp_path / "report.html", replace(found, judged=judged))
+        assert said in (tmp_path / "report.html").read_text()
 
 
 def test_gauge_study_and_notes_are_on_the_page_and_fit_the_sheet(opened, tmp_path):
@@ -333,7 +341,8 @@ def test_a_unit_far_off_leaves_the_scale_to_the_others_and_its_value_in_the_labe
         assert panel.span[1] < 2 * values[:, k].max()
         assert panel.label.endswith(f"beyond the axis: {records[20].unit} at {far.value[k] * RATE.factor:.3g}")
         (beyond,) = [one for one in panel.lines if one.name == "beyond three sigma"]
-        assert np.any((beyond.x == 21) & (beyond.y <= panel.span[1]))  # at the edge, in sight
+        assert beyond.y[beyond.x == 21] == pytest.approx(panel.span[1], rel=1e-3)  # at the edge of the axis
+        assert panel.span[1] > values[:, k].max()
 
 
 def test_half_of_the_units_are_in_the_narrow_band():

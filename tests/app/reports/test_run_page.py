@@ -15,8 +15,8 @@ from units_at_rest import thermal_bias, unit_at_rest
 import driftlab
 from driftlab.commands.run import show
 from driftlab.evaluation.overview import POINTS, STRETCHES
-from driftlab.reports.charts import content
-from driftlab.reports.run import bias_chart, error_chart, map_chart, nis_chart, result_sentences
+from driftlab.reports.charts import LOOKS, Clock, content
+from driftlab.reports.run import bias_chart, error_chart, event_shades, map_chart, nis_chart, result_sentences
 from driftlab.units import RATE
 
 CONFIG = """
@@ -126,6 +126,17 @@ def test_a_phone_shows_it_in_its_width(page, opened, dark):
     assert overflow(opened(page, width=390, height=800, dark=dark)) == 0
 
 
+def test_no_two_entries_of_a_legend_look_alike(run):
+    found, _ = run
+    for chart in (bias_chart(found.run), error_chart(found.run)):
+        bands = {line.name: line.role for panel in chart.panels for line in panel.lines if line.y is None}
+        shades = {shade.text: shade.role for shade in event_shades(found.journal, Clock(0.0, 1.0))}
+        shades["refused"] = "refused"
+        looks = [LOOKS[role] for role in (*bands.values(), *shades.values())]
+        for ground in ("light", "dark"):
+            assert len({getattr(look, ground) for look in looks}) == len(looks), chart.title
+
+
 def test_motion_is_shaded_where_it_was(run):
     found, _ = run
     (shade, *_) = bias_chart(found.run).panels[0].shades
@@ -228,5 +239,29 @@ def test_what_is_drawn_over_temperature_has_no_loop_that_the_unit_has_not(run):
 def test_without_an_axis_that_is_known_as_up_nothing_is_said_of_the_heading(run):
     scores = run[0].overview.yardsticks
     unknown = replace(scores, heading=dict.fromkeys(scores.heading, np.nan))
-    assert "turn the heading by" in result_sentences(scores, RATE, heading=True)[1]
-    assert "heading" not in result_sentences(unknown, RATE, heading=True)[1]
+    without = replace(run[0].run, overview=replace(run[0].overview, yardsticks=unknown))
+    assert "turn the heading by" in result_sentences(run[0].run)[1]
+    assert "heading" not in result_sentences(without)[1]
+
+
+def test_the_headline_is_of_all_predictions_as_their_limit_is(run, tmp_path):
+    """The bias goes away by 200 deg/h in a quarter of an hour, long after the first prediction."""
+    steady = {"seconds": 2600, "rate": 5.0, "walk": 2e-7}
+    made = unit_at_rest(**steady, temperature=lambda t: 20 + 9 * np.sin(2 * np.pi * t / 1000))
+    made.gyro[:, 1] += np.clip(made.t - 1300, 0, 900) / 900 * np.deg2rad(200 / 3600)
+    found = driftlab.run(run[1].parent / "unit.yaml", {"time": made.t, **made.channels()}, units=UNITS)
+    result, use = result_sentences(found.run)
+    (row,) = [row for row in found.judged if row.name == "coast"]
+    assert "4 predictions of 10 min" in row.note
+    value = f"{np.max(found.run.measured['coast'].values) * RATE.factor:.2f}"
+    first = f"{found.overview.yardsticks.coast['10 min'][1] * RATE.factor:.2f}"
+    assert result == (
+        f"Without updates the bias is predicted over 10 min to {value} deg/h rms of 4 predictions, y; "
+        f"the first of them is off by {first} deg/h."
+    )
+    assert re.match(r"the first 10 min without updates turn the heading by \S+ deg; of all 4 the sigma of y is ", use)
+    found.save(tmp_path / "out")
+    (cells,) = re.findall(
+        r"<td>prediction, all 4 of 10 min</td><td>(.*?)</td></tr>", (tmp_path / "out" / "report.html").read_text()
+    )
+    assert cells.split("</td><td>")[1].startswith(f"{value} (")

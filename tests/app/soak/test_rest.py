@@ -120,6 +120,18 @@ def test_rows_that_are_left_out_are_not_used_either():
     )
 
 
+def test_a_swing_that_is_too_small_says_how_long_it_lasts_and_first_what_left_the_rows_out():
+    t, T, rates = soak(MEMS, 22, 1.0)
+    said = r"T moves by only \d\.\d+ K, .*; it lasts 1\d\d s: where length or swing are not what was recorded, "
+    with pytest.raises(SwingTooSmall, match=said):
+        fit_map(config(MEMS), [recording(*soak(MEMS, 22, 1.0, seconds=120.0))], kind="spline")
+    rates[1000:, 1] = rates[1000, 1]
+    with pytest.raises(
+        SwingTooSmall, match=r"^\d\d% of the soak is not used: .*; of the 5\d\d s that are left, spline: T"
+    ):
+        fit_map(config(MEMS), [recording(t, np.where(t > 600, T, 20 + 1e-3 * t), rates)], kind="spline")
+
+
 def test_a_fit_that_fails_says_that_motion_took_the_samples():
     t, T, rates = soak(MEMS, 22, 1.0, seconds=1800.0)
     moving = (t > 60) & (t <= 1730)
