@@ -229,7 +229,9 @@ def _fitted(
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, soak, more)
-    verdict = MapVerdict(fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts)
+    verdict = MapVerdict(
+        fitted, settings, soak.brief(), soak.placements, soak.used, faults.doubts, comparison is not None
+    )
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 
