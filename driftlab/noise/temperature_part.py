@@ -1,4 +1,4 @@
-"""What a bias owes to the temperature in a recording that was to be at rest at one.
+"""The part of a bias that follows the temperature, in a recording that was to be at rest at one.
 
 A bias that follows the temperature raises the Allan deviation at long averaging times, where it passes for a walk, a
 ramp or a step. So means y over R blocks are held against a local level, white noise and walk of any ratio, with and
@@ -29,7 +29,7 @@ MATERIAL = 0.1  # of the variance of what the bias moves: less changes no coeffi
 
 
 class TemperaturePart(NamedTuple):
-    """How far the temperature moves in K, its part of the variance of what the bias moves, and the nats it gains.
+    """The temperature's span in K, its part of the variance of what the bias moves, and the nats it gains.
 
     A ramp beside it, as of ageing, is not counted in that variance.
     """

@@ -375,9 +375,8 @@ class CsvLines(Table):
             if seconds.null_count() > sum(1 for cell in parts[0] if not (cell or "").strip()):
                 return None
             values[path] = seconds.to_numpy()
-        for path, word in self._flags(at):
-            values[path] = (columns[path].fill_null("").str.strip_chars() == word).to_numpy().astype(np.float64)
-        return values
+        return values | {path: (columns[path].fill_null("").str.strip_chars() == word).to_numpy().astype(np.float64)
+                         for path, word in self._flags(at)}  # fmt: skip
 
     def _dates(self, at: Mapping[str, int]) -> Iterator[tuple[str, str]]:
         """Yield the columns of dates among those that are read, with their formats."""
