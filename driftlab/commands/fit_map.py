@@ -229,7 +229,8 @@ def _fitted(
         settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, soak, more, of_both_ways=True)
-    verdict = MapVerdict(fitted, settings, soak.summary, soak.placements, soak.used, faults.doubts, soak.memory)
+    known = soak.placements, soak.used, faults.doubts, soak.memory, comparison is not None
+    verdict = MapVerdict(fitted, settings, soak.summary, *known)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

@@ -48,6 +48,7 @@ class MapVerdict:
     used: Used | None = None  # share of the soak that is used; None where that is not known
     doubts: Sequence[str] = ()  # why the soak may not be what its config says (`Faults.doubts`)
     known_memory: MemoryVerdict | None = None  # of the soak, where it has been looked for
+    compared: bool = False  # whether the settings were chosen among all kinds (`driftlab.maps.kind_selection`)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -144,9 +145,17 @@ class MapVerdict:
         return [good, f"its level is not in that: {level}"]
 
     def _misfits(self, unit: BiasUnit) -> list[str]:
+        """Return the misfits, but for those within half of what is seen between up and down: means of both are off so.
+
+        Where a temperature was passed more often one way than the other, that is.
+        """
         error = self.fitted.record.error
+        misfits = () if error is None else error.misfits
+        if self.seen:
+            half = np.sqrt(self.memory.variance(np.array([m.T for m in misfits])))
+            misfits = tuple(m for m, beside in zip(misfits, half, strict=True) if m.left > beside[m.axis])
         each: list[str] = []
-        for m in sorted(() if error is None else error.misfits, key=lambda misfit: -misfit.left):
+        for m in sorted(misfits, key=lambda misfit: -misfit.left):
             axis, left, noise = self.axes[m.axis], text(m.left * unit.factor), text(m.noise * unit.factor)
             if each:
                 each.append(f"{axis} at {m.T:.3g} °C ({left} left, {noise} is noise)")
@@ -154,9 +163,11 @@ class MapVerdict:
                 bends = f"{axis} bends at {m.T:.3g} °C more than {self.settings.description} can"
                 each.append(f"{bends} ({left} {unit.shown} left, {noise} is noise)")
         when = "once it is known why up and down differ, " if self.seen else ""
-        what = self.settings.advice or "a kind that bends more"
+        what = f"take {self.settings.advice or 'a kind that bends more'}"
         whether = "`driftlab fit-map --compare` tells whether it predicts better"
-        return [f"{', '.join(each)}: {when}take {what}; {whether}"] if each else []
+        if self.compared:
+            what, whether = "look at the samples there", "of the kinds that were compared none surely predicts better"
+        return [f"{', '.join(each)}: {when}{what}; {whether}"] if each else []
 
     def _coverage(self, unit: BiasUnit) -> list[str]:
         lines = [unseen(self.fitted, *hole, unit) for hole in self.coverage.holes]

@@ -33,6 +33,7 @@ MODEL_ERROR = 0.02  # of the variance: no unit follows five power laws more clos
 GOOD = 0.11  # a departure of the variance up to which a fit begins at the shortest averaging time
 REACH = 10  # times `a` of `Design.smoothed`: a filter of first or second order has then all but come to rest
 SHAPED = 100  # samples over which what is no filter, as vibration, may bend the curve
+RAMP_SHOWS = "a rate ramp shows"
 SMOOTH = "neighbouring samples are alike, as those of a low-pass filter or of interpolation"
 AVERAGES = 100  # over which a correlation is looked at
 LEFT = 15  # averaging times that are left to a fit at least
@@ -79,7 +80,7 @@ def fit(curve: AllanCurve) -> Coefficients:
     value, low, high = allan.value, allan.low, allan.high
     notes = []
     if low[RAMP] > 0 or low[WALK] > hadamard.high[WALK]:
-        why = "a rate ramp shows" if low[RAMP] > 0 else "Allan and Hadamard curves disagree on the walk"
+        why = RAMP_SHOWS if low[RAMP] > 0 else "Allan and Hadamard curves disagree on the walk"
         value[WALK], low[WALK], high[WALK] = hadamard.value[WALK], hadamard.low[WALK], hadamard.high[WALK]
         notes.append(
             f"{why}: a drift (temperature, warming up) bends the long end. The walk is fitted on the Hadamard curve, "

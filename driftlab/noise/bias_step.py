@@ -44,32 +44,59 @@ class BiasStep(NamedTuple):
     walk: float
 
 
-def bias_steps(t: Array, rate: Array, stretches: Integers) -> list[BiasStep | None]:
-    """Return the likeliest step of each axis of readings `rate` (N, d) at times t (N,) in s; None where none is seen.
+class BlockMeans(NamedTuple):
+    """Means y (R, d) of R blocks of readings, at times t (R,) in s, the first of them begun at `starts` (R,).
+
+    `white` (R, d) is the white noise of each beside the usual one, `walks` the variance (R,) by which the bias walks to
+    each, for each of RATIOS; `usual` is the step between blocks in s, `rows` (R, 2) are first row and end of each.
+    """
+
+    starts: Array
+    t: Array
+    y: Array
+    white: Array
+    walks: list[Array]
+    usual: float
+    rows: Integers
+
+
+def block_means(t: Array, rate: Array, stretches: Integers) -> BlockMeans | None:
+    """Average readings `rate` (N, d) at times t (N,) in s; None where they are too few, or in too many pieces.
 
     `stretches` (S, 2) are first row and end of what can be used; what lies between is not read, and the bias walks on.
-    Where these are more than `MOST`, no step is looked for.
     """
     starts, last = _blocks(stretches)
-    n = (last - starts).astype(np.float64)
-    if not 4 * EDGE <= len(n) <= MOST:
-        return [None] * rate.shape[1]
-    total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate - np.mean(rate, axis=0), axis=0)])
-    y = (total[last] - total[starts]) / n[:, None]
+    if not 4 * EDGE <= len(starts) <= MOST:
+        return None
+    rows = np.stack([starts, last], axis=1)
     at = (t[starts] + t[last - 1]) / 2
-    places = np.arange(EDGE, len(n) - EDGE)
-    steps_at = np.arange(len(n))[:, None] >= places
     dt = np.diff(at)
     usual = float(np.median(dt))
     walks = [np.concatenate([[np.inf], ratio * dt / usual]) for ratio in RATIOS]
+    return BlockMeans(t[starts], at, mean_of(rate, rows), _white(rate, starts, last), walks, usual, rows)
+
+
+def mean_of(values: Array, rows: Integers) -> Array:
+    """Return the means (R, d) of values (N, d) between first rows and ends (R, 2)."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - np.mean(values, axis=0), axis=0)])
+    return np.asarray((total[rows[:, 1]] - total[rows[:, 0]]) / np.diff(rows, axis=1))
+
+
+def bias_steps(means: BlockMeans | None, axes: int) -> list[BiasStep | None]:
+    """Find the likeliest step of each of so many axes; None where none is seen, or there are no means to look at."""
+    if means is None:
+        return [None] * axes
+    n = len(means.t)
+    places = np.arange(EDGE, n - EDGE)
+    steps_at = np.arange(n)[:, None] >= places
     steps: list[BiasStep | None] = []
-    for axis, white in enumerate(_white(rate, starts, last).T):
-        found = [_gains(np.column_stack([y[:, axis], steps_at]), white, walk) for walk in walks]
+    for y, white in zip(means.y.T, means.white.T, strict=True):
+        found = [_gains(np.column_stack([y, steps_at]), white, walk) for walk in means.walks]
         without, with_step, size, sigma, scale = (np.stack(parts) for parts in zip(*found, strict=True))
         g, k = np.unravel_index(int(np.argmax(with_step)), with_step.shape)
-        gain, density = float(with_step[g, k] - np.max(without)), float(np.sqrt(RATIOS[g] * scale[g, k] / usual))
-        step = BiasStep(float(t[starts[places[k]]]), float(size[g, k]), float(sigma[g, k]), gain, density)
-        steps.append(step if gain > np.log(len(n)) + SURE else None)
+        gain, density = float(with_step[g, k] - np.max(without)), float(np.sqrt(RATIOS[g] * scale[g, k] / means.usual))
+        step = BiasStep(float(means.starts[places[k]]), float(size[g, k]), float(sigma[g, k]), gain, density)
+        steps.append(step if gain > np.log(n) + SURE else None)
     return steps
 
 

@@ -16,9 +16,10 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.noise.allan import bridgeable, curve
-from driftlab.noise.allan_fit import Coefficients, fit
+from driftlab.noise.allan_fit import RAMP_SHOWS, Coefficients, fit
 from driftlab.noise.allan_model import KEYS, PRESENT, AllanCurve
-from driftlab.noise.bias_step import bias_steps
+from driftlab.noise.bias_step import bias_steps, block_means
+from driftlab.noise.temperature_part import temperature_parts
 from driftlab.recordings.epochs import GAP, epochs
 from driftlab.recordings.plausibility import axes_in
 from driftlab.recordings.screening import read
@@ -167,6 +168,7 @@ def limits(t: Array, stretches: Integers) -> tuple[float, float]:
 IMU = ("gyro", "accel")
 SLOW = slice(KEYS.index("bias_instability"), None)  # of the coefficients: those that one step of the bias looks like
 
+WARMED = "the temperature shows as a rate ramp"
 SPARSE = 0.2  # of the time that samples at their interval fill, at least
 EARLY = 1e-3  # of the steps, that are the shortest: a stamp is early by so much, and another one as late
 
@@ -190,6 +192,9 @@ class Analysis:
     notes: list[str]  # remarks for the user, a sentence each
     plugins: list[Participant] = field(default_factory=list)  # those that took part
     sensors: dict[str, Sensor] = field(default_factory=dict)  # as the config has them, by channel
+    warmed: dict[str, list[str]] = field(
+        default_factory=dict
+    )  # axes whose slow terms are the temperature's, by channel
 
     @property
     def first(self) -> AllanCurve:
@@ -213,7 +218,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
         If the recording cannot be read.
     """
     name = config.source.name if config.source is not None else "the recording"
-    whole = _load(config, faults, progress)
+    whole, T = _load(config, faults, progress)
     rest = _rest(config, whole)
     cut = pieces(whole.t, None if rest is None or rest.doubtful else rest.rows(whole.t))
     if not cut.enough:
@@ -234,11 +239,18 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     _doubt_stamps(faults, len(whole), dt, total)
     first = next(iter(curves.values()))[0]
     notes = [*_gap_notes(first, whole, cut, faults), *_motion_notes(config, rest, faults)]
+    warmed: dict[str, list[str]] = {}
     for c, of_axes in coefficients.items():
-        notes += _step_notes(whole.t, whole[c], cut.spans, of_axes, c, axes[c], sensors.get(c), faults)
-        notes += _grouped(c, axes[c], [one.notes for one in of_axes])
+        said = list(_slow_notes(whole.t, whole[c], T, cut.spans, of_axes, c, axes[c], sensors.get(c), faults))
+        warmed[c] = [axis for axis, _, by_temperature in said if by_temperature]
+        notes += [f"{axis_name(c, axis)}: {text}" for axis, text, _ in said]
+        by_axis = zip(axes[c], of_axes, strict=True)
+        own = [[t.replace(RAMP_SHOWS, WARMED) if a in warmed[c] else t for t in one.notes] for a, one in by_axis]
+        notes += _grouped(c, axes[c], own)
     start, plugins = float(whole.t[cut.spans[0, 0]]), participants(config.source)
-    return Analysis(name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors)
+    return Analysis(
+        name, dt, cut.samples * dt, total, start, axes, curves, coefficients, notes, plugins, sensors, warmed
+    )
 
 
 def _doubt_stamps(faults: Faults, rows: int, dt: float, total: float) -> None:
@@ -256,24 +268,34 @@ def _doubt_stamps(faults: Faults, rows: int, dt: float, total: float) -> None:
         )
 
 
-def _step_notes(
-    t: Array, rate: Array, spans: Integers, found: Sequence[Coefficients], channel: str, axes: list[str],
-    sensor: Sensor | None, faults: Faults,
-) -> Iterator[str]:  # fmt: skip
-    """Yield a remark on each axis whose walk, or ramp, is rather one step of the bias."""
+def _slow_notes(
+    t: Array, rate: Array, T: Array | None, spans: Integers, found: Sequence[Coefficients], channel: str,
+    axes: list[str], sensor: Sensor | None, faults: Faults,
+) -> Iterator[tuple[str, str, bool]]:  # fmt: skip
+    """Yield axis and remark where the walk, or ramp, is rather the temperature's (True), or one step of the bias."""
     slow = [k for k, one in enumerate(found) if np.any(one.value[SLOW] > 0)]
-    if not slow:
+    means = block_means(t, rate[:, slow], spans) if slow else None
+    if means is None:
         return
     unit = default_unit("rad/s" if channel == IMU[0] else "m/s^2") if sensor is None else unit_of(sensor)
-    for k, step in zip(slow, bias_steps(t, rate[:, slow], spans), strict=True):
-        if step is not None:
+    warmed = [None] * len(slow) if T is None else temperature_parts(means, T)
+    for k, part, step in zip(slow, warmed, bias_steps(means, len(slow)), strict=True):
+        if part is not None and (step is None or part.gain > step.gain - 3 / 2 * np.log(len(means.t))):
+            text = (
+                f"the temperature moves by {part.moved:.3g} K, and a curve over it makes {100 * part.part:.0f} % of "
+                f"the variance of what the bias moves (log-likelihood {part.gain:.0f} beyond noise, walk, ramp and "
+                "warming up alone); walk and ramp have it in: take it out with a map, or record at one temperature"
+            )
+            yield axes[k], text, True
+        elif step is not None:
             value = with_uncertainty(step.size * unit.factor, step.sigma * unit.factor)
             beside = f"{step.walk * unit.factor:.3g} {unit.shown}/sqrt(s)" if step.walk > 0 else "not seen"
-            yield (
-                f"{axis_name(channel, axes[k])}: the bias steps by {value} {unit.shown} at {faults.when(step.t)} "
+            text = (
+                f"the bias steps by {value} {unit.shown} at {faults.when(step.t)} "
                 f"(log-likelihood {step.gain:.0f} beyond noise and walk alone); the walk that is fitted has it in, "
                 f"beside it the walk is {beside}: find its cause, or leave one side of it out with PATH::START:STOP"
             )
+            yield axes[k], text, False
 
 
 def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]:
@@ -285,17 +307,19 @@ def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]
     return [f"{axis_name(channel, ', '.join(about))}: {text}" for text, about in by_text.items()]
 
 
-def _load(config: Config, faults: Faults, progress: Callable[[float, int], None] | None) -> Chunk:
+def _load(config: Config, faults: Faults, progress: Callable[[float, int], None] | None) -> tuple[Chunk, Array | None]:
+    """Return the sensors' samples, and the temperatures (N,) beside them where there are such."""
     sensors = [sensor.channel for sensor in config.filter.sensors] if config.filter else []
     # an inertial unit's accelerometers also where the filter does without them
-    wanted, parts, count = IMU if "gyro" in (sensors or IMU) else sensors, list[Chunk](), 0
+    wanted, parts, T, count = IMU if "gyro" in (sensors or IMU) else sensors, list[Chunk](), list[Array](), 0
     for chunk in read(config, faults):
         channels = {c: chunk[c] for c in wanted if c in chunk.channels}
         parts.append(Chunk(chunk.t, channels, sensors=frozenset(channels)))
+        T += [chunk["temperature"]] if "temperature" in chunk.channels and chunk["temperature"].ndim == 1 else []
         count += len(chunk)
         if progress is not None:
             progress(faults.since(float(chunk.t[-1])), count)
-    return concatenate(parts)
+    return concatenate(parts), np.concatenate(T) if len(T) == len(parts) else None
 
 
 def _rest(config: Config, whole: Chunk) -> RestWindows | None:

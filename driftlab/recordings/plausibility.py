@@ -7,6 +7,7 @@ What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from itertools import combinations
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Sensor
-from fusion_core.faults import Faults
+from fusion_core.faults import RANGES, Faults
 from fusion_core.thermal.thermometer import noise_before
 
 LIVELY = 100  # changes of a reading that show its habit
@@ -29,7 +30,9 @@ AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the
 BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
 EXACT = 0.01  # of a step: so far changes may be from multiples of it
 MINUTE = 60.0  # s; a mean over it is to be off by no more than its noise
-KELVIN = (200.0, 450.0)  # degC: colder there is no kelvin, and hotter no sensor
+KELVIN = 200.0  # degC: in kelvin a soak is warmer than that throughout
+SOAKS = (-100.0, 450.0)  # degC: colder and hotter no sensor is soaked
+ZERO = RANGES["temperature"][0]  # degC; colder rows are left out
 
 
 class Copies:
@@ -151,7 +154,20 @@ class Thermometer:
         self.changes = self.longest = self.run = 0  # changes, rows of the longest repetition, and of the present one
         self.since = np.nan  # when that began, s
         self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
-        self.fast = False  # whether it has moved faster than any
+        self.fast = self.odd = False  # whether it has moved faster than any, and shown what no soak has
+        self.impossible: set[float] = set()  # readings below absolute zero: one or two of a logger that has none
+
+    def along(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Pass the rows of a source on, and look for readings below absolute zero that change as readings do."""
+        for chunk in chunks:
+            T = chunk.channels.get("temperature")
+            if T is not None and len(self.impossible) < LIVELY and np.any(below := T < ZERO):
+                self.impossible |= set(np.unique(T[below]).tolist())
+                if len(self.impossible) >= LIVELY:
+                    self.faults.doubt(
+                        "temperature changes below absolute zero; correct path or unit of source.channels.temperature"
+                    )
+            yield chunk
 
     def look(self, chunk: Chunk) -> None:
         """Take the next temperatures (N,), in degC, and look at them once there are enough."""
@@ -207,11 +223,18 @@ class Thermometer:
     def _range(self, t: Array, T: Array) -> None:
         if self.first is None:
             self.first = float(t[0]), float(T[0])
-            if KELVIN[0] < T.min() and T.max() < KELVIN[1]:
+            if T.min() > KELVIN and T.max() < SOAKS[1]:
                 self.faults.doubt(
                     f"temperature is {T[0]:.4g} °C in the first row: that looks like kelvin; set "
                     "source.channels.temperature.unit to K"
                 )
+        odd = (SOAKS[0] > T) | (SOAKS[1] < T)
+        if not self.odd and np.any(odd):
+            self.odd, k = True, int(np.argmax(odd))
+            self.faults.doubt(
+                f"temperature is {T[k]:.4g} °C at {self.faults.when(t[k])}: no sensor is soaked below {SOAKS[0]:g} or "
+                f"above {SOAKS[1]:g} °C; correct path or unit of source.channels.temperature"
+            )
         seconds, warmer = float(t[-1]) - self.first[0], abs(float(T[-1]) - self.first[1])
         if warmer > MOVED and warmer > FASTEST * seconds and not self.fast:
             self.fast = True

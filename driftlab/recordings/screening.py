@@ -34,7 +34,8 @@ def read(
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     gaps, screen = Gaps(faults), _Screen(faults, sensors or {}, few=few)
-    chunks = usable(gaps.along(stream or config.source.chunks(rows, faults)), faults, config.source.name, start)
+    raw = screen.thermometer.along(gaps.along(stream or config.source.chunks(rows, faults)))
+    chunks = usable(raw, faults, config.source.name, start)
     empty, previous = True, None
     for chunk in chunks:
         if not DERIVED.isdisjoint(chunk.channels):

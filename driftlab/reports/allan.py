@@ -120,7 +120,7 @@ def config_lines(analysis: Analysis) -> str:
         if any(np.isinf(fit.high[WHITE]) for fit in fits):
             lines.append(f"  # {channel}: white noise is not measured")
             continue
-        axes, units = analysis.axes[channel], units_of(analysis, channel)
+        axes, units, warmed = analysis.axes[channel], units_of(analysis, channel), analysis.warmed.get(channel)
         noise = [float(fit.value[WHITE] or fit.high[WHITE]) for fit in fits]
         walk = [
             float(fit.value[WALK] or (fit.high[WALK] if np.isfinite(fit.high[WALK]) else _of_floor(c, n)))
@@ -134,6 +134,7 @@ def config_lines(analysis: Analysis) -> str:
         indent = "  " if bare else "    "
         lines += [
             f"  channel: {channel}" if bare else f"  {channel}:",
+            *([f"{indent}# in doubt: the bias follows the temperature in {', '.join(warmed)}"] if warmed else []),
             f"{indent}noise: {_value_text(noise, units, 'white')}{unseen}",
             f"{indent}bias: {{kind: random_walk, walk: {_value_text(walk, units, 'rate_random_walk')}{where}}}{most}",
         ]

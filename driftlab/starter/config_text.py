@@ -26,6 +26,8 @@ UNITS_OF = {
 }  # fmt: skip  # that are usual
 FASTEST = 0.1  # s between epochs
 QUIET = 20.0  # times less noise than the others of a triad: more than sensors of one kind differ by
+FLAGS = {"status", "state", "valid", "ok", "flag", "flags", "err", "error", "good", "quality"}  # words of their names
+FEW = 5  # values of a flag, at most
 AXES = tuple(str.maketrans("xX", pair) for pair in ("xX", "yY", "zZ"))
 
 
@@ -78,7 +80,8 @@ def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, m
         note = "# guess: the sensor, since no column is a gyro; correct its unit"
         place = f"{{path: {yaml_text(held.path)}, unit: {yaml_text(_held_unit(held))}}}"
         lines.append(f"    {yaml_text(_key(held.path))}: {place}   {note}")
-    lines += [_auxiliary(other, columns.units.get(other.path)) for other in channels.others if other != held]
+    lines += [_auxiliary(other, columns) for other in channels.others if other != held]
+    lines += [_not_read(path, why, columns) for path, why in columns.unread.items()]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
     return _starter(lines, asked, questions, [*unread_of(columns, channels), *_quiet(channels)])
@@ -206,10 +209,28 @@ def _channel(field: str, channel: GuessedChannel) -> str:
     return f"    {field}: {{path: {path}, unit: {yaml_text(channel.unit)}}}{note}"
 
 
-def _auxiliary(name: Name, stated: str | None) -> str:
-    unit = name.unit or stated
+def _auxiliary(name: Name, columns: FileColumns) -> str:
+    """Return a comment on a column of numbers that is not read; of a flag, how many rows it would leave out."""
+    values = columns.values[name.path]
+    if _is_flag(name.path) and values.ndim == 1 and len(np.unique(values)) <= FEW:
+        share = f"{100 * float(np.mean(values == 0)):.3g} % of these"
+        return f"    # valid: {{path: {yaml_text(name.path)}}}   # leaves out the rows in which it is 0, {share}"
+    unit = name.unit or columns.units.get(name.path)
     known = f", unit: {yaml_text(unit)}" if unit is not None and _is_unit(unit) else ""
     return f"    # {yaml_text(_key(name.path))}: {{path: {yaml_text(name.path)}{known}}}"
+
+
+def _not_read(path: str, why: str, columns: FileColumns) -> str:
+    """Return a comment on a column of texts; of a flag, how it is read."""
+    cell = found[1] if (found := re.search(r"'([^']*)' is not a number", why)) else ""
+    if _is_flag(path) and columns.flags and cell:
+        flags = f"source.flags: {{{yaml_text(path)}: {yaml_text(cell)}}}"
+        return f"    # valid: {{path: {yaml_text(path)}}}   # with {flags} leaves out the rows with another text"
+    return f"    # {yaml_text(path)} is not read: {why}"
+
+
+def _is_flag(path: str) -> bool:
+    return not FLAGS.isdisjoint(re.findall("[a-z]+", path.lower()))
 
 
 def _filter(channels: Channels, map_name: str) -> Iterator[str]:

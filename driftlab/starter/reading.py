@@ -52,6 +52,7 @@ class FileColumns:
     more: bool  # whether the file has more rows than were looked at
     doubts: dict[str, Doubt] = field(default_factory=dict)  # by settings
     unread: dict[str, str] = field(default_factory=dict)  # columns that are no numbers, and where
+    flags: bool = False  # whether the source takes a text of a column for 1, and all others for 0
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,9 @@ def _columns(path: Path, cls: type[FileSource], settings: dict[str, Any], doubts
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     unread: dict[str, str] = {}
     values, more = _values(source, path, names, unread)
-    return FileColumns(source.kind, noun, settings, names, values, units, more, doubts, unread)
+    return FileColumns(
+        source.kind, noun, settings, names, values, units, more, doubts, unread, "flags" in type(source).model_fields
+    )
 
 
 def _values(source: FileSource, path: Path, names: list[str], unread: dict[str, str]) -> tuple[dict[str, Array], bool]:

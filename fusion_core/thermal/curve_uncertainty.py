@@ -40,6 +40,7 @@ HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
 TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
 NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
+SURE = 2.0  # deviations of the place of a misfit, of which chance is excluded by all places together
 
 
 def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother) -> CurveError:
@@ -211,7 +212,7 @@ def _axis_modes(
     noise = contrasts.noise(blocks.y[:, axis], left)
     modes = np.column_stack([H @ noise.root, smoothed])
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
-    if misfit is not None:
+    if np.any(shape):
         modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
     if ripple is not None:
         modes = np.column_stack([modes, ripple_modes(ripple, grid)])
@@ -263,6 +264,8 @@ def _misfit(
 ) -> tuple[Misfit | None, Array]:
     """Return the part (p,) of the free curve that the map leaves, where noise alone would hardly leave as much.
 
+    And the place at which the samples are off by it, where they are.
+
     `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
     it can follow says nothing of its misfit. Of each shape the share is returned that is no noise: where knots stand
     near one another the free curve is hardly known, and what it shows there is none.
@@ -284,10 +287,25 @@ def _misfit(
     chi_square, freedom = float(np.sum(shape**2 / variances)), int(np.sum(unfollowed))
     if freedom == 0 or chi_square < chdtri(freedom, CHANCE):
         return nothing
-    sigma = np.sqrt(np.clip(np.diagonal(expected), 0.0, None))
-    k = int(np.argmax(np.abs(curve) - 2 * sigma))
-    where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
-    return where, np.asarray(U[:, unfollowed] @ (shape * _share_of_misfit(shape, variances)))
+    return _place(blocks, contrasts.X, curve, expected, axis), np.asarray(
+        U[:, unfollowed] @ (shape * _share_of_misfit(shape, variances))
+    )
+
+
+def _place(blocks: Blocks, X: Array, curve: Array, expected: Array, axis: int) -> Misfit | None:
+    """Return the block in which the free curve (p,) is surest to be away, by no more than its samples are off.
+
+    None where no samples are: a walk, a lag or a hysteresis move the free curve, too, which follows what goes with the
+    temperature within minutes, and the means of all samples at one temperature stay where the map is.
+    """
+    weight = np.sqrt(blocks.n)
+    means = X @ np.linalg.lstsq(X * weight[:, None], blocks.y[:, axis] * weight)[0]
+    off = np.maximum(np.minimum(X @ curve * np.sign(means), np.abs(means)), 0.0)
+    sigma = np.sqrt(np.clip(np.sum((X @ expected) * X, axis=1), 0.0, None))
+    k = int(np.argmax(off - SURE * sigma))
+    if off[k] <= SURE * sigma[k]:
+        return None
+    return Misfit(axis=axis, T=float(blocks.T[k]), left=float(off[k]), noise=float(sigma[k]))
 
 
 def _share_of_misfit(shape: Array, variances: Array) -> Array:

@@ -84,6 +84,8 @@ class Csv(TableSource):
     dates: Mapping[str, str] = Field(default_factory=dict)
     """Format of the dates of a column, as `%d.%m.%Y %H:%M:%S`; `Date + Time` is two columns, joined by a blank. A time
     without a day goes on over midnight."""
+    flags: Mapping[str, str] = Field(default_factory=dict)
+    """Text of a column that is 1, any other is 0, as `status: OK` where the channel `valid` is of this column."""
 
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
@@ -167,7 +169,8 @@ class CsvLines(Table):
         self.line = 1  # number of the first line of the block that is read
         self.units: list[str] = []
         self.again: re.Pattern[bytes] | None = None  # the line of the names, where a logger writes it once more
-        self.texts = {part for path in settings.dates for part in self._parts(path)}
+        self.texts = {part for path in settings.dates for part in self._parts(path)} | settings.flags.keys()
+        self.flagged = settings.channels["valid"].paths if "valid" in settings.channels else ()
         self.columns = self._names()
         self._check_header()
 
@@ -175,7 +178,7 @@ class CsvLines(Table):
     def names(self) -> Sequence[str]:
         """The columns' names."""
         dates, columns = self.settings.dates, [name for name in self.columns if name and name not in self.texts]
-        return [*columns, *dates]
+        return [*columns, *dates, *(name for name in self.settings.flags if name in self.columns)]
 
     def unit(self, path: str) -> str | None:
         """Return s of a date; of another column what the line below its name says."""
@@ -377,11 +380,16 @@ class CsvLines(Table):
             if seconds.null_count() > sum(1 for cell in parts[0] if not (cell or "").strip()):
                 return None
             values[path] = seconds.to_numpy()
-        return values
+        return values | {path: (columns[path].fill_null("").str.strip_chars() == word).to_numpy().astype(np.float64)
+                         for path, word in self._flags(at)}  # fmt: skip
 
     def _dates(self, at: Mapping[str, int]) -> Iterator[tuple[str, str]]:
         """Yield the columns of dates among those that are read, with their formats."""
         return ((path, form) for path, form in self.settings.dates.items() if all(p in at for p in self._parts(path)))
+
+    def _flags(self, at: Mapping[str, int]) -> Iterator[tuple[str, str]]:
+        """Yield the columns of flags among those that are read, with the text that is 1."""
+        return ((path, word.strip()) for path, word in self.settings.flags.items() if path in at)
 
     def _lines(self, block: bytes) -> int | None:
         """Return the number of lines where each has as many fields as the header, or None."""
@@ -406,6 +414,8 @@ class CsvLines(Table):
         numbers = [self._row(lines[k], at, where, k) for k in rows]
         columns = np.array(numbers, dtype=np.float64).reshape(len(numbers), len(at)).T
         values = dict(zip(at, np.ascontiguousarray(columns), strict=True))
+        for path, word in self._flags(at):
+            values[path] = np.array([float(self._fields(lines[k])[at[path]].strip() == word) for k in rows])
         for path, form in self._dates(at):
             texts = [" ".join(self._fields(lines[k])[at[part]] for part in self._parts(path)) for k in rows]
             values[path] = numbers_of(texts, form)
@@ -438,6 +448,8 @@ class CsvLines(Table):
             number = 0.0 if path in self.texts else self._number(fields[place])
             if number is None:
                 cell, remedy = fields[place][:40], "correct it, or leave the cell empty where the value is missing"
+                if path in self.flagged:
+                    remedy = f"set source.flags to {{{path}: TEXT}}, with the text of the rows that are valid"
                 if self.settings.decimal == "," and "." in cell:
                     remedy = "the decimal sign is ',': remove points between thousands, or correct source.decimal"
                 raise BadValue(f"{self.path}: line {where(k)}, column '{path}': '{cell}' is not a number; {remedy}")

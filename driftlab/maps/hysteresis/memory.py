@@ -195,7 +195,8 @@ class _MemoryTest:
         seen = total > SEEN
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.bias, axis=0)
-        unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
+        if not np.any(unseen < np.maximum(reach, 1e-300)):  # an axis that hardly moves is as sure as the others
+            unseen = np.full_like(unseen, np.inf)
         settles = self.evidence.alone(self.shapes.settling)
         sized = self if total <= HINT else self._following()
         if not (settles > HINT and total - settles < SEEN):  # how far it would open says nothing of a memory

@@ -32,7 +32,7 @@ from driftlab.config import load_config
 from driftlab.starter.config_text import with_map
 from fusion_core.chunk import concatenate
 from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
-from fusion_core.faults import Faults
+from fusion_core.faults import Faults, usable
 from fusion_core.units import convert
 
 UNIT = unit_at_rest(seconds=400, rate=20, temperature=lambda t: 15 + t / 20, walk=1e-8)
@@ -217,6 +217,24 @@ def test_a_sensor_that_is_no_gyro_is_held(tmp_path):
     assert config.filter.kind == "held"
     assert config.filter.tracked.channel == "ppm"
     assert driftlab("check", done.path).exit_code == 0
+
+
+def test_a_column_that_is_not_read_is_listed_and_a_flag_says_how_it_is_taken(tmp_path):
+    N = len(UNIT.t)
+    good = np.arange(N) % 50 > 0
+    more = {"state": np.where(good, 3, 0), "status": np.where(good, "OK", "ERR, loud"), "who": np.array(["me"] * N)}
+    done = written(tmp_path, table(LOGS["short"]) | more | {"good_volts": 3.3 + 0.01 * np.arange(N)})
+    text = done.path.read_text()
+    assert "    # valid: {path: state}   # leaves out the rows in which it is 0, 2 % of these\n" in text
+    assert '    # valid: {path: status}   # with source.flags: {status: "ERR, loud"} leaves out the rows' in text
+    assert "    # who is not read: line 2, column 'who': 'me' is not a number" in text
+    assert "    # good_volts: {path: good_volts" in text, "of many values: no flag"
+    assert done.asked == ()
+    taken = text.replace("    # valid: {path: status}   # with", "    valid: {path: status}   # with")
+    taken = taken.replace("  channels:", "  flags: {status: OK}\n  channels:")
+    (tmp_path / "taken.yaml").write_text(taken)
+    source, faults = load_config(tmp_path / "taken.yaml").source, Faults()
+    assert sum(map(len, usable(source.chunks(100_000, faults), faults, "rec"))) == np.sum(good)
 
 
 def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):

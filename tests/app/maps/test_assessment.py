@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,24 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
     assert said.endswith(": take kind: spline; `driftlab fit-map --compare` tells whether it predicts better")
     for misfit in verdict(Spline(), T, bias).fitted.record.error.misfits:
         assert misfit.left < 0.05 * by_axis[misfit.axis].left
+
+
+def test_a_bend_within_what_is_between_up_and_down_is_not_said():
+    found = verdict(Polynomial(), *soak(0, 3, planted=200.0))
+    assert found.memory.answer == "seen"
+    assert {misfit.axis for misfit in found.fitted.record.error.misfits} == {0, 1, 2}
+    said = next(line for line in found.sentences(RATE) if "bends" in line)
+    assert re.match(
+        r"z bends at \S+ °C .*, y at [^x]*: once it is known why up and down differ, take kind: spline", said
+    )
+
+
+def test_after_a_comparison_no_kind_is_advised_that_it_did_not_prefer():
+    T, bias = soak(0, 3)
+    found = replace(verdict(Polynomial(), T, bias), compared=True)
+    said = next(line for line in found.sentences(RATE) if "bends" in line)
+    assert said.endswith(": look at the samples there; of the kinds that were compared none surely predicts better")
+    assert "take kind" not in said
 
 
 def test_hysteresis_is_said_with_its_size_and_is_part_of_what_the_map_is_good_to():

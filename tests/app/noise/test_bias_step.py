@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from driftlab.noise.bias_step import bias_steps
+from driftlab.noise.bias_step import bias_steps, block_means
 
 N, DT, AT = 24_000, 0.1, 9_000
 T = np.arange(N) * DT
 WHOLE = np.array([[0, N]])
+
+
+def found_in(t, rate, stretches):
+    return bias_steps(block_means(t, rate, stretches), rate.shape[1])
 
 
 def slow(kind, rng):
@@ -34,7 +38,7 @@ def test_what_moves_without_a_step_has_none(kind):
     found = []
     for seed in range(4):
         rng = np.random.default_rng([seed, 77])
-        found += bias_steps(T, rng.normal(size=(N, 3)) + slow(kind, rng), WHOLE)
+        found += found_in(T, rng.normal(size=(N, 3)) + slow(kind, rng), WHOLE)
     assert found == [None] * 12
 
 
@@ -43,7 +47,7 @@ def test_a_step_is_found_with_its_size_time_and_the_walk_beside_it(walk):
     rng = np.random.default_rng(5)
     rate = rng.normal(size=(N, 3)) + walk * np.cumsum(rng.normal(size=(N, 3)), axis=0)
     rate[AT:, 1] += 1.0
-    x, y, z = bias_steps(T, rate, WHOLE)
+    x, y, z = found_in(T, rate, WHOLE)
     assert (x, z) == (None, None)
     assert abs(y.size - 1.0) < 4 * y.sigma
     assert y.sigma < 0.1
@@ -58,16 +62,16 @@ def test_a_step_across_a_gap_is_a_step_of_what_is_used():
     rate[AT:] += 1.0
     moving = slice(AT - 300, AT + 300)
     rate[moving] = 1e4 * rng.normal(size=(600, 1))
-    (step,) = bias_steps(T, rate, np.array([[0, moving.start], [moving.stop, N]]))
+    (step,) = found_in(T, rate, np.array([[0, moving.start], [moving.stop, N]]))
     assert abs(step.size - 1.0) < 4 * step.sigma
     rate[moving.stop :] -= 1.0
-    assert bias_steps(T, rate, np.array([[0, moving.start], [moving.stop, N]])) == [None]
+    assert found_in(T, rate, np.array([[0, moving.start], [moving.stop, N]])) == [None]
 
 
 def test_too_short_a_recording_has_none():
-    assert bias_steps(T[:8], np.ones((8, 2)), np.array([[0, 8]])) == [None, None]
+    assert found_in(T[:8], np.ones((8, 2)), np.array([[0, 8]])) == [None, None]
 
 
 def test_thousands_of_stretches_are_not_looked_at():
     rows = np.arange(0, 24_000, 12)
-    assert bias_steps(T, np.ones((N, 1)), np.stack([rows, rows + 10], axis=1)) == [None]
+    assert found_in(T, np.ones((N, 1)), np.stack([rows, rows + 10], axis=1)) == [None]

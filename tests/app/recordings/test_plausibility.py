@@ -74,6 +74,34 @@ def test_jumps_and_kelvin_are_named(T, word):
     assert word in text
 
 
+@pytest.mark.parametrize("size", [1, 313, 3_000])
+@pytest.mark.parametrize(("shown", "word"), [
+    (NOISY - 273.15, "-253.1"),  # degC read as K
+    (np.arange(N) * 1.0, "451"),  # the time
+    (np.where(np.arange(N) > 2_000, NOISY + 5e-4 * (np.arange(N) - 2_000) ** 2, NOISY), "450"),
+])  # fmt: skip
+def test_temperatures_that_no_soak_has_are_named_where_they_begin(shown, word, size):
+    (text,) = [text for text in doubts(shown[:3_500], size, dt=10.0) if "is soaked" in text]
+    assert word in text
+
+
+def below_zero(T, size):
+    faults = Faults(first_row=0.0)
+    parts = [T[k : k + size] for k in range(0, len(T), size)]
+    chunks = [Chunk(np.arange(len(part)) * DT, {"temperature": part}) for part in parts]
+    assert list(Thermometer(faults).along(chunks)) == chunks
+    return faults.doubts
+
+
+@pytest.mark.parametrize("size", [7, N])
+def test_readings_below_absolute_zero_that_change_are_in_doubt_and_what_stands_for_no_reading_is_not(size):
+    (text,) = below_zero(NOISY - 310, size)
+    assert text.startswith("temperature changes below absolute zero")
+    for absent in (-999.0, -1e30, np.nan, np.inf):
+        assert below_zero(np.where(np.arange(N) % 3, NOISY, absent), size) == []
+    assert below_zero(np.where(RNG.random(N) < 1e-3, -1000 * RNG.random(N), NOISY), size) == []  # torn lines
+
+
 def test_time_in_another_unit_is_named():
     (text,) = doubts(NOISY, dt=DT / 1000)
     assert "source.channels.time.unit" in text

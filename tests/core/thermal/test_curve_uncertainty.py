@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from doses import draws
+from scipy.signal import lfilter
 
 from fusion_core.errors import OutsideDomain, SingularFit
 from fusion_core.thermal.curve_error import CurveError
@@ -307,6 +308,48 @@ def test_a_kind_that_is_too_stiff_for_the_same_curve_is_seen(maps):
     for seed in range(draws(2, 5)):
         fitted = maps.fit(*soak(wave(seed), seed, WIDE, 8.0, 7200, 0.03 * DEG_H, 10 * DEG_H), {})
         assert [misfit.axis for misfit in fitted.record.error.misfits] == [0, 1, 2]
+
+
+LEVELS = np.concatenate([np.arange(-10, 51, 10), np.arange(40, -11, -10)]).astype(float)
+SMOOTH = lambda T: np.stack([40 * np.sin(T / 25), 30 * np.exp(-T / 40), 1.5 * T], axis=1) * DEG_H  # noqa: E731
+
+
+def by_steps(seed, curve, lag, more=lambda T: 0.0):
+    """Return temperatures and bias of a soak by steps, which the thermometer shows at once where the sensor lags."""
+    rng = np.random.default_rng(seed)
+    chamber = np.repeat(LEVELS, 1200)
+    T = lfilter([1 / 150], [1, 1 / 150 - 1], chamber + 10) - 10
+    bias = curve(T) + more(T) + np.cumsum(0.03 * DEG_H * rng.normal(size=(len(T), 3)), axis=0)
+    read = chamber if lag else T
+    return read + 0.02 * rng.normal(size=len(T)), bias + 3 * DEG_H * rng.normal(size=bias.shape)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_a_lag_or_a_hysteresis_leaves_is_no_misfit_of_a_curve_that_knots_can_follow(seed):
+    """A thermometer in the air, which is at seven temperatures alone; and a play of 16 deg/h on a smooth curve."""
+
+    def play(T):
+        back = np.empty_like(T)
+        back[0] = last = T[0]
+        for k in range(1, len(T)):
+            back[k] = last = max(T[k] - 4, min(T[k] + 4, last))
+        return np.outer(back - T, [2.0, -2.0, 0.0]) * DEG_H
+
+    assert Spline().fit(*by_steps(seed, SMOOTH, lag=True), {}).record.error.misfits == ()
+    assert Spline().fit(*by_steps(seed, SMOOTH, lag=False, more=play), {}).record.error.misfits == ()
+
+
+@pytest.mark.parametrize("lag", [False, True])
+def test_a_misfit_is_where_samples_are_and_no_larger_than_what_they_are_off(lag):
+    """The axis of the smallest bend may be lost in the lag."""
+    T, bias = by_steps(0, bend(4), lag)
+    fitted = Polynomial(order=2).fit(T, bias, {})
+    assert {misfit.axis for misfit in fitted.record.error.misfits} >= {0, 2}
+    for misfit in fitted.record.error.misfits:
+        near = np.abs(T - misfit.T) < 0.1
+        assert np.any(near)
+        off = np.mean((bias - fitted.bias(T))[near, misfit.axis])
+        assert misfit.left < abs(off) + 3 * misfit.noise
 
 
 def test_of_a_finding_what_is_hardly_known_is_no_misfit():

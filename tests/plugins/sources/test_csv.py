@@ -373,6 +373,27 @@ def test_a_header_without_end(tmp_path):
         read(simple(text(tmp_path, "t,g," + "x," * 20_000 + "\n0,1\n")))
 
 
+FLAGGED = "t,status,g\n0,OK,1\n1, OK ,2\n2,ERR,3\n3,,4\n4,OK!,5\n5,OK,6\n"
+
+
+@pytest.mark.parametrize("content", [
+    FLAGGED,
+    FLAGGED[:-1],
+    FLAGGED.replace("\n", "\r\n"),
+    FLAGGED.replace("ERR", '"ERR, loud"'),  # line by line
+    "".join(",".join(line.split(",")[i] for i in (0, 2, 1)) + "\n" for line in FLAGGED.splitlines()),
+])  # fmt: skip
+def test_a_column_of_texts_says_which_rows_are_valid(tmp_path, content):
+    channels = {"time": {"path": "t", "unit": "s"}, "gyro": {"path": "g", "unit": "rad/s"}, "valid": {"path": "status"}}
+    path, faults = text(tmp_path, content), Faults()
+    source = Csv(path=path, channels=channels, flags={"status": "OK"})
+    got = concatenate(list(usable(source.chunks(100, faults), faults, "rec")))
+    assert got["gyro"][:, 0].tolist() == [1, 2, 6]
+    assert [line.partition(" (")[0] for line in faults.lines()] == ["rows flagged as not valid, left out: 3"]
+    with pytest.raises(BadValue, match=r"'OK' is not a number; set source.flags to \{status: TEXT\}"):
+        read(Csv(path=path, channels=channels))
+
+
 LOGGED = (
     'Soak of unit 7\n\nDatum;Zeit;g;T\n;;deg/s;°C\n05.03.2026;14:22:01,5;0,25;"20,5"\n05.03.2026;14:22:02;-1,5;21\n'
 )

@@ -125,6 +125,34 @@ def test_none_larger_is_said_of_what_would_have_been_seen(profile):
         assert judged(8 + seed, profile, kind=kind, size=most.max()).answer == "seen"
 
 
+def beside_a_level_axis(seed, planted):
+    """Return the verdict on a steep axis and one that does not go with the temperature but for a play of `planted`."""
+    rng = np.random.default_rng(seed)
+    T = temperature("once", 10.0)
+    bias = np.stack([120 * np.tanh((T - 18) / 3), memory(T, "play", planted)], axis=1)
+    bias += np.cumsum(0.02 * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
+    return memory_of(brief(T, bias + 4 / np.sqrt(DT) * rng.normal(size=bias.shape), [0], DT))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axis_that_hardly_moves_takes_no_limit_from_the_others(seed):
+    """What is denied of it is more than it moves in all, and would be seen all the same."""
+    found = beside_a_level_axis(seed, 0.0)
+    assert found.answer == "none"
+    assert np.all(found.none_larger_than < 40)
+    assert beside_a_level_axis(seed + 3, found.none_larger_than[1]).answer == "seen"
+
+
+def test_where_no_axis_moves_as_much_as_would_be_seen_none_is_denied():
+    rng = np.random.default_rng(1)
+    T = temperature("once", 0.5)
+    bias = np.cumsum(0.5 * np.sqrt(DT) * rng.normal(size=(len(T), 2)), axis=0)
+    found = memory_of(brief(T, bias + 4 / np.sqrt(DT) * rng.normal(size=bias.shape), [0], DT))
+    assert found.answer == "undecided"
+    assert "larger than all that the bias does here" in found.why
+    assert np.all(np.isinf(found.none_larger_than))
+
+
 @pytest.mark.parametrize(
     ("turns", "why"),
     [([0, 60], "only ever warms"), ([60, 0], "only ever cools"), ([0, 60, 55], "share too few temperatures")],
