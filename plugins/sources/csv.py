@@ -36,6 +36,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import problem
 from fusion_plugins.sources.dialect import (
     JOINED,
+    Clock,
     bare,
     called,
     dialect_of,
@@ -61,7 +62,6 @@ BLANKS, EDGES = re.compile(rb"[ \t]+"), re.compile(rb"^[ \t]+|[ \t]+(?=\r?$)", r
 MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}  # of encodings, at the beginning
 MISSING = ("n/a", "N/A", "NA", "#N/A", "null", "NULL", "None")  # texts of an empty cell
 COMMA = str.maketrans(",.", ".,")
-DAY = 86_400.0  # s
 GUESSED = 1 << 18  # bytes that are looked at to tell how a text is a table
 
 
@@ -194,7 +194,7 @@ class CsvLines(Table):
             if (count := self.columns.count(part)) > 1:
                 raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
         at = {part: self.columns.index(part) for part in parts}
-        clocks = {path: _Clock() for path, form in self._dates(at) if not has_day(form)}
+        clocks = {path: Clock() for path, form in self._dates(at) if not has_day(form)}
         for block, final, values in _ahead(self._parsed(at)):
             if values is None:
                 cells, unfinished = self._without(block), final and not block.endswith(b"\n")
@@ -477,23 +477,6 @@ def _ahead(items: Iterator[Item]) -> Iterator[Item]:
         while (item := made.result()) is not None:
             made = thread.submit(next, items, None)
             yield item
-
-
-class _Clock:
-    """A time of day, which goes on over midnight: a fall of more than half a day is a new day."""
-
-    def __init__(self) -> None:
-        self.last, self.days = np.nan, 0
-
-    def unwrapped(self, t: Array) -> Array:
-        """Return the next times of day (N,) in s since the first midnight."""
-        known = np.flatnonzero(np.isfinite(t))
-        days = self.days + np.cumsum(np.diff(t[known], prepend=self.last) < -DAY / 2)
-        if len(known):
-            self.last, self.days = t[known[-1]], days[-1]
-        whole = t.copy()
-        whole[known] += DAY * days
-        return whole
 
 
 def _number(cell: str) -> float | None:

@@ -15,6 +15,8 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
@@ -40,6 +42,7 @@ OFFSET = r":\d\d[.\d]*\s?([+-])(\d\d):?(\d\d)$"
 FRACTION = r"(\d:\d\d:\d\d)(?:,(\d)|:(\d{6}|\d{3})(\D|$))"  # of a second, behind no point
 DAYS = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%m/%d/%Y", "%d/%m/%Y", "%m/%d/%y", "%d/%m/%y", "%d.%m.%y",
         "%d-%b-%Y", "%d-%m-%Y", "%Y%m%d")  # fmt: skip
+DAY = 86_400.0  # s
 HOURS = ("%H:%M:%S", "%I:%M:%S %p", "%H:%M")
 MOST_ABOVE = 8  # lines between the names and the first row
 JOINED = " + "  # between the columns of a date and of a time
@@ -224,3 +227,20 @@ def numbers_of(cells: Sequence[str], form: str) -> Array:
     import polars as pl
 
     return seconds_of(pl.Series(cells, dtype=pl.String), form).to_numpy().astype(float)
+
+
+class Clock:
+    """A time of day, which goes on over midnight: a fall of more than half a day is a new day."""
+
+    def __init__(self) -> None:
+        self.last, self.days = np.nan, 0
+
+    def unwrapped(self, t: Array) -> Array:
+        """Return the next times of day (N,) in s since the first midnight."""
+        known = np.flatnonzero(np.isfinite(t))
+        days = self.days + np.cumsum(np.diff(t[known], prepend=self.last) < -DAY / 2)
+        if len(known):
+            self.last, self.days = t[known[-1]], days[-1]
+        whole = t.copy()
+        whole[known] += DAY * days
+        return whole
