@@ -36,7 +36,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import problem
 from fusion_plugins.sources.dialect import (
     JOINED,
-    Clock,
+    TimeOfDay,
     bare,
     called,
     dialect_of,
@@ -194,7 +194,7 @@ class CsvLines(Table):
             if (count := self.columns.count(part)) > 1:
                 raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
         at = {part: self.columns.index(part) for part in parts}
-        clocks = {path: Clock() for path, form in self._dates(at) if not has_day(form)}
+        clocks = {path: TimeOfDay() for path, form in self._dates(at) if not has_day(form)}
         for block, final, values in _ahead(self._parsed(at)):
             if values is None:
                 cells, unfinished = self._without(block), final and not block.endswith(b"\n")

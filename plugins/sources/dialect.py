@@ -229,7 +229,7 @@ def numbers_of(cells: Sequence[str], form: str) -> Array:
     return seconds_of(pl.Series(cells, dtype=pl.String), form).to_numpy().astype(float)
 
 
-class Clock:
+class TimeOfDay:
     """A time of day, which goes on over midnight: a fall of more than half a day is a new day."""
 
     def __init__(self) -> None:
