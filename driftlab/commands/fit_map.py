@@ -226,7 +226,7 @@ def _fitted(
         settings, comparison, tried = _compared(config, soak, progress)
         more = {"comparison": tried}
     elif neurons is not None:
-        settings, selection, tried = settings_selected(settings, soak.T, soak.bias, neurons, progress)
+        settings, selection, tried = settings_selected(settings, soak.T, soak.of_both_ways, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, soak, more, of_both_ways=True)
     known = soak.placements, soak.used, faults.doubts, soak.memory, comparison is not None
@@ -265,7 +265,7 @@ def _blocks(soak: GatheredSoak) -> tuple[list[Array], list[Array]]:
     for start, stop in pairwise([*soak.starts, len(soak.T)]):
         own_T, cuts = soak.T[start:stop], runs([0], stop - start, n)
         T.append(means(own_T, cuts))
-        bias.append(means(soak.bias[start:stop], cuts))
+        bias.append(means(soak.of_both_ways[start:stop], cuts))
         if len(cuts) > 1:
             T[-1][[np.argmin(T[-1]), np.argmax(T[-1])]] = np.min(own_T), np.max(own_T)
     return T, bias

@@ -225,7 +225,7 @@ class _Inquiry:
 
     def request(self, range: str | tuple[float, float] | None) -> PlanRequest:
         """Return the request over a range; None: the config's."""
-        return parse_request(self.config, self.hours, range=range, **self.options)
+        return parse_request(self.config, range=range, **self.options)
 
     def first(self, request: PlanRequest) -> PlanResult:
         """Plan what is recorded first."""

@@ -98,8 +98,8 @@ def root_of(Sigma: Array) -> tuple[Array, Array]:
 
 def inverse(matrices: Array) -> Array:
     """Inverses of symmetric matrices (..., q, q) without an eigenvalue of zero or less; the lower triangle is read."""
-    q = matrices.shape[-1]
-    swept: Array = _swept(np.ascontiguousarray(matrices.reshape(-1, q, q)))[0]
+    shape = int(np.prod(matrices.shape[:-2])), *matrices.shape[-2:]
+    swept: Array = _swept(np.ascontiguousarray(matrices.reshape(shape)))[0]
     return swept.reshape(matrices.shape)
 
 
@@ -447,7 +447,15 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) ->
 
 
 def _log_det(matrix: Array) -> tuple[float, Array]:
-    """Return the logarithm of the determinant of a covariance (q, q), and its inverse."""
+    """Return the logarithm of the determinant of a covariance (q, q), and its inverse.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If it is none.
+    """
     scale = np.sqrt(np.diag(matrix))
     inverses, pivots = _swept((matrix / np.outer(scale, scale))[None])
+    if not np.all(pivots > 0):
+        raise np.linalg.LinAlgError("a covariance has an eigenvalue of zero or less")
     return float(np.sum(np.log(pivots)) + 2 * np.sum(np.log(scale))), inverses[0] / np.outer(scale, scale)

@@ -248,12 +248,15 @@ def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
     if memory is None or memory.get("answer") != "seen":
         return
     effects = sensor.bias.effects if isinstance(sensor.bias, ThermalBias) else ()
-    if {effect.kind for effect in effects} & set(memory["kinds"]):
+    if {effect.kind for effect in effects} & {*memory.get("kinds", ())}:
         return
-    size = np.abs(np.array(memory["size"], dtype=np.float64))
+    size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
+    if not np.any(np.isfinite(size)):
+        return
     axis, factor = int(np.nanargmax(size)), convert(1.0, sensor.unit, sensor.shown)
+    kinds = " or ".join(memory.get("kinds") or ["memory"])
     faults.note(
-        f"the soak of the {sensor.channel}'s map showed a {' or '.join(memory['kinds'])}: up and down differ by up to "
+        f"the soak of the {sensor.channel}'s map showed a {kinds}: up and down differ by up to "
         f"{size[axis] * factor:.3g} {sensor.shown}, {sensor.axes[axis]}, which no effect of the config follows and no "
         "sigma has in it; `driftlab explain` finds it"
     )

@@ -47,7 +47,7 @@ class MapVerdict:
     placements: Placements | None = None  # of the unit, where its input is known by its length alone
     used: Used | None = None  # share of the soak that is used; None where that is not known
     doubts: Sequence[str] = ()  # why the soak may not be what its config says (`Faults.doubts`)
-    known_memory: MemoryVerdict | None = None  # of the soak, where it has been looked for
+    known_memory: MemoryVerdict | None = None  # of the soak, where the curve is the mean of both its ways
     compared: bool = False  # whether the settings were chosen among all kinds (`driftlab.maps.kind_selection`)
 
     @property
@@ -81,7 +81,8 @@ class MapVerdict:
         """Deviation (GRID, d) of the curve, half of what is or may be between up and down included."""
         if self.fitted.record.error is None:
             return None
-        return np.sqrt(np.square(self.fitted.sigma(self.T)) + self.memory.variance(self.T))
+        counted = None if self.known_memory is None else self.known_memory.apart  # with the curve of both ways
+        return np.sqrt(np.square(self.fitted.sigma(self.T)) + self.memory.variance(self.T, counted))
 
     @cached_property
     def good(self) -> Array | None:

@@ -24,7 +24,7 @@ from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
 from driftlab.units import BiasUnit, duration
-from fusion_core.chunk import Array, Chunk, Flags, Integers
+from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
@@ -41,7 +41,8 @@ USUAL = "spline"  # kind of a map where neither the config nor the user names on
 ROW = 10.0  # s, of a row of a soak
 MAX_ROWS = 8640  # of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
-GRID = 400  # temperatures at which the difference between up and down is looked at
+GRID = 400  # temperatures between which a smooth curve is straight
+LITTLE = 1.0  # K: a soak that moves by less has no ways
 MOST = 0.5  # of a soak that is not used: that is then the error
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
@@ -96,15 +97,13 @@ def fit_gathered(
     A curve `of_both_ways` is the mean of warming and cooling at each temperature where these are seen to differ.
     """
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
-    looked_for = of_both_ways and np.ptp(soak.T) >= settings.min_swing
-    apart = soak.memory.apart if looked_for else np.zeros(soak.bias.shape[1], dtype=np.bool_)
-    bias = _mean_of_ways(soak, apart) if np.any(apart) else soak.bias
+    bias = soak.of_both_ways if of_both_ways else soak.bias
     try:
         fitted = settings.fit(_to_fit(soak), bias, about)
     except (SingularFit, SwingTooSmall) as error:
         raise type(error)(_likelier(error, soak)) from None
-    if np.any(apart):
-        fitted = _with_spread(fitted, soak.memory, apart)
+    if bias is not soak.bias:
+        fitted = _with_spread(fitted, soak.memory)
     if soak.used.low < soak.used.high:
         fitted = settings.over(fitted, (soak.used.low, soak.used.high))
     if soak.placements is not None:
@@ -114,30 +113,13 @@ def fit_gathered(
     return of_sensor(config, of_thermometer(fitted, soak.steps, soak.T, soak.off, soak.interval))
 
 
-def _mean_of_ways(soak: GatheredSoak, axes: Flags) -> Array:
-    """Return the bias (N, d) less half of what is between up and down, on the way that each sample is on.
-
-    A soak in stairs stays just below a temperature while it warms, and just above it while it cools. A curve of all
-    samples alike would follow the one way below each step, and the other above. Of `axes` (d,) where they differ.
-    """
-    T, difference, up, down = soak.summary.between_ways()
-    lines = smooth_lines(soak.summary.domain)
-    B, grid = lines.values(T), np.linspace(*soak.summary.domain, GRID)
-    way = np.repeat(soak.summary.way, np.round(soak.summary.span / soak.interval).astype(np.int64))
-    bias = soak.bias.copy()
-    for axis in np.flatnonzero(axes):
-        between = penalised(B, difference[:, axis], up * down / (up + down), lines.penalty).coefficients
-        bias[:, axis] -= way * np.interp(soak.T, grid, lines.values(grid) @ between / 2)
-    return bias
-
-
-def _with_spread(fitted: FittedMap, memory: MemoryVerdict, axes: Flags) -> FittedMap:
-    """Return the map with what noise may hide in the difference of the ways of `axes` (d,), which was taken off."""
+def _with_spread(fitted: FittedMap, memory: MemoryVerdict) -> FittedMap:
+    """Return the map with what noise may hide in the difference of the ways, which was taken off."""
     error, some = fitted.record.error, np.isfinite(memory.spread[:, 0])
     if error is None:
         return fitted
     half = np.stack([np.interp(error.T, memory.T[some], column / 2) for column in memory.spread[some].T], axis=1)
-    return fitted.noting(error=error.model_copy(update={"modes": (*nested((half * axes)[None]), *error.modes)}))
+    return fitted.noting(error=error.model_copy(update={"modes": (*nested((half * memory.apart)[None]), *error.modes)}))
 
 
 def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:
@@ -273,6 +255,25 @@ class GatheredSoak:
         """The verdict on whether the bias remembers which temperatures came before."""
         return memory_of(self.summary)
 
+    @cached_property
+    def of_both_ways(self) -> Array:
+        """Bias (N, d) less half of what is between up and down, on the way of each sample, of axes where these differ.
+
+        A soak in stairs stays just below a temperature while it warms, and just above it while it cools. A curve of all
+        samples alike would follow the one way below each step, and the other above.
+        """
+        if not np.ptp(self.T) > LITTLE or not np.any(self.memory.apart):
+            return self.bias
+        summary, starts = self.summary, [*self.starts, len(self.T)]
+        if len(self.starts) > 1:  # levels of recordings are no difference of the ways
+            left = self.bias - _smooth(summary.T, summary.bias, summary.span, self.T)
+            levels = [left[start:stop].mean(axis=0) for start, stop in pairwise(starts)]
+            summary = brief(self.T, self.bias - np.repeat(levels, np.diff(starts), axis=0), self.starts, self.interval)
+        T, difference, up, down = summary.between_ways()
+        between = _smooth(T, difference, up * down / (up + down), self.T)
+        way = np.repeat(self.summary.way, np.round(self.summary.span / self.interval).astype(np.int64))
+        return np.asarray(self.bias - way[:, None] * between / 2 * self.memory.apart)
+
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""
         rows, ends = [], np.cumsum([len(window) for window in self.windows])
@@ -280,6 +281,15 @@ class GatheredSoak:
             own = slice(int(np.searchsorted(ends, start, "right")), int(np.searchsorted(ends, stop, "left")) + 1)
             rows.append(_rows(self.windows[own], self.T[start:stop], self.bias[start:stop], channel))
         return tuple(rows)
+
+
+def _smooth(T: Array, values: Array, weight: Array, at: Array) -> Array:
+    """Return penalised lines through values (K, d) of a weight (K,) at T (K,), at temperatures `at` (N,) in degC."""
+    domain = float(at.min()), float(at.max())
+    lines, grid = smooth_lines(domain), np.linspace(*domain, GRID)
+    B, on_grid = lines.values(T), lines.values(grid)
+    curves = [on_grid @ penalised(B, column, weight, lines.penalty).coefficients for column in values.T]
+    return np.stack([np.interp(at, grid, curve) for curve in curves], axis=1)
 
 
 def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> SoakRows:

@@ -35,7 +35,7 @@ class PlanRequest(NamedTuple):
 
 
 def parse_request(
-    config: Config, hours: float, *, range: Range = None, rate: str | None = None, lag: str | None = None,
+    config: Config, *, range: Range = None, rate: str | None = None, lag: str | None = None,
     start: str | None = None, walk: str | None = None, sigma: str | None = None, kind: str | None = None,
 ) -> PlanRequest:  # fmt: skip
     """Return the request of the options, with the values of the config where an option is None.

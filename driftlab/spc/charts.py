@@ -249,9 +249,9 @@ class GroupDifference:
     group : str
         The group that is furthest from the others.
     units : int
-        Its units.
+        Its units that were compared.
     value, others : float
-        Middle of its units, and of all others, SI.
+        Middle of its units, and of those compared with them, SI; the two are as far apart as within blocks.
     """
 
     quantity: str

@@ -236,9 +236,11 @@ def _differences(line: LineReport) -> list[str]:
     for one in sorted(line.differences, key=lambda one: one.p):
         unit = line.shown(one.quantity)
         value, others = (f"{number(x * unit.factor)} {unit.shown}" for x in (one.value, one.others))
+        chance = "p < 1e-15" if one.p < 1e-15 else f"p = {one.p:.1g}"
+        figure = f"{figure_name(one.quantity).capitalize()} of {one.axis}"
         lines.append(
-            f"{figure_name(one.quantity).capitalize()} of {one.axis} differs by {one.column} (p = {one.p:.1g}): in the "
-            f"middle {value} of the {units(one.units)} of {one.group}, {others} of the others."
+            f"{figure} differs by {one.column} ({chance}): {value} in the {units(one.units)} of {one.group}, where "
+            f"those beside them have {others}."
         )
     return lines
 

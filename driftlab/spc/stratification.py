@@ -1,12 +1,17 @@
 """Groups of units by a column of their table (stratification), and figures that differ between them.
 
-Units of one lot are alike, and so are units made one after the other where a line drifts. Hence a run of units of one
-group and lot counts as one value, their mean; where a lot has units of several groups, less the lot's median. Whether
-such values differ between the groups by more than chance is Kruskal and Wallis' test; of few values the probability is
-no smaller than that of one arrangement of them.
+Units of one lot are alike, and so are units made one after the other where a line drifts. Hence units are compared
+within blocks: lots that have units of several groups, or, where most lots are of one group, all of these, a value a
+lot. A change of the line ends a block, a trend is taken off, and a run of units of one group counts as one value, their
+mean. Of values less the median of their block, ranked over all, the sums S of the groups have, were groups dealt out
+anew within each block::
 
-Source: W. Kruskal and A. Wallis, J. Amer. Statist. Assoc. 47 (1952) 583. Blocks: Montgomery, Design and Analysis of
-Experiments, 8th ed., chapter 4.
+    E S_g = sum_b n_bg m_b,    cov(S_g, S_h) = sum_b s_b^2 (n_bg [g = h] - n_bg n_bh / n_b)
+
+with n_b values of block b, their mean m_b and variance s_b^2; (S - E S)' cov^-1 (S - E S) is chi-square.
+
+Source: J. Hodges and E. Lehmann, Ann. Math. Stat. 33 (1962) 482, ranks of aligned values; N. Mantel, J. Amer. Statist.
+Assoc. 58 (1963) 690, the covariance.
 """
 
 from __future__ import annotations
@@ -33,7 +38,7 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
 """Columns of the units' table beside those of the manifest itself."""
 NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
-LEAST = 3  # values of a group that is compared
+LEAST = 4  # values of a group that is compared
 ALPHA = 0.05  # chance, over all columns and figures, that one is said to differ where none does
 
 
@@ -66,10 +71,13 @@ def _number(text: str) -> float:
 
 
 def strata_of(records: Sequence[UnitRecord], by: Iterable[str]) -> dict[str, list[str]]:
-    """Return the group of each unit by each column that has some groups and not many: `by`, and the manifest's own."""
+    """Return the group of each unit by each column of two to CLASSES groups: of `by`, and the manifest's own.
+
+    Lots have charts of their own.
+    """
     columns = dict.fromkeys([*by, *(name for record in records for name in record.more)])
-    found = {column: groups_of(records, column) for column in columns if column != "lot"}  # which has charts
-    return {column: names for column, names in found.items() if 2 <= len(set(names)) <= CLASSES}
+    found = {column: groups_of(records, column) for column in columns if column != "lot"}
+    return {column: names for column, names in found.items() if 2 <= len({*names} - {NO_VALUE}) <= CLASSES}
 
 
 def differences(line: LineReport, strata: Mapping[str, Sequence[str]]) -> tuple[GroupDifference, ...]:
@@ -86,46 +94,63 @@ def _compared(
     chart: ControlChart, column: str, names: NDArray[np.str_], lots: NDArray[np.str_]
 ) -> GroupDifference | None:
     """Return the difference of a chart's quantity between groups (m,) of units; None where too few can be compared."""
-    value = chart.value
-    codes = np.unique(names, return_inverse=True)[1]
-    values, groups = _values(chart.scale.to(value), codes, np.unique(lots, return_inverse=True)[1])
-    count = np.bincount(groups)
-    enough = count[groups] >= LEAST
-    compared = np.unique(groups[enough])
-    if len(compared) < 2:
+    known, value = np.flatnonzero(names != NO_VALUE), chart.value
+    if len(known) < 2 * LEAST:
         return None
-    p = kruskal_wallis(values[enough], groups[enough])
-    middle = {g: float(np.median(values[groups == g])) for g in compared}
-    centre = float(np.median(values[enough]))
-    far = max(compared, key=lambda g: abs(middle[g] - centre))
-    own: Flags = codes == far
-    its, others = (float(np.median(value[where])) for where in (own, ~own))
-    name = str(names[np.argmax(own)])
-    return GroupDifference(chart.quantity, chart.axis, column, p, name, int(np.sum(own)), its, others)
+    at, x = chart.at[known], chart.scale.to(value[known])
+    if chart.trend is not None:
+        x = x - np.polyval(np.polyfit(at, x, 1), at)
+    stretch = np.searchsorted([change.at for change in chart.changes], at, side="right")
+    groups, codes = np.unique(names[known], return_inverse=True)
+    values, of_value, blocks, counted = _values(x, codes, np.unique(lots[known], return_inverse=True)[1], stretch)
+    enough = np.bincount(of_value, minlength=len(groups)) >= LEAST
+    some = enough[of_value]
+    if np.sum(enough) < 2:
+        return None
+    values, of_value, blocks = aligned(values[some], blocks[some]), of_value[some], blocks[some]
+    middle = {int(g): float(np.median(values[of_value == g])) for g in np.flatnonzero(enough)}
+    far = max(middle, key=lambda g: abs(middle[g]))
+    beside = float(np.median(value[known][counted & enough[codes] & (codes != far)]))
+    more = middle[far] - float(np.median(values[of_value != far]))
+    its = float(chart.scale.back(chart.scale.to(np.array([beside])) + more)[0])
+    p, count = stratified_p(values, of_value, blocks), int(np.sum(counted & (codes == far)))
+    return GroupDifference(chart.quantity, chart.axis, column, p, str(groups[far]), count, its, beside)
 
 
-def _values(x: Array, codes: Integers, lots: Integers) -> tuple[Array, Integers]:
-    """Return the values that are compared, and the group of each: means of runs, less what a mixed lot has as usual."""
-    x = x.copy()
-    order = np.argsort(lots, kind="stable")
-    for lot in np.split(order, np.flatnonzero(np.diff(lots[order])) + 1):
-        if len(set(codes[lot].tolist())) > 1:
-            x[lot] -= np.median(x[lot])
-    starts = np.flatnonzero(np.concatenate([[True], (np.diff(codes) != 0) | (np.diff(lots) != 0)]))
-    return np.add.reduceat(x, starts) / np.diff(starts, append=len(x)), codes[starts]
+def _values(x: Array, codes: Integers, lots: Integers, stretch: Integers) -> tuple[Array, Integers, Integers, Flags]:
+    """Return the values that are compared, the group and block of each, and which units (m,) they are of."""
+    pairs = np.unique(np.stack([lots, codes]), axis=1)[0]
+    mixed = np.bincount(pairs, minlength=int(lots.max()) + 1)[lots] > 1
+    within = 2 * np.sum(mixed) >= len(x)
+    counted = mixed if within else ~mixed
+    places, block = np.flatnonzero(counted), (stretch * (int(lots.max()) + 1) + lots if within else stretch)[counted]
+    ends = np.stack([codes[places], lots[places], stretch[places]])
+    starts = np.flatnonzero(np.concatenate([[True], np.any(np.diff(ends, axis=1) != 0, axis=0)]))
+    values = np.add.reduceat(x[places], starts) / np.diff(starts, append=len(places))
+    return values, codes[places][starts], np.unique(block[starts], return_inverse=True)[1], counted
 
 
-def kruskal_wallis(values: Array, groups: Integers) -> float:
-    """Return the probability that groups (n,) of values (n,) from one distribution differ as much in their ranks."""
-    from scipy.special import chdtrc, gammaln
+def aligned(values: Array, blocks: Integers) -> Array:
+    """Return values (n,) less the median of their block."""
+    left, order = values.copy(), np.argsort(blocks, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1):
+        left[own] -= np.median(values[own])
+    return left
+
+
+def stratified_p(values: Array, groups: Integers, blocks: Integers) -> float:
+    """Return the probability of aligned values (n,) that differ as much, were groups (n,) dealt out within blocks."""
+    from scipy.special import chdtrc
 
     _, place, ties = np.unique(values, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(ties) - (ties - 1) / 2)[place] - (len(values) + 1) / 2  # less the mean of all
-    codes = np.unique(groups, return_inverse=True)[1]
-    count = np.bincount(codes)
-    spread = float(rank @ rank)
-    if spread == 0:
-        return 1.0
-    statistic = (len(values) - 1) * float(np.sum(np.bincount(codes, weights=rank) ** 2 / count)) / spread
-    arrangements = float(gammaln(len(values) + 1) - np.sum(gammaln(count + 1)))
-    return max(float(chdtrc(len(count) - 1, statistic)), float(np.exp(-arrangements)))
+    rank = (np.cumsum(ties) - (ties - 1) / 2)[place]
+    codes, block = (np.unique(x, return_inverse=True)[1] for x in (groups, blocks))
+    count = np.zeros((int(block.max()) + 1, int(codes.max()) + 1))
+    np.add.at(count, (block, codes), 1.0)
+    n = count.sum(axis=1)
+    mean = np.bincount(block, weights=rank) / n
+    variance = np.bincount(block, weights=(rank - mean[block]) ** 2) / np.maximum(n - 1, 1)
+    off = np.bincount(codes, weights=rank - mean[block])
+    covariance = np.diag(variance @ count) - (count * (variance / n)[:, None]).T @ count
+    free = int(np.linalg.matrix_rank(covariance, hermitian=True))
+    return float(chdtrc(free, off @ np.linalg.pinv(covariance, hermitian=True) @ off)) if free else 1.0

@@ -27,6 +27,7 @@ UNITS_OF = {
 FASTEST = 0.1  # s between epochs
 QUIET = 20.0  # times less noise than the others of a triad: more than sensors of one kind differ by
 FLAGS = {"status", "state", "valid", "ok", "flag", "flags", "err", "error", "good", "quality"}  # words of their names
+SOUND = {"valid", "ok", "good"}  # those of which 0 says that a row is none
 FEW = 5  # values of a flag, at most
 AXES = tuple(str.maketrans("xX", pair) for pair in ("xX", "yY", "zZ"))
 
@@ -213,8 +214,9 @@ def _auxiliary(name: Name, columns: FileColumns) -> str:
     """Return a comment on a column of numbers that is not read; of a flag, how many rows it would leave out."""
     values = columns.values[name.path]
     if _is_flag(name.path) and values.ndim == 1 and len(np.unique(values)) <= FEW:
-        share = f"{100 * float(np.mean(values == 0)):.3g} % of these"
-        return f"    # valid: {{path: {yaml_text(name.path)}}}   # leaves out the rows in which it is 0, {share}"
+        share, sound = f"{100 * float(np.mean(values == 0)):.3g} % of these", not SOUND.isdisjoint(_words(name.path))
+        left_out = f"leaves out the rows in which it is 0, {share}" + ("" if sound else ": where 0 is no reading")
+        return f"    # valid: {{path: {yaml_text(name.path)}}}   # {left_out}"
     unit = name.unit or columns.units.get(name.path)
     known = f", unit: {yaml_text(unit)}" if unit is not None and _is_unit(unit) else ""
     return f"    # {yaml_text(_key(name.path))}: {{path: {yaml_text(name.path)}{known}}}"
@@ -225,12 +227,17 @@ def _not_read(path: str, why: str, columns: FileColumns) -> str:
     cell = found[1] if (found := re.search(r"'([^']*)' is not a number", why)) else ""
     if _is_flag(path) and columns.flags and cell:
         flags = f"source.flags: {{{yaml_text(path)}: {yaml_text(cell)}}}"
-        return f"    # valid: {{path: {yaml_text(path)}}}   # with {flags} leaves out the rows with another text"
+        text = f"with {flags}, where that text is of sound rows, leaves out the others"
+        return f"    # valid: {{path: {yaml_text(path)}}}   # {text}"
     return f"    # {yaml_text(path)} is not read: {why}"
 
 
 def _is_flag(path: str) -> bool:
-    return not FLAGS.isdisjoint(re.findall("[a-z]+", path.lower()))
+    return not FLAGS.isdisjoint(_words(path))
+
+
+def _words(path: str) -> list[str]:
+    return re.findall("[a-z]+", path.lower())
 
 
 def _filter(channels: Channels, map_name: str) -> Iterator[str]:

@@ -195,7 +195,8 @@ class CsvLines(Table):
                 raise BadValue(f"{self.path}: has {count} columns '{part}', one was expected; rename the others")
         at = {part: self.columns.index(part) for part in parts}
         clocks = {path: TimeOfDay() for path, form in self._dates(at) if not has_day(form)}
-        for block, final, values in _ahead(self._parsed(at)):
+        parsed = self._parsed(at)
+        for block, final, values in _ahead(parsed) if self.path.is_file() else parsed:  # a pipe may keep one waiting
             if values is None:
                 cells, unfinished = self._without(block), final and not block.endswith(b"\n")
                 values = self._fast(cells, at) if cells and cells != block and not unfinished else None

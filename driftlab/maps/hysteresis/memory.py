@@ -102,12 +102,16 @@ class MemoryVerdict:
             )
         return " or ".join(self.kinds) + (" (one cannot tell which)" if len(self.kinds) > 1 else "")
 
-    def variance(self, T: Array) -> Array:
-        """Return the mean square (N, d) of half of what is between up and down at T (N,), as probable as it is."""
+    def variance(self, T: Array, without_spread: Flags | None = None) -> Array:
+        """Return the mean square (N, d) of half of what is between up and down at T (N,), as probable as it is.
+
+        Its deviation is left out on some axes (d,).
+        """
         d = len(self.size)
         if not len(self.T):
             return np.zeros((len(T), d))
-        squares = self.probability * (self.difference**2 + self.spread**2) / 4
+        spread = self.spread if without_spread is None else np.where(without_spread, 0.0, self.spread)
+        squares = self.probability * (self.difference**2 + spread**2) / 4
         some = ~np.isnan(squares[:, 0])
         if not np.any(some):
             return np.zeros((len(T), d))

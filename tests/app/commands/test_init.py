@@ -225,8 +225,11 @@ def test_a_column_that_is_not_read_is_listed_and_a_flag_says_how_it_is_taken(tmp
     more = {"state": np.where(good, 3, 0), "status": np.where(good, "OK", "ERR, loud"), "who": np.array(["me"] * N)}
     done = written(tmp_path, table(LOGS["short"]) | more | {"good_volts": 3.3 + 0.01 * np.arange(N)})
     text = done.path.read_text()
-    assert "    # valid: {path: state}   # leaves out the rows in which it is 0, 2 % of these\n" in text
-    assert '    # valid: {path: status}   # with source.flags: {status: "ERR, loud"} leaves out the rows' in text
+    assert (
+        "    # valid: {path: state}   # leaves out the rows in which it is 0, 2 % of these: where 0 is no reading\n"
+        in text
+    )
+    assert '    # valid: {path: status}   # with source.flags: {status: "ERR, loud"}, where that text is' in text
     assert "    # who is not read: line 2, column 'who': 'me' is not a number" in text
     assert "    # good_volts: {path: good_volts" in text, "of many values: no flag"
     assert done.asked == ()

@@ -224,7 +224,7 @@ def test_what_cannot_be_meant_is_refused_in_the_words_of_the_reference(command, 
 
 @pytest.mark.parametrize("text", ["-20..50 degC", "-20 degC..50 degC", "-4..122 degF", "253.15..323.15 K"])
 def test_a_range_is_written_in_any_unit(text):
-    chamber = parse_request(config_of("unit.yaml"), 4, range=text).chamber
+    chamber = parse_request(config_of("unit.yaml"), range=text).chamber
     assert (chamber.low, chamber.high) == pytest.approx((-20, 50))
 
 

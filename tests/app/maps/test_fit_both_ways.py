@@ -70,3 +70,17 @@ def test_samples_without_a_memory_are_left_as_they_are():
     plain, both = (fit_gathered(Config(), Spline(), samples, of_both_ways=both) for both in (False, True))
     T = np.linspace(*plain.domain, 50)
     np.testing.assert_array_equal(plain.bias(T), both.bias(T))
+
+
+def test_levels_of_recordings_are_no_difference_of_the_ways():
+    """Of two soaks the second is higher by 100 deg/h and goes down alone: the curve is that of one level."""
+    first, *_ = soak(60.0)
+    down = slice(int(np.argmax(first.T)), None)
+    T = np.concatenate([first.T, first.T[down]])
+    bias = np.concatenate([first.bias, first.bias[down] + 100 * DEG_H])
+    both = GatheredSoak(np.arange(len(T)) * DT, T, bias, ["a", "b"], [0, len(first.T)], DT)
+    way = np.repeat(both.summary.way, np.round(both.summary.span / DT).astype(int))
+    taken = (both.bias - both.of_both_ways) / DEG_H * np.where(way == 0, np.nan, way)[:, None]
+    inner = (T > 0) & (T < 40)
+    np.testing.assert_allclose(np.abs(taken[inner, 0]), 30.0, atol=6.0)  # half of the loop, and of no level
+    assert np.all(taken[inner, 2] == 0)

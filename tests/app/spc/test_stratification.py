@@ -6,7 +6,7 @@ from lines import SPREAD, line
 from scipy import stats
 
 from driftlab.spc.line import line_of
-from driftlab.spc.stratification import LEAST, differences, kruskal_wallis
+from driftlab.spc.stratification import LEAST, aligned, differences, stratified_p
 
 
 def of_chambers(records, chambers):
@@ -23,14 +23,27 @@ def found(records, **more):
 
 
 @pytest.mark.parametrize("ties", [False, True])
-def test_the_test_is_scipys(ties):
+def test_of_one_block_the_test_is_kruskal_and_wallis(ties):
     rng = np.random.default_rng(3)
     values, groups = rng.normal(size=60), rng.integers(0, 3, 60)
     values = np.round(values * 2) if ties else values
     expected = stats.kruskal(*(values[groups == g] for g in range(3))).pvalue
-    assert kruskal_wallis(values, groups) == pytest.approx(expected, rel=1e-10)
-    assert kruskal_wallis(np.ones(9), np.repeat([0, 1, 2], 3)) == 1.0
-    assert kruskal_wallis(np.arange(6.0), np.repeat([0, 1], 3)) == pytest.approx(1 / 20)  # of 20 arrangements
+    assert stratified_p(values, groups, np.zeros(60, dtype=int)) == pytest.approx(expected, rel=1e-10)
+    assert stratified_p(np.ones(9), np.repeat([0, 1, 2], 3), np.zeros(9, dtype=int)) == 1.0
+
+
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_its_level_holds_in_small_blocks(size):
+    """By dealing out the groups of each block anew: as often below 5 and 1 % as they say."""
+    rng, blocks = np.random.default_rng(size), np.repeat(np.arange(60 // size), size)
+    p = []
+    for _ in range(2000):
+        values = aligned(rng.standard_t(4, 60 // size)[blocks] * 5 + rng.normal(size=len(blocks)), blocks)
+        order = np.lexsort([rng.random(len(blocks)), blocks])
+        p.append(stratified_p(values, np.resize([0, 1], len(blocks))[order], blocks))
+    for level in (0.05, 0.01):
+        assert np.mean(np.array(p) < level) <= level + 3.3 * np.sqrt(level / len(p))
+    assert np.mean(np.array(p) < 0.05) > 0.02
 
 
 def test_a_chamber_whose_units_are_noisier_is_named_with_its_size():
@@ -43,7 +56,7 @@ def test_a_chamber_whose_units_are_noisier_is_named_with_its_size():
         assert (one.column, one.group, one.units) == ("chamber", "B", np.sum(chambers == "B"))
         assert one.value / one.others == pytest.approx(np.exp(3 * SPREAD["noise"]), rel=0.1)
         said = next(text for text in report.sentences if text.startswith("Noise of x differs by chamber (p = "))
-        assert f"of the {one.units} units of B" in said
+        assert f"in the {one.units} units of B" in said
 
 
 @pytest.mark.parametrize("law", ["normal", "heavy", "skew"])
@@ -67,6 +80,41 @@ def test_what_lots_have_of_their_own_is_not_a_chambers():
     assert not any(found(lots(seed, 4)) for seed in range(4))
     false = sum(("noise", "x") in found(lots(seed, 16)) for seed in range(10))
     assert false <= 1
+
+
+@pytest.mark.parametrize("mixed", [4, 10, 16])
+def test_lots_of_one_chamber_and_of_several_are_not_taken_together(mixed):
+    """Nothing is planted; the first lots have units of A and B, each of the others is of A or C alone."""
+    false = 0
+    for seed in range(10):
+        rng = np.random.default_rng([seed, 8])
+        chambers = [*rng.choice(["A", "B"], 6 * mixed), *np.repeat(rng.choice(["A", "C"], 20 - mixed), 6)]
+        false += bool(found(of_chambers(line(120, seed, lots=20), chambers)))
+    assert false <= 2
+
+
+def test_pairs_in_a_lot_do_not_alarm():
+    false = sum(bool(found(of_chambers(line(60, seed, lots=30), np.resize(["A", "B"], 60)))) for seed in range(12))
+    assert false <= 2
+
+
+def test_a_change_of_the_line_is_no_chambers():
+    """A and B in turn, then C and D, and the line moves between."""
+    planted = [("noise", "x", 60, 120, 2.0)]
+    chambers = [*np.resize(["A", "B"], 60), *np.resize(["C", "D"], 60)]
+    false = sum(bool(found(of_chambers(line(120, seed, lots=1, planted=planted), chambers))) for seed in range(6))
+    assert false <= 1
+
+
+def test_size_and_sign_are_those_within_lots():
+    """A is higher by 1.3 in each lot, and B is in the lots that are high."""
+    rng = np.random.default_rng(2)
+    chambers = np.array([rng.choice(["A", "B"], p=[0.8, 0.2] if k < 60 else [0.2, 0.8]) for k in range(120)])
+    step = np.log(1.3) / SPREAD["noise"]
+    planted = [("noise", "x", 60, 120, 8.0)] + [("noise", "x", k, k + 1, step) for k in np.flatnonzero(chambers == "A")]
+    one = found(of_chambers(line(120, 3, lots=6, planted=planted), chambers))[("noise", "x")]
+    ratio = one.value / one.others
+    assert (ratio if one.group == "A" else 1 / ratio) == pytest.approx(1.3, rel=0.1)
 
 
 def test_chambers_are_compared_within_lots_that_have_several():
