@@ -426,7 +426,8 @@ def _sigma_of_coasts(run: ScoredRun) -> Array:
 
     The variance v of the run's own prediction has a part of the map, m(T, T_0) from T_0 on, and the rest r. That of
     a prediction from s on is m(T, T_s) and, of the rest, what r begins with, and the larger of what it grows by from s
-    on and from the run's own start on.
+    on and from the run's own start on. T is that of the overview's curves: of a run longer than a week their rows are
+    further apart than a prediction lasts, and how T moves within one is not in m.
     """
     curves, fitted = run.overview.curves, map_of(run.config)
     known = np.isfinite(curves["coast_sigma"][:, 0])
