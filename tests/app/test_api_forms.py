@@ -31,5 +31,5 @@ def test_the_error_says_what_is_given_and_what_could_be():
         driftlab.run("run.yaml", out=3)
     with pytest.raises(FusionError, match=r"^range: is \('a',\), of type tuple; give "):
         driftlab.plan("map.yaml", range=("a",))
-    with pytest.raises(FusionError, match=r"^hours='3': is not a length"):
-        driftlab.plan("extends: mems_crs05", "3")
+    with pytest.raises(FusionError, match=r"^hours: 'soon' is not a quantity"):
+        driftlab.plan("extends: mems_crs05", "soon")

@@ -50,7 +50,7 @@ def a_unit(out):
 
 
 def the_family(out):
-    return lambda: any((out / SCRATCH).glob("sample-*"))
+    return lambda: any((out / SCRATCH).glob("stacked-*"))
 
 
 @pytest.mark.parametrize("part", [a_unit, the_family])
