@@ -266,7 +266,7 @@ BUDGET = {
     "driftlab/maps": 1995,
     "driftlab/noise": 1544,
     "driftlab/planning": 1226,
-    "driftlab/production": 3215,
+    "driftlab/production": 3219,
     "driftlab/products": 6,
     "driftlab/recordings": 686,
     "driftlab/reports": 3561,

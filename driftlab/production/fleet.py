@@ -247,7 +247,11 @@ class _Command:
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
         with self.jobs:
-            return self._stages()
+            content = self._stages()
+            folder = self.jobs.folder
+            if folder.units is folder.place:
+                folder.place.finish()  # what a worker that was killed had begun to write
+            return content
 
     def _stages(self) -> dict[str, Any]:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]

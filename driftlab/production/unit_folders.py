@@ -213,7 +213,7 @@ class UnitPlace(UnitFolders):
         yield self.unit(unit) / name
 
     def finish(self) -> None:
-        """Finish what a command that was killed had begun to replace."""
+        """Finish what a command or a worker that was killed had begun to replace."""
         (self.path / UNITS).mkdir(exist_ok=True)
         for path in sorted(self.path / UNITS / name for name in os.listdir(self.address) if name[0] == "."):
             if path.name.endswith(OLD):

@@ -518,3 +518,15 @@ def test_units_that_were_soaked_twice_are_a_gauge_study(fleet):
     assert "Gauge R&amp;R" in Path("made/report.html").read_text()
     with pytest.raises(ConfigError, match="--appraiser lot: no such column; choose chamber"):
         fleet(appraiser="lot")
+
+
+def test_what_a_killed_worker_had_begun_to_write_is_gone_at_the_end(fleet):
+    left = Path("made/units/.0001.0123456789ab.new")
+
+    def note(_):
+        left.mkdir(exist_ok=True)
+        (left / "unit.npz").write_bytes(b"")
+
+    fleet(progress=note)
+    assert Path("made/fleet.json").is_file()
+    assert not left.exists()
