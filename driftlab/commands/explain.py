@@ -47,6 +47,7 @@ from fusion_core.escaping import comment
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
+from fusion_core.threads import one_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,8 +150,6 @@ def explain(
     DataError, ConfigError, UnitError
         If the config or a recording cannot be used.
     """
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     given = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in given.items()}
     understood = config_of(config).tracking(channel)
@@ -158,7 +157,7 @@ def explain(
 
     def explained() -> ExplainResult:
         # the matrices are small: fits side by side are faster than divided matrices
-        with TemporaryDirectory(prefix="driftlab-") as folder, threadpool_limits(1):
+        with TemporaryDirectory(prefix="driftlab-") as folder, one_thread():
             told = progress or (lambda text: None)
             whole = _closed(understood, recordings, Path(folder), told, without, estimate=estimate)
             return ExplainResult(whole, {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}, used)

@@ -21,7 +21,6 @@ from pydantic import (
     TypeAdapter,
     model_serializer,
 )
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, columns_of, seen_temperatures
 from driftlab.family.partitions import Partitions, UnitOfLot, by_lot
@@ -36,6 +35,7 @@ from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
+from fusion_core.threads import one_thread
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished
 HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
@@ -219,7 +219,7 @@ def _effects_of_units(
 ) -> list[tuple[str, str, UnitDensities, list[_UnitContrast]]]:
     """Return of each unit its name, its lot, its noise beside the effects, and its contrast of each."""
     found = []
-    with threadpool_limits(1):
+    with one_thread():
         for soaked, lot in units:
             quiet = _with_noise_beside(soaked, [offer.effect for offer in taken])
             contrasts = [_contrast(quiet, taken, k) for k in range(len(taken))]

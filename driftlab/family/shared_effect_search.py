@@ -31,7 +31,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, chunks_of, of_each_axis, own_curve
 from driftlab.family.partitions import Partition, Partitions, UnitOfLot, by_lot, tree
@@ -43,6 +42,7 @@ from driftlab.identification.state import name_of
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import Effect
 from fusion_core.host.registry import kind_of
+from fusion_core.threads import one_thread
 
 CHANCE = 5.0  # nats beyond the price, as in the loop
 FOLDS = 5
@@ -152,7 +152,7 @@ def contrasts_of(
 def _contrasts(
     effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], units: Sequence[UnitOfLot]
 ) -> list[tuple[EffectContrasts, str]]:
-    with threadpool_limits(1):
+    with one_thread():
         return [(UnitRows(soaked, beside).contrasts(effects, sizes), lot) for soaked, lot in units]
 
 
@@ -258,7 +258,7 @@ def refine(
 
 def _squares(effects: Sequence[Effect], units: Sequence[UnitOfLot]) -> float:
     """Return the sum of squares that curves and effects leave in units, in their noise."""
-    with threadpool_limits(1):
+    with one_thread():
         return sum(float(r @ r) for soaked, _ in units for r in UnitRows(soaked, effects).r)
 
 

@@ -30,6 +30,7 @@ from driftlab.filtering.tracker import Filtered, Segments, Tracker
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.prefetch import prefetch
 from driftlab.recordings.screening import read
+from driftlab.units import unit_of
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
 from fusion_core.contracts import Alignment, FittedMap, Sensor, ThermalBias
@@ -39,7 +40,6 @@ from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT
 from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
-from fusion_core.units import convert
 
 
 class Moment(NamedTuple):
@@ -253,12 +253,12 @@ def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
     size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
     if not np.any(np.isfinite(size)):
         return
-    axis, factor = int(np.nanargmax(size)), convert(1.0, sensor.unit, sensor.shown)
+    axis, unit = int(np.nanargmax(size)), unit_of(sensor)
     kinds = " or ".join(memory.get("kinds") or ["memory"])
     faults.note(
         f"the soak of the {sensor.channel}'s map showed a {kinds}: up and down differ by up to "
-        f"{size[axis] * factor:.3g} {sensor.shown}, {sensor.axes[axis]}, which no effect of the config follows and no "
-        "sigma has in it; `driftlab explain` finds it"
+        f"{size[axis] * unit.factor:.3g} {unit.shown}, {sensor.axes[axis]}, which no effect of the config follows and "
+        "no sigma has in it; `driftlab explain` finds it"
     )
 
 

@@ -38,6 +38,7 @@ from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts import FittedMap, NetworkMap, Plugin, ThermalMap
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.thermal.sweeps import sweeps_of
+from fusion_core.threads import one_thread
 
 ERROR_RANGES = 50  # of temperature, over which the errors of a part are averaged
 NEGLIGIBLE = 1e-4  # of the error without a map: less is no difference
@@ -145,11 +146,9 @@ Fit = TypeVar("Fit")
 
 def side_by_side(fit: Callable[[Job], Fit], jobs: Sequence[Job], progress: Progress | None) -> list[Fit]:
     """Return the fits of all jobs, several at once; `progress` is called with the fits done, and their number."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     fits = []
     # the matrices are too small to be divided among cores: a fit a core is faster
-    with threadpool_limits(1), ThreadPoolExecutor(min(4, cpu_count() or 1)) as pool:
+    with one_thread(), ThreadPoolExecutor(min(4, cpu_count() or 1)) as pool:
         for done, fitted in enumerate(pool.map(fit, jobs), start=1):
             fits.append(fitted)
             if progress is not None:

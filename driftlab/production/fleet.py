@@ -44,6 +44,7 @@ from driftlab.spc.sentences import alarms
 from driftlab.spc.yields import Yield, yields_of
 from fusion_core.errors import ConfigError, DataError, quote
 from fusion_core.host.provenance import participants
+from fusion_core.threads import one_thread
 
 __all__ = ["FleetOptions", "fleet"]
 
@@ -254,8 +255,6 @@ class _Command:
             return content
 
     def _stages(self) -> dict[str, Any]:
-        from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
         jobs, folder, options, progress = self.jobs, self.jobs.folder, self.jobs.options, self.jobs.progress
         self.notes = known_notes(folder.mark, f"--out {folder.out}")
         self._timed("units", jobs.do)
@@ -271,7 +270,7 @@ class _Command:
         self._mark()
         # of matrices of forty rows more threads make less
         engine, seen = jobs.engine() if len(status.done) > ALONE else (serial, folder.place)
-        with threadpool_limits(1), seen.scratch() as scratch:
+        with one_thread(), seen.scratch() as scratch:
             stored = partial(stored_units, folder.units, engine=engine, scratch=scratch)
             whole = stored(status.records.units, [record.lot for record in status.records])
             doubted, units = (

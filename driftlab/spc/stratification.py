@@ -39,7 +39,7 @@ COLUMNS: dict[str, Callable[[UnitRecord], str]] = {
 NO_VALUE = "not known"
 CLASSES = 12  # numbers of a column that are groups by themselves; of more there are four classes
 LEAST = 4  # values of a group that is compared
-ALPHA = 0.05  # chance, over all columns and figures, that one is said to differ where none does
+ALPHA = 0.05  # chance, over all columns, and over their figures, that one is said to differ where none does
 
 
 def groups_of(records: Iterable[UnitRecord], column: str) -> list[str]:

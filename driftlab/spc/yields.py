@@ -19,7 +19,7 @@ import numpy as np
 
 from driftlab.family.record import UnitRecord, figure_name
 from driftlab.spc.capability import share_beyond
-from driftlab.spc.stratification import groups_of
+from driftlab.spc.stratification import ALPHA, groups_of
 from fusion_core.faults import in_doubt
 
 UNITS = {"T_low": "°C", "T_high": "°C", "hours": "h"}  # of columns
@@ -28,7 +28,6 @@ SAID = {"fail": "above limit", UNDECIDED: "undecided", "not measured": "not meas
 _Judged = tuple[list[str], bool, bool]  # reasons of a unit, whether it stands out, and whether it is undecided
 DRAWS = 9999  # permutations
 CELLS = 10_000_000  # groups of all draws
-ALPHA = 0.05  # chance, over all columns, that a yield is said to differ where it does not
 
 
 @dataclass(frozen=True)
