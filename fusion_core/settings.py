@@ -59,8 +59,13 @@ class Frozen(BaseModel):
 
     def __eq__(self, other: object) -> bool:
         """Return True if all fields are the same, whatever has been worked out from them since."""
-        fields = type(self).model_fields
-        return type(other) is type(self) and all(getattr(self, name) == getattr(other, name) for name in fields)
+        if other is self or type(other) is not type(self):
+            return other is self
+        mine, theirs = self.__dict__, other.__dict__
+        for name in type(self).__pydantic_fields__:  # most are the same objects
+            if mine[name] is not theirs[name] and mine[name] != theirs[name]:
+                return False
+        return True
 
 
 class Settings(Frozen):

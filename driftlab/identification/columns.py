@@ -21,7 +21,8 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from driftlab.identification.records import Evidence, map_inputs
 from fusion_core.chunk import Array, Flags, Integers
@@ -67,7 +68,7 @@ class NormalEquations:
 
     def solve(self, b: Array) -> Array:
         """Return x (k,) or (k, p) of A x = b; what A does not determine is nearly zero."""
-        return np.asarray(cho_solve((self._root(), False), b, check_finite=False))
+        return np.asarray(dpotrs(self._root(), b)[0])
 
     def _root(self) -> Array:
         """Return U (k, k) with U' U = A and a tiny ridge; below its diagonal stands anything."""
@@ -76,10 +77,10 @@ class NormalEquations:
         while True:
             A = self.A.copy()
             A[diagonal] += tiny
-            try:
-                return np.asarray(cho_factor(A, overwrite_a=True, check_finite=False)[0])
-            except LinAlgError:  # rounding made it indefinite
-                tiny *= 100
+            root, indefinite = dpotrf(A.T, clean=False, overwrite_a=True)
+            if not indefinite:
+                return np.asarray(root)
+            tiny *= 100  # rounding made it so
 
     @cached_property
     def solution(self) -> Array:

@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import log
 from os import cpu_count
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +28,7 @@ from driftlab.identification.least_squares import LeastSquares, Model, Term
 from driftlab.identification.records import move_together
 from driftlab.identification.state import Errors, Search, Trial
 from driftlab.noise.local_level import LocalLevel, effective
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Effect
 
 WORTH = 0.97  # of the sum of squares in the fit itself: a candidate that gains less is not cross-validated
@@ -194,6 +196,14 @@ def _likelihood(search: Search, model: Model, noises: Sequence[LocalLevel]) -> f
     return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
 
 
+class Candidate(NamedTuple):
+    """A term that is tried over some segments, with its columns on each axis, and those of its starts there."""
+
+    term: Term
+    columns: tuple[Integers, ...]
+    starts: Integers
+
+
 class Tuning:
     """Costs of candidates beside one base, over some segments."""
 
@@ -210,37 +220,45 @@ class Tuning:
                 known[key] = fit.equations.explained(G[fit.cols])
             self._explained.append(known[key])
 
-    def cost(self, terms: Sequence[Term]) -> float:
-        """Return n/2 log of the sum of squares that the terms leave beside the base, summed over the axes (nats)."""
-        logs = (float(np.log(max(self._left(terms, axis), 1e-300))) for axis in self.axes)
-        return 0.5 * self.rows * sum(logs)
-
-    def _left(self, terms: Sequence[Term], axis: int) -> float:
+    def candidates(self, terms: Sequence[Term]) -> list[Candidate]:
+        """Return the terms with their columns."""
         columns, squares = self.squares.columns, self.squares
-        if any(term.effect.acts_on_input for term in terms):
-            return squares.fit((*self.base, *terms), axis, self.segments).cost
-        starts = [squares.starts(term, self.segments) for term in terms]
-        cols = np.concatenate([*(columns.of(term.effect).columns[axis] for term in terms), *starts])
-        sizes, colour = np.array([len(s) for s in starts]), float(squares.colour[axis])
-        base, y = self._explained[axis], int(columns.y[axis])
-        return float(left_with_starts(self._G, base, y, cols, sizes, self.rows, colour))
+        return [Candidate(t, columns.of(t.effect).columns, squares.starts(t, self.segments)) for t in terms]
+
+    def cost(self, candidates: Sequence[Candidate]) -> float:
+        """Return n/2 log of the sum of squares that they leave beside the base, summed over the axes (nats)."""
+        if any(one.term.effect.acts_on_input for one in candidates):
+            model = (*self.base, *(one.term for one in candidates))
+            left = [self.squares.fit(model, axis, self.segments).cost for axis in self.axes]
+        else:
+            starts = [one.starts for one in candidates]
+            sizes = np.array([len(s) for s in starts])
+            left = [
+                self._left(axis, [*(one.columns[axis] for one in candidates), *starts], sizes) for axis in self.axes
+            ]
+        return 0.5 * self.rows * sum(log(max(squares, 1e-300)) for squares in left)
+
+    def _left(self, axis: int, cols: Sequence[Integers], sizes: Integers) -> float:
+        base, y, colour = self._explained[axis], int(self.squares.columns.y[axis]), float(self.squares.colour[axis])
+        return float(left_with_starts(self._G, base, y, np.concatenate(cols), sizes, self.rows, colour))
 
 
-def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
+def best(tuning: Tuning, families: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
     """Return one term of each family, those of least cost together, by coordinate descent from several starts."""
+    choices = [tuning.candidates(terms) for terms in families]
     if len(choices) == 1:
-        return (min(choices[0], key=lambda term: tuning.cost((term,))),)
-    ends: list[tuple[float, tuple[Term, ...]]] = []
+        return (min(choices[0], key=lambda one: tuning.cost((one,))).term,)
+    ends: list[tuple[float, list[Candidate]]] = []
     for share in (0.15, 0.5, 0.85):
         chosen = [family[int(share * (len(family) - 1))] for family in choices[:-1]]
-        chosen.append(min(choices[-1], key=lambda term: tuning.cost((*chosen, term))))
+        chosen.append(min(choices[-1], key=lambda one: tuning.cost((*chosen, one))))
         cost = tuning.cost(chosen)
         while True:
             for k, family in enumerate(choices):
-                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))
+                chosen[k] = min(family, key=lambda one: tuning.cost((*chosen[:k], one, *chosen[k + 1 :])))
             lower = tuning.cost(chosen)
             if lower >= cost - 1e-9:
                 break
             cost = lower
-        ends.append((cost, tuple(chosen)))
-    return min(ends, key=lambda pair: pair[0])[1]
+        ends.append((cost, chosen))
+    return tuple(one.term for one in min(ends, key=lambda pair: pair[0])[1])
