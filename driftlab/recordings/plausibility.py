@@ -28,6 +28,7 @@ FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
 AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the rows next to it: at least
 BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
+MANY, SOME = 20, 10  # chunks, after which one in SOME is looked at: of steps
 EXACT = 0.01  # of a step: so far changes may be from multiples of it
 MINUTE = 60.0  # s; a mean over it is to be off by no more than its noise
 KELVIN = 200.0  # degC: in kelvin a soak is warmer than that throughout
@@ -98,12 +99,16 @@ class Rounding:
     def __init__(self, name: str, sensor: Sensor | None, d: int) -> None:
         self.name, self.sensor = name, sensor
         self.step = np.full(d, np.inf)  # of which all changes are multiples; 0: of none
+        self.chunks = 0  # so far
         self.squares: list[Array] = []  # (B, d): mean squares of the changes in each block
         self.dt: list[float] = []
 
     def look(self, chunk: Chunk) -> None:
         """Look at blocks of the next rows."""
         if self.sensor is None or len(chunk) < BLOCK or not np.any(self.step):
+            return
+        self.chunks += 1
+        if self.chunks > MANY and self.chunks % SOME:
             return
         starts = np.unique(np.linspace(0, len(chunk) - BLOCK, min(BLOCKS, len(chunk) // BLOCK)).astype(np.intp))
         rows = starts[:, None] + np.arange(BLOCK)
@@ -228,9 +233,8 @@ class Thermometer:
                     f"temperature is {T[0]:.4g} °C in the first row: that looks like kelvin; set "
                     "source.channels.temperature.unit to K"
                 )
-        odd = (SOAKS[0] > T) | (SOAKS[1] < T)
-        if not self.odd and np.any(odd):
-            self.odd, k = True, int(np.argmax(odd))
+        if not self.odd and (T.min() < SOAKS[0] or T.max() > SOAKS[1]):
+            self.odd, k = True, int(np.argmax((SOAKS[0] > T) | (SOAKS[1] < T)))
             self.faults.doubt(
                 f"temperature is {T[k]:.4g} °C at {self.faults.when(t[k])}: no sensor is soaked below {SOAKS[0]:g} or "
                 f"above {SOAKS[1]:g} °C; correct path or unit of source.channels.temperature"
