@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,6 +71,29 @@ def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:
     return NisTest(total / N / m, low, high)
 
 
+class VarianceRatio(NamedTuple):
+    """Sums of innovations over blocks beside those of independent ones, of m components.
+
+    Source: A. W. Lo and A. C. MacKinlay, Review of Financial Studies 1 (1988) 41.
+
+    Attributes
+    ----------
+    ratio : (m,) array
+        Mean square of a block's sum over that of as many independent innovations of the same size.
+    rows : (m,) array
+        Rows of that block.
+    p : (m,) array
+        Probability of so much, or more, in white innovations, for all sizes that were tried; NaN where N is too small.
+    square : (m,) array
+        Mean square of single innovations.
+    """
+
+    ratio: Array
+    rows: Array
+    p: Array
+    square: Array
+
+
 class Whiteness:
     """The sums behind tests of whiteness, taken stretch by stretch: m components at lags up to `lags`, and in blocks.
 
@@ -115,19 +139,10 @@ class Whiteness:
             self._part = self._part + np.sum(self._sums[even:], axis=0)
             self._sums, self._size = self._sums[0:even:2] + self._sums[1:even:2], 2 * self._size
 
-    def slow(self) -> tuple[Array, Array, Array]:
+    def slow(self) -> VarianceRatio:
         """Return the ratio of sums over blocks to those of white innovations, at the size of block where it is surest.
 
-        Returns
-        -------
-        ratio : (m,) array
-            Mean square of a block's sum over that of as many independent innovations of the same size.
-        rows : (m,) array
-            Rows of that block.
-        p : (m,) array
-            Probability of so much, or more, in white innovations, for all sizes that were tried; NaN where N is too
-            small. A slow error, which is far below the innovations of single updates, adds up (A. W. Lo and A. C.
-            MacKinlay, Review of Financial Studies 1 (1988) 41: variance ratios).
+        A slow error, which is far below the innovations of single updates, adds up.
         """
         from scipy import special
 
@@ -142,7 +157,7 @@ class Whiteness:
             for own, values in zip(best, (ratio, np.full(m, float(size)), p), strict=True):
                 own[better] = values[better]
             sums, size = sums[0 : len(sums) // 2 * 2 : 2] + sums[1 : len(sums) // 2 * 2 : 2], 2 * size
-        return best[0], best[1], np.minimum(best[2] * max(tried, 1), 1.0)
+        return VarianceRatio(best[0], best[1], np.minimum(best[2] * max(tried, 1), 1.0), square)
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""

@@ -38,7 +38,7 @@ from driftlab.filtering.setup import noise_doubts
 from driftlab.recordings.prefetch import prefetch
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Flags, read_only
-from fusion_core.consistency import NisTest, Whiteness, nis_test_of
+from fusion_core.consistency import NisTest, VarianceRatio, Whiteness, nis_test_of
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor, ThermalBias
 from fusion_core.fast import compiled
 from fusion_core.faults import DOUBT
@@ -72,7 +72,7 @@ class Overview:
     yardsticks: Scores  # scores of the run
     nis: NisTest  # of the used updates after the first alignment
     whiteness_p: Array  # (m,) of the same
-    slow: tuple[Array, Array, Array]  # (m,) each, of the same (`Whiteness.slow`)
+    slow: VarianceRatio  # of the same
     # at most POINTS rows of the estimates, evenly spread, and the last, with the `reference` of the scores
     curves: Columns
     errors: Columns  # `t`, and the error of `bias` and `coast`, with every spike of it
@@ -407,7 +407,8 @@ class ScoredRun:
     @cached_property
     def doubts(self) -> list[str]:
         """Sentences on why the recording may not be what its config says."""
-        noise = noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel])
+        updates = self.model.align / self.alignment.dt
+        noise = noise_doubts(self.sensor, self.alignment.noise_ratio[self.sensor.channel], updates)
         return [*self.journal.faults.doubts, *noise]
 
     @cached_property

@@ -89,7 +89,8 @@ def remarks(run: ScoredRun) -> list[str]:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
         lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
     lines += wandering(run)
-    noises = (noise_remarks(sensor, first.noise_ratio[sensor.channel]) for sensor in model.sensors)
+    updates = model.align / first.dt
+    noises = (noise_remarks(s, first.noise_ratio[s.channel], updates=updates) for s in model.sensors)
     return [*lines, *chain.from_iterable(noises), *_seen(run)]
 
 
@@ -109,17 +110,17 @@ def in_sample(fitted: FittedMap | None, recordings: Iterable[str]) -> list[str]:
 def wandering(run: ScoredRun) -> list[str]:
     """Return a remark where innovations add up, since the bias moves by more than its walk allows; none where not.
 
-    An error e of the bias is e^2 tau / N^2 of the square of an innovation, N the white noise and tau the update's
-    length, so the sums say how large the error is beside the filter's own, which is that of the least deviation: what
-    deviations have of thermometer and map adds up as well.
+    An error e of the bias is e^2 tau / N^2 of the square of an innovation, N the declared white noise and tau the
+    update's length. Of innovations of a mean square s a filter of deviation P that is at its best makes s P^2, and
+    what adds up is beyond that. P is the least deviation: what others have of thermometer and map adds up as well.
     """
     overview, sensor = run.overview, run.sensor
     d = len(sensor.axes)
-    ratio, rows, p = (column[-d:] for column in overview.slow)
+    ratio, rows, p, square = (column[-d:] for column in overview.slow)
     tau = run.alignment.dt
-    excess = np.maximum(ratio - 1, 0) / rows * sensor.noise**2 / tau
     own, deviation = overview.deviations
-    small = np.sqrt(np.divide(own**2 + excess, deviation**2, out=np.zeros(d), where=deviation > 0))
+    error = square * (own**2 + np.maximum(ratio - 1, 0) / rows * sensor.noise**2 / tau)
+    small = np.sqrt(np.divide(error, deviation**2, out=np.zeros(d), where=deviation > 0))
     seen = (p < CHANCE / d) & (small > SMALL)
     if not np.any(seen):
         return []

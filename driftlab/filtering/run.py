@@ -235,6 +235,14 @@ class Run:
         name = self.config.source.name if self.config.source else "the recording"
         left_out = "".join(f"; {line}" for line in self.journal.faults.lines(notes=False))
         left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
+        apart = self.model.update_interval  # or longer, where samples are rarer
+        if waiting is not None and len(waiting) > 1:
+            apart = max(apart, float(np.median(np.diff(waiting.t))))
+        if align_s < 2 * apart:
+            return (
+                f"{name}: an alignment of {align_s:g} s has fewer than three updates, which are {apart:.4g} s apart; "
+                f"set filter.align to {3 * apart:.4g} s or more, or filter.update_interval lower"
+            )
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
             f"looked at{left_out}); use a longer recording, set filter.align lower, or check "

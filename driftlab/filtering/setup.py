@@ -32,6 +32,7 @@ from fusion_core.settings import nearest
 
 FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
+CHANCE = 1e-3  # probability that noise as it is declared is said to be another
 OFF = 5.0  # factor between measured and declared noise: more may be a wrong unit or path
 
 
@@ -41,34 +42,51 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
 
 
-def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0) -> list[str]:
+def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0, updates: float = np.inf) -> list[str]:
     """Return a sentence on a sensor whose noise is not as declared, by a factor of `least`; nothing where it is.
 
-    `ratios` (d,) are measured over declared noise.
+    `ratios` (d,) are measured over declared noise, of the differences of so many `updates`: fewer show less of it.
     """
+    if np.min(ratios) >= 1 / least and np.max(ratios) <= least:
+        return []  # nearly always
+    low, high = _by_chance(updates)
 
     def off(ratio: float, factor: float) -> bool:
-        return not 1 / factor <= ratio <= factor
+        return not min(1 / factor, low) <= ratio <= max(factor, high)
 
-    if not any(off(r, least) for r in ratios):
+    pairs = [pair for pair in zip(sensor.axes, ratios, strict=True) if off(pair[1], least)]
+    if not pairs:
         return []
-    pairs = zip(sensor.axes, ratios, strict=True)
     single = axis_name(sensor.channel, sensor.axes[0]) == sensor.channel
-    each = [f"{r:.2g}" if single else f"{axis} {r:.2g}" for axis, r in pairs if single or off(r, least)]
+    each = ", ".join(f"{ratio:.2g}" if single else f"{axis} {ratio:.2g}" for axis, ratio in pairs)
     path = f", or correct unit and path of source.channels.{sensor.channel}" if any(off(r, OFF) for r in ratios) else ""
     alike = ", unless neighbouring samples are alike, as those of a filter or of interpolation"
     return [
-        f"{sensor.channel}: white noise is not as declared (measured / declared: {', '.join(each)}); "
+        f"{sensor.channel}: white noise is not as declared (measured / declared: {each}); "
         f"set {sensor.section}.noise{path}{alike if np.max(ratios) < 1 else ''}"
     ]
 
 
-def noise_doubts(sensor: Sensor, ratios: Array) -> list[str]:
+def _by_chance(updates: float) -> tuple[float, float]:
+    """Return the least and the largest ratio that chance makes of the noise of so many updates.
+
+    Mean squares of differences of neighbours, which share an update, vary as those of two thirds as many numbers.
+    """
+    if not np.isfinite(updates):
+        return 1.0, 1.0
+    from scipy.special import chdtri
+
+    freedom = max(2 / 3 * (updates - 1), 1.0)
+    low, high = (float(np.sqrt(chdtri(freedom, p) / freedom)) for p in (1 - CHANCE / 2, CHANCE / 2))
+    return low, high
+
+
+def noise_doubts(sensor: Sensor, ratios: Array, updates: float = np.inf) -> list[str]:
     """Return that sentence where the noise is far less than declared.
 
     So it is of an axis in another unit, of one that is not there, at its range, or filtered, and so is its bias.
     """
-    return noise_remarks(sensor, ratios, OFF) if np.min(ratios) < 1 / OFF else []
+    return noise_remarks(sensor, ratios, OFF, updates) if np.min(ratios) < 1 / OFF else []
 
 
 @dataclass(frozen=True)

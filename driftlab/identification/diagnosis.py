@@ -3,12 +3,7 @@
 The errors of predicting each row from those before (`driftlab.noise.local_level`) are white with unit variance, once
 divided by their deviation, where the fast part of the residual says all of it. Over windows of W rows their sums, over
 the square root of W, are then independent with unit variance again, at every time scale; and none stands out. What is
-significant is reported only where it matters to one who drives off: where the residual is slow.
-
-A further recording that would tell two explanations apart is designed from the ranges of the channels so far: one model
-predicts the unit's readings on it, and the other is fitted to the old recordings and the new one together, all whitened
-by the noise that is left. By how much its misfit grows, in nats, is the expected gain: the log of how much less likely
-it would become.
+significant is reported only where it matters to one who drives off: where the residual is slow, or is no noise.
 """
 
 from __future__ import annotations
@@ -21,17 +16,15 @@ import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, GAIN, nats_of
 from driftlab.identification.candidates import Family, Probe, candidates_of, probes, with_residual
-from driftlab.identification.columns import EffectRegressors, NormalEquations
-from driftlab.identification.least_squares import Model, Term, without_term
-from driftlab.identification.records import Evidence, Progress, Record, row_starts
+from driftlab.identification.experiments import Experiment, Question, propose
+from driftlab.identification.least_squares import Term, without_term
+from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
-from driftlab.identification.trials import AS_GOOD, as_good, contains, is_copy, tried, with_uncertain_map
-from driftlab.noise.local_level import LocalLevel, one_step, whitened
+from driftlab.identification.trials import as_good, contains, is_copy, tried, with_uncertain_map
+from driftlab.noise.local_level import LocalLevel, whitened
 from driftlab.units import duration
-from fusion_core.chunk import Array, Chunk, Integers
+from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
-from fusion_core.contracts.table import auxiliary
-from fusion_core.errors import FusionError
 from fusion_core.thermal.sweeps import one_way
 
 Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous", "refuted"]
@@ -237,6 +230,7 @@ SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the t
 SLOW = 120.0  # s: a residual over means of that length spoils a coast
 MATTERS = 0.5  # of the error on left-out parts
 BEYOND = 2.0  # of the declared mean square: from there on most of what is left is neither declared noise nor walk
+PREDICTABLE = 0.5  # of what is left: where more than that follows from what was before, it is no noise
 MAX_NATS = 700.0  # exp of minus that is nearly the least number of a computer
 
 
@@ -261,9 +255,10 @@ def structures(search: Search, error: Array) -> list[Structure]:
     columns, evidence = search.columns, search.evidence
     left = np.stack(search.residuals(search.model), axis=1)
     parts = [part * columns.scale[columns.y] for part in evidence.split(left)]
+    white = _white(search, evidence.split(left))
     if not _slow(evidence.interval, parts, error):
-        return []
-    scales = list(_sums(_white(search, evidence.split(left))))
+        return quick(white, evidence.interval, evidence.axes)
+    scales = list(_sums(white))
     limit = -float(np.log(SIGNIFICANT / len(scales)))
     unit, stays = evidence.unit, _stays(evidence.interval, parts)
     size = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * unit.factor
@@ -278,6 +273,28 @@ def structures(search: Search, error: Array) -> list[Structure]:
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
     return [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
+
+
+def quick(white: Sequence[Array], interval: float, axes: Sequence[str]) -> list[Structure]:
+    """Return the structure of innovations (n, d), `interval` s apart, of which most follows from those before.
+
+    The share that does is 1 - exp(mean log S) / mean S, S the spectrum (Kolmogorov), of whose logarithm that of a
+    periodogram is less by Euler's constant in the mean. Noise has none; what repeats, as a tone or a vibration, has.
+    """
+    powers = [np.abs(np.fft.rfft(part - part.mean(axis=0), axis=0)[1:-1]) ** 2 / len(part) for part in white]
+    power = np.concatenate([part for part in powers if len(part)])
+    if not len(power) or not np.all(np.mean(power, axis=0) > 0):
+        return []
+    flatness = np.exp(np.mean(np.log(power), axis=0) + np.euler_gamma) / np.mean(power, axis=0)
+    k = int(np.argmin(flatness))
+    nats, limit = -len(power) * float(np.log(flatness[k])), -float(np.log(SIGNIFICANT / len(axes)))
+    if nats <= limit or flatness[k] > 1 - PREDICTABLE:
+        return []
+    longest = max(powers, key=len)[:, k]
+    period = 2 * (len(longest) + 1) * interval / (1 + int(np.argmax(longest)))
+    share = f"{1 - float(flatness[k]):.0%} of it follow from what was before"
+    text = f"on {axes[k]} what is left is no noise, {share}, most of all with a period of {duration(period)}"
+    return [Structure("time", period, text, min(nats, MAX_NATS), limit)]
 
 
 def beyond_declared(evidence: Evidence, parts: Sequence[Array]) -> list[Structure]:
@@ -355,142 +372,3 @@ def _sums(parts: list[Array]) -> Iterator[tuple[int, Array]]:
     while W == 1 or longest >= W * 8:
         yield W, np.concatenate([_windows(part, W).sum(axis=1) / np.sqrt(W) for part in parts])
         W *= 2
-
-
-HOURS = 3.0  # of a designed recording
-RAMP = 1.0 / 60.0  # K/s of the chamber
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A recording to make, as `loop.json` has it: what it tells apart, and the expected gain."""
-
-    description: str
-    separates: tuple[str, str]
-    expected_gain_nats: float
-
-
-@dataclass(frozen=True)
-class Question:
-    """Two models to tell apart, and their names; the first is what the unit is taken to be."""
-
-    model: Model
-    other: Model
-    names: tuple[str, str]
-
-
-def propose(search: Search, questions: Sequence[Question]) -> tuple[Experiment, ...]:
-    """Return the recording that tells best the two models of each question apart, where one would tell them at all."""
-    if not questions:
-        return ()
-    evidence, basis = search.evidence, search.columns.basis
-    designs = [(text, EffectRegressors(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
-    proposed = []
-    for question in questions:
-        gains = [_separation(search, new, question) for _, new in designs]
-        k = int(np.argmax(gains))
-        if gains[k] > AS_GOOD:
-            proposed.append(Experiment(designs[k][0], question.names, gains[k]))
-    return tuple(proposed)
-
-
-def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
-    """Yield recordings that one can make, as channels over time with what is not moved held at its median."""
-    template = evidence.chunks[0]
-    step = float(np.median(np.diff(template.t)))
-    t = np.arange(1, int(HOURS * 3600 / step) + 1, dtype=np.float64) * step
-    still: dict[str, Array] = {}
-    for name in template.channels:
-        middle = np.median(np.concatenate([chunk[name] for chunk in evidence.chunks]), axis=0)
-        still[name] = np.broadcast_to(middle, (len(t), *np.shape(middle))).copy()
-    if "temperature" in template.channels:
-        T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
-        for text, profile in _profiles(t, float(T.min()), float(T.max())):
-            along = {name: profile for name in still if name.startswith("temperature_")}  # other thermometers go along
-            moved = {"temperature": profile, "temperature_rate": np.asarray(np.gradient(profile, t), dtype=np.float64)}
-            yield text, _chunk(t, still | along | {k: v for k, v in moved.items() if k in still})
-    else:
-        yield f"{HOURS:g} h from switch-on", _chunk(t, still)
-    others = set(auxiliary([template])) - {"temperature"}
-    for name, values in still.items():
-        if name not in others:
-            continue
-        low_v, high_v = np.quantile(np.concatenate([chunk[name] for chunk in evidence.chunks]), [0.02, 0.98], axis=0)
-        up = (t // 900 % 2 == 1).reshape(-1, *[1] * (values.ndim - 1))
-        text = f"{HOURS:g} h at constant temperature with {name} alone moved over its range every 15 min"
-        moved_alone = np.asarray(np.where(up, high_v, low_v), dtype=np.float64)
-        yield text, _chunk(t, still | {name: moved_alone})
-
-
-def _profiles(t: Array, low: float, high: float) -> Iterator[tuple[str, Array]]:
-    """Yield temperatures (N,) over a recording, between the lowest and the highest so far."""
-    middle, part = (low + high) / 2, max((high - low) / 4, 1e-3)
-
-    def swing(about: float, reach: float) -> Array:
-        return about + reach * (2 * np.abs(2 * (t * RAMP / (4 * reach) % 1) - 1) - 1)
-
-    yield f"{HOURS:g} h from switch-on at a constant {middle:.0f} °C", np.full_like(t, middle)
-    yield f"{HOURS:g} h up and down between {low:.0f} and {high:.0f} °C at 1 K/min", swing(middle, 2 * part)
-    between = f"{middle - part:.0f} and {middle + part:.0f}"
-    yield f"{HOURS:g} h up and down between {between} °C at 1 K/min", swing(middle, part)
-    yield f"switch on at {high:.0f} °C and cool to {low:.0f} °C at 1 K/min", np.maximum(high - RAMP * t, low)
-    warm = np.clip(low + RAMP * (t - 3600), low, high)
-    yield f"switch on at {low:.0f} °C, wait 1 h, then warm up to {high:.0f} °C at 1 K/min", warm
-
-
-def _chunk(t: Array, channels: dict[str, Array]) -> Chunk:
-    return Chunk(t, channels, Chunk(t[:1] - (t[1] - t[0]), {name: values[:1] for name, values in channels.items()}))
-
-
-def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
-    """Return a designed recording in rows as long as those of the present ones."""
-    return replace(evidence, records=(Record("designed", False, True, chunk, row_starts(chunk.t, evidence.interval)),))
-
-
-def _separation(search: Search, new: EffectRegressors, question: Question) -> float:
-    """Return by how many nats the second model would fall behind on a designed recording.
-
-    0 where an effect cannot predict the readings on such a recording.
-    """
-    gain = 0.0
-    columns = search.columns
-    for axis, noise in enumerate(search.noises):
-        truth, other = (search.fit(model, axis) for model in (question.model, question.other))
-        try:
-            reading = _predicted(columns, new, question.model, axis, truth.cols) @ truth.beta
-            fitted = _predicted(columns, new, question.other, axis, other.cols)
-        except FusionError:
-            return 0.0
-        old = columns.W[:, np.append(other.cols, columns.y[axis])]
-        left = max(float(np.mean(search.squares.residual(axis, other) ** 2)), 1e-300)
-        ridge = (other.equations.A - columns.gram(search.everything, other.cols)) / left
-        before = _white_equations(search.evidence.split(old), noise).raised(ridge)
-        after = before + _white_equations([np.column_stack([fitted, reading])], noise)
-        gain += 0.5 * max(after.left - before.left, 0.0)
-    return float(gain)
-
-
-def _predicted(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Integers) -> Array:
-    """Return the columns of a fit (n, k) over a designed recording, in the scale of those over the old ones.
-
-    Levels and starts of the old recordings are nothing there, and a memory begins in equilibrium.
-    """
-    effects = [term.effect for term in model]
-    predicted = np.zeros((len(new.evidence), len(cols)))
-    at = len(columns.of_map(effects))
-    predicted[:, :at] = new.raw(new.of_map(effects))
-    at += len(columns.levels)
-    for effect in effects:
-        old, now = columns.of(effect), new.of(effect)
-        for place in old.places[axis]:
-            same = np.flatnonzero(now.places[axis] == place)
-            if len(same):
-                predicted[:, at] = new.raw(now.columns[axis][same])[:, 0]
-            at += 1
-    return np.asarray(predicted / columns.scale[cols])
-
-
-def _white_equations(parts: Sequence[Array], noise: LocalLevel) -> NormalEquations:
-    """Return the normal equations of columns, one (n, k + 1) a recording, made white."""
-    white = np.concatenate(one_step(parts, noise.gain)) / np.sqrt(noise.variance)
-    return NormalEquations.of(white.T @ white)

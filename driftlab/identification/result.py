@@ -102,7 +102,8 @@ def closed(
         verdict = replace(verdict, word="unexplained")
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     others = (remark for remark in remarks if remark not in off)
-    lines = (*untested, *off, *([first] if first else []), *identified.lines, *others)
+    noise = ["what is left looks like noise"] * (verdict.word == "nothing_missing" and not verdict.promising)
+    lines = (*untested, *off, *([first] if first else []), *identified.lines, *noise, *others)
     whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
     return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
 
@@ -363,8 +364,8 @@ def summary(search: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     lines += [f"{name}: the same here as {other}" for name, other in search.same.items() if other not in named]
     lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in search.broken.items()]
     if verdict.word == "nothing_missing":
-        left = "it may be what is named above" if verdict.promising else "what is left looks like noise"
-        lines.append(f"no effect of {search.tried} candidates has enough evidence, and {left}")
+        perhaps = ", and it may be what is named above" * bool(verdict.promising)
+        lines.append(f"no effect of {search.tried} candidates has enough evidence{perhaps}")
     return lines
 
 

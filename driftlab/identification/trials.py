@@ -196,7 +196,7 @@ def _likelihood(search: Search, model: Model, noises: Sequence[LocalLevel]) -> f
     return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
 
 
-class Candidate(NamedTuple):
+class CandidateColumns(NamedTuple):
     """A term that is tried over some segments, with its columns on each axis, and those of its starts there."""
 
     term: Term
@@ -220,12 +220,12 @@ class Tuning:
                 known[key] = fit.equations.explained(G[fit.cols])
             self._explained.append(known[key])
 
-    def candidates(self, terms: Sequence[Term]) -> list[Candidate]:
+    def candidates(self, terms: Sequence[Term]) -> list[CandidateColumns]:
         """Return the terms with their columns."""
         columns, squares = self.squares.columns, self.squares
-        return [Candidate(t, columns.of(t.effect).columns, squares.starts(t, self.segments)) for t in terms]
+        return [CandidateColumns(t, columns.of(t.effect).columns, squares.starts(t, self.segments)) for t in terms]
 
-    def cost(self, candidates: Sequence[Candidate]) -> float:
+    def cost(self, candidates: Sequence[CandidateColumns]) -> float:
         """Return n/2 log of the sum of squares that they leave beside the base, summed over the axes (nats)."""
         if any(one.term.effect.acts_on_input for one in candidates):
             model = (*self.base, *(one.term for one in candidates))
@@ -248,7 +248,7 @@ def best(tuning: Tuning, families: Sequence[Sequence[Term]]) -> tuple[Term, ...]
     choices = [tuning.candidates(terms) for terms in families]
     if len(choices) == 1:
         return (min(choices[0], key=lambda one: tuning.cost((one,))).term,)
-    ends: list[tuple[float, list[Candidate]]] = []
+    ends: list[tuple[float, list[CandidateColumns]]] = []
     for share in (0.15, 0.5, 0.85):
         chosen = [family[int(share * (len(family) - 1))] for family in choices[:-1]]
         chosen.append(min(choices[-1], key=lambda one: tuning.cost((*chosen, one))))

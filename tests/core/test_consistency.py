@@ -42,17 +42,17 @@ def test_whiteness_p_is_uniform_under_white_noise():
     assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-def local_level(seed, declared, N=20_000):
+def local_level(seed, declared, R=1.0, N=20_000):
     """White innovations (N, 1) of a Kalman filter of one state, written out, on a walk of 0.02 under white noise of 1.
 
-    Its steady gain K is that of P = (q + sqrt(q^2 + 4 q)) / 2 before an update, q the variance of the declared step.
+    Its steady gain K is that of P = (q + sqrt(q^2 + 4 q R)) / 2 before an update, q the variance of the declared step.
     """
     rng, q = np.random.default_rng(seed), declared**2
-    b, P = np.cumsum(0.02 * rng.normal(size=N)), (q + np.sqrt(q**2 + 4 * q)) / 2
+    b, P = np.cumsum(0.02 * rng.normal(size=N)), (q + np.sqrt(q**2 + 4 * q * R)) / 2
     y, x, white = b + rng.normal(size=N), b[0], np.empty((N, 1))
     for k in range(N):
-        white[k] = (y[k] - x) / np.sqrt(P + 1)
-        x += P / (P + 1) * (y[k] - x)
+        white[k] = (y[k] - x) / np.sqrt(P + R)
+        x += P / (P + R) * (y[k] - x)
     return white
 
 
@@ -66,10 +66,23 @@ def test_a_walk_that_is_declared_too_small_adds_up_though_no_update_shows_it():
         sums = Whiteness(1)
         for part in np.array_split(white, [1, 20, 6_000, 6_001]):
             sums.add(part)
-        ratio, rows, p = (float(column[0]) for column in sums.slow())
+        ratio, rows, p, square = (float(column[0]) for column in sums.slow())
         assert nis_test(white[:, 0] ** 2, 1).mean < 1.06
         assert p < 1e-6
-        assert (ratio - 1) / rows == pytest.approx(error - P, rel=0.5)
+        assert (ratio - 1) / rows * square * (P + 1) == pytest.approx(error - P, rel=0.5)
+
+
+def test_with_noise_declared_too_large_the_sums_say_the_error_that_there_is():
+    """Nine times the variance: the gain is too small, and the error far below the deviation P that the filter has."""
+    R, q = 9.0, 0.02**2
+    K = (P := (q + np.sqrt(q**2 + 4 * q * R)) / 2) / (P + R)
+    error = K / (2 - K) + 0.02**2 / (K * (2 - K))
+    for seed in range(4):
+        sums = Whiteness(1)
+        sums.add(local_level(seed, 0.02, R))
+        ratio, rows, _, square = (float(column[0]) for column in sums.slow())
+        assert square * (P + (ratio - 1) / rows * (P + R)) == pytest.approx(error, rel=0.4)
+        assert error < 0.6 * P
 
 
 def test_white_innovations_add_up_as_often_as_they_may():

@@ -13,7 +13,7 @@ from driftlab.evaluation.overview import Overview, ScoredRun
 from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
 from driftlab.evaluation.summary import FAR_OFF, jumps, remarks
 from driftlab.filtering.segment import RunLog
-from fusion_core.consistency import NisTest
+from fusion_core.consistency import NisTest, VarianceRatio
 from fusion_core.contracts import Alignment
 from fusion_core.faults import Faults
 from fusion_plugins.measurement_models.zupt import Zupt
@@ -27,7 +27,7 @@ SCORES = Scores(
 QUIET = Overview(
     count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, deviations=(ONES, ONES),
     yardsticks=SCORES,
-    nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, slow=(ONES, ONES, ONES), curves={}, errors={},
+    nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, slow=VarianceRatio(ONES, ONES, ONES, ONES), curves={}, errors={},
     nis_curve=np.zeros((0, 3)), nis_highest=0.0, swing=0.0,
 )  # fmt: skip
 
@@ -57,7 +57,7 @@ def test_innovations_that_add_up_say_by_how_much_sigma_is_too_small():
     """An error of twice its sigma is 4 sigma^2 tau / N^2 of an innovation's square, of which 3 are too much."""
     noise, tau = MODEL.tracked.noise, 0.1
     excess = 3 * ONES**2 * tau / noise**2
-    adding = replace(QUIET, slow=(1 + 100 * excess, np.full(3, 100.0), np.array([1e-9, 0.5, 1e-9])))
+    adding = replace(QUIET, slow=VarianceRatio(1 + 100 * excess, np.full(3, 100.0), np.array([1e-9, 0.5, 1e-9]), ONES))
     (line,) = said(adding, journal())
     assert line.startswith("innovations of gyro x, gyro z add up: over 10 s gyro x has ")
     assert "its sigma is about 2 times too small; measure the walk with `driftlab allan`" in line
@@ -65,8 +65,23 @@ def test_innovations_that_add_up_say_by_how_much_sigma_is_too_small():
 
 def test_what_the_deviations_have_of_the_thermometer_adds_up_and_is_no_walk():
     excess = 3 * ONES**2 * 0.1 / MODEL.tracked.noise**2
-    adding = replace(QUIET, slow=(1 + 100 * excess, np.full(3, 100.0), np.full(3, 1e-9)), deviations=(ONES, 2 * ONES))
+    slow = VarianceRatio(1 + 100 * excess, np.full(3, 100.0), np.full(3, 1e-9), ONES)
+    adding = replace(QUIET, slow=slow, deviations=(ONES, 2 * ONES))
     assert said(adding, journal()) == []
+
+
+def test_noise_that_is_declared_far_too_large_makes_no_sigma_too_small():
+    """Innovations of a ninth of the square that the model says: the error is a third of what they add up to."""
+    excess = 3 * ONES**2 * 0.1 / MODEL.tracked.noise**2
+    slow = VarianceRatio(1 + 100 * excess, np.full(3, 100.0), np.full(3, 1e-9), ONES / 9)
+    assert said(replace(QUIET, slow=slow), journal()) == []
+
+
+@pytest.mark.parametrize(("align", "expected"), [(0.5, 0), (60.0, 1)])
+def test_noise_of_a_few_updates_is_not_told_from_what_is_declared(align, expected):
+    model = MODEL.model_copy(update={"align": align})
+    log = journal(ratio=np.array([1.0, 0.43, 1.0]))
+    assert len(remarks(ScoredRun(Config(), model, log, QUIET, None))) == expected
 
 
 def test_a_quiet_run_has_nothing_to_say():

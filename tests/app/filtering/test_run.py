@@ -198,6 +198,13 @@ def test_never_at_rest_is_an_error():
         go(config(), unit_at_rest(seconds=30))
 
 
+def test_an_alignment_of_too_few_updates_says_so():
+    made = config()
+    short = made.filter.model_copy(update={"align": 5.0, "update_interval": 5.0})
+    with pytest.raises(NotAtRest, match=r"fewer than three updates, which are 5 s apart; set filter.align to 15 s or"):
+        go(made.model_copy(update={"filter": short}), unit_at_rest(seconds=200))
+
+
 def test_temperature_outside_the_domain_names_the_time(maps):
     unit = unit_at_rest(seconds=200, temperature=lambda t: 58 + t / 60)
     bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", "path": maps}}

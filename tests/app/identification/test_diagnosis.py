@@ -11,7 +11,7 @@ from third_parties import registry_of
 
 from driftlab.identification import candidates
 from driftlab.identification.acceptance import CandidateEvidence, fast_evidence
-from driftlab.identification.diagnosis import innovations, judge, structures
+from driftlab.identification.diagnosis import innovations, judge, quick, structures
 from driftlab.identification.least_squares import Term
 from driftlab.identification.search import search
 from driftlab.identification.state import Trial
@@ -41,6 +41,23 @@ def test_what_is_left_is_noise_or_is_not():
     assert quiet == [[]] * 5
     assert all(any("jumps" in s.description for s in seen) for seen in jumping)
     assert all(s.log_likelihood_gain > s.threshold for seen in jumping for s in seen)
+
+
+def test_a_tone_faster_than_any_prediction_is_no_noise():
+    """White noise of 1 beside A sin: a flat spectrum but for its line, of a share A^2 / (2 + A^2) of the whole."""
+    rng, t = np.random.default_rng(3), np.arange(3000) * 4.0
+    noise = [rng.normal(size=(3000, 3)) for _ in range(3)]
+    assert quick(noise, 4.0, "xyz") == []
+    few = quick([part + 0.3 * np.sin(t / 7)[:, None] for part in noise], 4.0, "xyz")
+    assert few == []  # a twentieth of what is left
+    tone = 2.0 * np.sin(2 * np.pi * t / 40 + 1.0)[:, None] * [0, 1, 0]
+    (found,) = quick([part + tone for part in noise], 4.0, "xyz")
+    assert found.time_scale_s == pytest.approx(40, rel=0.01)
+    share = float(found.description.partition("noise, ")[2].partition("%")[0])
+    assert share == pytest.approx(100 * 2 / 3, abs=3)
+    assert found.description.startswith("on y what is left is no noise, ")
+    drifting = 3.0 * np.sin(2 * np.pi * (t / 40 + 5e-7 * t**2))[:, None] * [1, 1, 1]
+    assert len(quick([part + drifting for part in noise], 4.0, "xyz")) == 1
 
 
 def test_the_first_rows_of_a_recording_are_no_jump():

@@ -3,7 +3,7 @@
 from rows_at_rest import PLAY, SLIP, VOLTAGE, evidence, known, search_of
 from third_parties import effect, registry_of
 
-from driftlab.identification.diagnosis import Question, propose
+from driftlab.identification.experiments import Question, propose
 from driftlab.identification.least_squares import Term
 from driftlab.identification.trials import AS_GOOD
 
