@@ -197,9 +197,9 @@ def bounds(
         (v, log_v), v_inside = one.variances, 1 + RATIOS * one.inside
         squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
         n = len(one.V) + free
-        w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
-        cost = n * np.log(w) + squares / w + log_v + free * np.log(v_inside)
-        each_law.append((cost, w * (a + RATIOS * b)))
+        likely = np.maximum(squares, np.finfo(float).tiny) / n  # w (R,)
+        cost = n * (np.log(SCALES) + 1 / SCALES) + (n * np.log(likely) + log_v + free * np.log(v_inside))  # (S, R)
+        each_law.append((cost, SCALES * (likely * (a + RATIOS * b))))
         best = min(best, float(np.min(cost)))
     near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]
     return min(float(np.min(E)) for E in near), max(float(np.max(E)) for E in near)

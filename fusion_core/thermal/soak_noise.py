@@ -71,8 +71,17 @@ class Blocks:
         return _shares(self.of_sample, which, (len(self.T), count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
-        """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples."""
-        return _shares(group, self.of_sample, (count, len(self.T)))
+        """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples.
+
+        The axes of a fit have the same.
+        """
+        if id(group) not in self._shared:
+            self._shared[id(group)] = group, _shares(group, self.of_sample, (count, len(self.T)))
+        return self._shared[id(group)][1]
+
+    @cached_property
+    def _shared(self) -> dict[int, tuple[Integers, csr_array]]:
+        return {}
 
 
 def _shares(group: Integers, part: Integers, shape: tuple[int, int]) -> csr_array:

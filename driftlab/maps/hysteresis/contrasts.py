@@ -20,7 +20,7 @@ Source: J. A. Barnes and S. Jarvis, NBS Technical Note 604 (1971), for flicker n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,19 @@ class FreeCurve:
         return np.asarray(BSpline(self.knots, np.eye(len(self.knots) - 4), 3)(np.clip(T, *self.domain)))
 
 
+@lru_cache(maxsize=2)
+def _laws(t: bytes, span: bytes, recording: bytes) -> tuple[Array, list[Array], tuple[Array, Array]]:
+    """Return roots (K, 1) of spans over their mean, the laws times these, and eigenvalues and -vectors of the walk.
+
+    Once for all units of a line that are soaked for the same times.
+    """
+    blocks = SoakRows(np.frombuffer(t), np.empty(0), np.empty(0), np.frombuffer(span), {})
+    root = np.sqrt(blocks.span / np.mean(blocks.span))[:, None]
+    laws = [root * C * root.T for C in laws_of(blocks, np.frombuffer(recording, dtype=np.int64))]
+    own, V = np.linalg.eigh(laws[0])
+    return root, laws, (own, V)
+
+
 def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
     lasted = float(np.median(blocks.span))
@@ -115,12 +128,12 @@ class SoakContrasts:
         bias = self.blocks.bias
         self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
-        self.root = np.sqrt(self.blocks.span / np.mean(self.blocks.span))[:, None]
+        times = self.blocks.t, self.blocks.span, recording.astype(np.int64)
+        self.root, laws, walk = _laws(*(np.ascontiguousarray(x).tobytes() for x in times))
         self.y = (bias - bias.mean(axis=0)) / self.scale * self.root
         levels = recording[:, None] == np.unique(recording)[1:]
         self.more = levels * self.root
-        laws = [self.root * C * self.root.T for C in laws_of(self.blocks, recording)]
-        self.curve, self.splines = self._curve(soak, laws[0])
+        self.curve, self.splines = self._curve(soak, *walk)
         self.X = np.column_stack([self.splines * self.root, self.more])
         free_of_X = Complement(basis_of(self.X, RANK))
         self.Z = free_of_X.Z
@@ -143,13 +156,13 @@ class SoakContrasts:
         white = soak.white**2 * np.sum(soak.span) / np.sum(soak.count)
         return np.asarray(np.all(len(white) * slope**2 * off[:, None] <= white, axis=1))
 
-    def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
+    def _curve(self, soak: SoakSummary, own: Array, V: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
 
+        `own` (K,) and V (K, K) are the eigenvalues and eigenvectors of the walk.
         By Akaike's information criterion, from few knots on, as long as twice as many are better: a curve that is too
         stiff leaves more than one that is too free takes.
         """
-        own, V = np.linalg.eigh(walk)
         weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
         y, more, best = V.T @ self.y, V.T @ self.more, np.inf
         chosen: list[tuple[FreeCurve, Array]] = []
@@ -261,7 +274,8 @@ class SoakContrasts:
     def late(self, inputs: Array) -> tuple[Array, Array]:
         """Return the splines where the curve sees inputs (S, J): of slots (J, S, p), and X of the blocks (J, K, P)."""
         there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
-        return there, np.stack([np.column_stack([self.means(one) * self.root, self.more]) for one in there])
+        late = self.means(there.swapaxes(0, 1)).swapaxes(0, 1) * self.root
+        return there, np.concatenate([late, np.broadcast_to(self.more, (*late.shape[:2], self.more.shape[1]))], axis=2)
 
     def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
         """Return the bias that is added where the curve sees other temperatures (S, J).
@@ -359,13 +373,13 @@ class SoakContrasts:
         They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.
         """
         some, other = np.triu_indices(ways.shape[2])
-        each = []
+        ways, y, each = ways.swapaxes(1, 2), y.swapaxes(1, 2), []  # shapes last: whole rows are multiplied
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
             turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
-            products = turned[:, :, some] * turned[:, :, other], turned[..., None] * u[:, :, None], u**2
+            products = turned[:, some] * turned[:, other], turned[:, :, None] * u[:, None], u**2
             each.append([(w @ x.reshape(len(u), -1)).reshape(len(w), *x.shape[1:]) for x in products])
-        flat, B, Q = map(np.concatenate, zip(*each, strict=True))
+        flat, B, Q = (np.moveaxis(np.concatenate(parts), -1, 1) for parts in zip(*each, strict=True))
         gram = np.empty((*flat.shape[:2], *B.shape[2:3] * 2))
         gram[:, :, some, other] = gram[:, :, other, some] = flat
         return gram, B, Q
