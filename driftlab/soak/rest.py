@@ -129,9 +129,11 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
     others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
     cutting = _Cutting(config, model, others, used)
-    moved = False
+    moved, checked = False, set[str]()
     for window in _windows(stream, model.align):
-        check_channels(model, window)
+        if window.channels.keys() != checked:
+            check_channels(model, window)
+            checked = set(window.channels)
         used.note(window["temperature"])
         refused = len(window)
         for part in cutting.parts(window):

@@ -8,6 +8,7 @@ themselves, or of what a smooth curve leaves of them, as steep as a bias may be 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import cos, sin, sqrt
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * root / sensor.noise
         scatter = _median(away) / 0.6745
-        level = np.all(scatter <= FAR_BEYOND) and np.all(away <= OUTLIER * np.maximum(scatter, 1.0))
+        level = (scatter <= FAR_BEYOND).all() and (away <= OUTLIER * np.maximum(scatter, 1.0)).all()
         if not (level or _follows_temperature(window, sensor)):
             return False
     return True
@@ -162,14 +163,14 @@ def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
     s and c the vertical and the level part of the Earth's rate.
     """
     assert site.latitude is not None
-    rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * np.sin(site.latitude), RATE * np.cos(site.latitude)
+    rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * sin(site.latitude), RATE * cos(site.latitude)
     if site.heading is None:
         return rate, np.asarray(abs(s) * np.sqrt(np.maximum(1 - up**2, 0.0)))
-    sin, cos = np.sin(site.heading), np.cos(site.heading)
-    level = np.sqrt(1 - up[0] ** 2)
-    X, Y = np.array([level, -up[0] * up[1] / level, -up[0] * up[2] / level]), np.array([0.0, up[2], -up[1]]) / level
-    along = s * X - c * cos * up
-    across = s * Y + c * (up[0] / level * (sin * X - cos * Y) - sin * up)
+    east, north, (x, y, z) = sin(site.heading), cos(site.heading), up.tolist()
+    level = sqrt(1 - x**2)
+    X, Y = np.array([level, -x * y / level, -x * z / level]), np.array([0.0, z / level, -y / level])
+    along = s * X - c * north * up
+    across = s * Y + c * (x / level * (east * X - north * Y) - east * up)
     return rate, np.asarray(np.sqrt(along**2 + across**2))
 
 
@@ -186,6 +187,6 @@ def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
         if len(values) < 2:
             ratios[sensor.channel] = np.ones(values.shape[1])
             continue
-        spread = (values[1:] - values[:-1]) / root
-        ratios[sensor.channel] = np.sqrt(np.mean(spread**2, axis=0)) / sensor.noise
+        squares = np.square((values[1:] - values[:-1]) / root)
+        ratios[sensor.channel] = np.sqrt(np.add.reduce(squares) / len(squares)) / sensor.noise
     return ratios

@@ -272,9 +272,9 @@ class SoakContrasts:
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
     def late(self, inputs: Array) -> tuple[Array, Array]:
-        """Return the splines where the curve sees inputs (S, J): of slots (J, S, p), and X of the blocks (J, K, P)."""
-        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
-        late = self.means(there.swapaxes(0, 1)).swapaxes(0, 1) * self.root
+        """Return the splines where the curve sees inputs (S, J): of slots (S, J, p), and X of the blocks (J, K, P)."""
+        there = self.curve(inputs.ravel()).reshape(*inputs.shape, -1)
+        late = self.means(there).swapaxes(0, 1) * self.root
         return there, np.concatenate([late, np.broadcast_to(self.more, (*late.shape[:2], self.more.shape[1]))], axis=2)
 
     def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
@@ -295,9 +295,9 @@ class SoakContrasts:
         regressors = self.Z.T @ late  # (J, m, P)
         each = [self.curves_under(int(noise), axis, late, regressors) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
-        here, p = self.curve(self.soak.T), self.splines.shape[1]
-        there -= here
-        slots = np.stack([one @ bent[:p] for one in there], axis=1)
+        p = self.splines.shape[1]
+        there -= self.curve(self.soak.T)[:, None]
+        slots = there @ bent[:p]
         J, d = slots.shape[1:]
         whole = np.einsum("jmp,pjd->mjd", regressors, curves)
         open_ = (regressors @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
@@ -306,7 +306,7 @@ class SoakContrasts:
         part, parts = self.parts(regressors[:, :, :p] @ smooth, int(noises[0]))
         likelier = log_mean(part) > log_mean(followed)
         coefficients = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
-        added = np.stack([one @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
+        added = (there.swapaxes(0, 1) @ coefficients).swapaxes(0, 1)
         following = FollowingCurves(coefficients, likelier, added, late[:, :, :p])
         return slots, self.of(slots), np.stack([followed, part]), following
 
@@ -373,7 +373,9 @@ class SoakContrasts:
         They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.
         """
         some, other = np.triu_indices(ways.shape[2])
-        ways, y, each = ways.swapaxes(1, 2), y.swapaxes(1, 2), []  # shapes last: whole rows are multiplied
+        # shapes last: whole rows are multiplied
+        ways, y = (np.ascontiguousarray(x.swapaxes(1, 2)) for x in (ways, y))
+        each = []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
             turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
@@ -414,6 +416,6 @@ def log_mean(x: Array) -> Array:
 
 def _cost(X: Array, y: Array) -> Array:
     """Return - 2 log-likelihood (d,) of y (K, d) about the best of X (K, p), white noise of any size."""
-    q = np.linalg.qr(X)[0]
-    left = np.maximum(np.sum(y**2, axis=0) - np.sum((q.T @ y) ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
+    R = np.linalg.qr(np.hstack([X, y]), mode="r")
+    left = np.maximum(np.sum(R[X.shape[1] :, X.shape[1] :] ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
     return np.asarray(len(y) * np.log(np.maximum(left, 1e-300)))

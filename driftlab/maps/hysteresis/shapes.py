@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,9 +168,13 @@ class Sweeps:
         self.up = np.array(up, dtype=bool)
         self.shown = np.array(shown).reshape(len(up), GRID, sum(part.shape[1] for part in values), d)
 
+    @cached_property
+    def _extremes(self) -> tuple[Array, Array]:
+        return _extremes(self.shown, self.up)
+
     def openings(self) -> tuple[Array, Array]:
         """Return the opening of each shape (J, d), warming less cooling, and at which temperature it is (J, d)."""
-        most, least = _extremes(self.shown, self.up)
+        most, least = self._extremes
         wide = np.where(np.abs(most) >= np.abs(least), most, least)
         known = np.isfinite(wide)
         at = np.argmax(np.where(known, np.abs(wide), 0.0), axis=0)
@@ -177,7 +182,7 @@ class Sweeps:
 
     def both_ways(self) -> NDArray[np.bool_]:
         """Return the shapes (J, d) that open almost as far the other way: a curve that bends has no sign."""
-        most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(self.shown, self.up))
+        most, least = (np.where(np.isfinite(one), one, 0.0) for one in self._extremes)
         sides = np.stack([np.max(most, axis=0), -np.min(least, axis=0)])
         return np.asarray(np.min(sides, axis=0) > OTHER * np.max(sides, axis=0))
 
@@ -188,16 +193,15 @@ class Sweeps:
         gradient = shown[above, g] - shown[below, g]
         return float(gradient @ coefficients), gradient
 
-    def widest(self, together: Array) -> tuple[int, int, int]:
-        """Return between which sweeps, up and down, and where on T something shown (W, G) opens most."""
-        most, least = _extremes(together, self.up)
-        wide = np.where(np.isfinite(most), most, 0.0), np.where(np.isfinite(least), least, 0.0)
-        sign = 1 if np.max(wide[0]) >= -np.min(wide[1]) else -1
-        g = int(np.argmax(wide[0]) if sign > 0 else np.argmin(wide[1]))
-        signed = np.where(np.isnan(together[:, g]), -np.inf, sign * together[:, g])
-        above = int(np.argmax(np.where(self.up, signed, -np.inf)))
-        signed = np.where(np.isnan(together[:, g]), np.inf, sign * together[:, g])
-        return above, int(np.argmin(np.where(self.up, np.inf, signed))), g
+    def widest(self, together: Array) -> tuple[Integers, Integers, Integers]:
+        """Return between which sweeps, up and down, and where on T each thing shown (W, G, ...) opens most."""
+        most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(together, self.up))
+        most_of_all = np.max(most, axis=0) >= -np.min(least, axis=0)
+        g = np.where(most_of_all, np.argmax(most, axis=0), np.argmin(least, axis=0))
+        there = np.take_along_axis(together, g[None, None], axis=1)[:, 0]
+        signed, up = np.where(most_of_all, there, -there), self.up.reshape(-1, *[1] * (there.ndim - 1))
+        above = np.argmax(np.where(up & ~np.isnan(there), signed, -np.inf), axis=0)
+        return above, np.argmin(np.where(up | np.isnan(there), np.inf, signed), axis=0), g
 
     def mean_differences(self) -> Array:
         """Return warming less cooling in the mean over the sweeps (G, J, d); NaN where one of the two is missing."""
