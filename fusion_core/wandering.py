@@ -103,22 +103,26 @@ class BiasMeans:
             *(BiasWalk(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds)),
         ]
 
-    @cached_property
+    @property
     def covariances(self) -> list[Array]:
         """The covariance (K, K) of the rows by each law."""
-        return self._of_means(self.t, self.lasted)
+        return _of_laws(self.t.tobytes(), self.lasted, self.size)[0]
 
-    @cached_property
+    @property
     def inside(self) -> list[float]:
         """The variance of averages about their row by each law."""
-        n, step = self.size, self.lasted / self.size
-        if n < 2:
-            return [0.0] * len(self.laws)
-        covariances = self._of_means(self.t[0] + step * (np.arange(n) - (n - 1) / 2), step)
-        return [float(np.trace(C) - np.mean(C) * n) / (n - 1) for C in covariances]
+        return _of_laws(self.t.tobytes(), self.lasted, self.size)[1]
 
-    def _of_means(self, t: Array, lasted: float) -> list[Array]:
-        return [law.covariance(t, lasted) for law in self.laws]
+
+@lru_cache(maxsize=8)
+def _of_laws(t: bytes, lasted: float, size: int) -> tuple[list[Array], list[float]]:
+    """Return the covariances of rows and the variances inside: once for all recordings of a line that are as long."""
+    rows, step = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), 0), lasted / size
+    covariances = [law.covariance(rows.t, lasted) for law in rows.laws]
+    if size < 2:
+        return covariances, [0.0] * len(covariances)
+    within = [law.covariance(rows.t[0] + step * (np.arange(size) - (size - 1) / 2), step) for law in rows.laws]
+    return covariances, [float(np.trace(C) - np.mean(C) * size) / (size - 1) for C in within]
 
 
 def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:

@@ -267,8 +267,9 @@ class SoakContrasts:
         left = free * (one - gain @ again)
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
         half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        shown = np.sqrt(w)[:, None] * (V.T @ regressors) @ half
-        most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
+        turned = _turned(V, regressors)
+        shown = np.swapaxes(half, 1, 2) @ (np.swapaxes(turned * w[:, None], 1, 2) @ turned) @ half
+        most = np.linalg.eigh(shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
     def late(self, inputs: Array) -> tuple[Array, Array]:
@@ -292,7 +293,7 @@ class SoakContrasts:
             The likelier of the two.
         """
         there, late = self.late(inputs)
-        regressors = self.Z.T @ late  # (J, m, P)
+        regressors = _turned(self.Z, late)  # (J, m, P)
         each = [self.curves_under(int(noise), axis, late, regressors) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
         p = self.splines.shape[1]
@@ -342,8 +343,8 @@ class SoakContrasts:
         in units in which what is shown most has g, one of SIZES: Zellner's prior of a whole curve.
         """
         w, V = self.under(noise)
-        white = np.sqrt(w)[:, None] * (V.T @ shown)
-        most = np.linalg.eigh(np.swapaxes(white, 1, 2) @ white)[1][:, :, -PARTS:]
+        turned = _turned(V, shown)
+        most = np.linalg.eigh(np.swapaxes(turned * w[:, None], 1, 2) @ turned)[1][:, :, -PARTS:]
         gram, B, Q = self._products(self.u[:, None], np.moveaxis(shown @ most, 0, 1))
         size, along = np.linalg.eigh(gram)
         size = np.maximum(size, FINEST * size[..., -1:] + TINY)
@@ -396,6 +397,12 @@ class SoakContrasts:
         thin = np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         log_w = self.log_w[thin, None]
         return np.asarray((log_w - log_size / 2)[..., None] - len(self.u) / 2 * np.log(left))
+
+
+def _turned(V: Array, x: Array) -> Array:
+    """Return V' x (J, m, p) of V (K, m) and x (J, K, p), by one product of matrices."""
+    J, K, p = x.shape
+    return np.ascontiguousarray((V.T @ x.swapaxes(0, 1).reshape(K, J * p)).reshape(-1, J, p).swapaxes(0, 1))
 
 
 def _of_drift(C: Array, Z: Array) -> tuple[Array, Array]:
