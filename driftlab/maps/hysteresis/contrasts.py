@@ -423,6 +423,6 @@ def log_mean(x: Array) -> Array:
 
 def _cost(X: Array, y: Array) -> Array:
     """Return - 2 log-likelihood (d,) of y (K, d) about the best of X (K, p), white noise of any size."""
-    R = np.linalg.qr(np.hstack([X, y]), mode="r")
+    R = np.asarray(np.linalg.qr(np.hstack([X, y]), mode="r"))
     left = np.maximum(np.sum(R[X.shape[1] :, X.shape[1] :] ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
     return np.asarray(len(y) * np.log(np.maximum(left, 1e-300)))
