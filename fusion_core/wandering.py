@@ -118,11 +118,9 @@ class BiasMeans:
 def _of_laws(t: bytes, lasted: float, size: int) -> tuple[list[Array], list[float]]:
     """Return the covariances of rows and the variances inside: once for all recordings of a line that are as long."""
     rows, step = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), 0), lasted / size
-    covariances = [law.covariance(rows.t, lasted) for law in rows.laws]
-    if size < 2:
-        return covariances, [0.0] * len(covariances)
-    within = [law.covariance(rows.t[0] + step * (np.arange(size) - (size - 1) / 2), step) for law in rows.laws]
-    return covariances, [float(np.trace(C) - np.mean(C) * size) / (size - 1) for C in within]
+    within = rows.t[0] + step * (np.arange(size) - (size - 1) / 2)
+    covariances, inside = ([law.covariance(*of) for law in rows.laws] for of in ((rows.t, lasted), (within, step)))
+    return covariances, [float(np.trace(C) - np.mean(C) * size) / max(size - 1, 1) for C in inside]
 
 
 def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:

@@ -59,5 +59,4 @@ def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array
         x_level /= length
     (a, b, c), (x, y, z) = up.tolist(), x_level.tolist()
     across = np.array([b * z - c * y, c * x - a * z, a * y - b * x])  # up x x_level
-    north = math.cos(heading) * x_level + math.sin(heading) * across
-    return np.asarray(vertical + RATE * math.cos(latitude) * north)
+    return np.asarray(vertical + RATE * math.cos(latitude) * (math.cos(heading) * x_level + math.sin(heading) * across))

@@ -129,11 +129,10 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
     others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
     cutting = _Cutting(config, model, others, used)
-    moved, checked = False, set[str]()
+    moved = False
     for window in _windows(stream, model.align):
-        if window.channels.keys() != checked:
+        if not noise:  # a recording has the same channels from its beginning to its end
             check_channels(model, window)
-            checked = set(window.channels)
         used.note(window["temperature"])
         refused = len(window)
         for part in cutting.parts(window):
@@ -144,8 +143,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             if placing is not None:
                 alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])
             moved = False
-            known = model.known(part, alignment)
-            number = 0 if placing is None else placing.number
+            known, number = model.known(part, alignment), 0 if placing is None else placing.number
             used.epochs += len(part)
             yield RestStretch(float(part.t[-1]), part["temperature"], part[channel] - known, known, number, part)
         if refused:

@@ -99,10 +99,9 @@ class CurveError(Frozen):
         return self
 
     @cached_property
-    def _arrays(self) -> tuple[Array, Array, Array]:
-        """The grid (G,), the modes (r, G, d) and their differences: what is asked for often is made of tuples once."""
-        modes = np.asarray(self.modes, dtype=np.float64)
-        return np.asarray(self.T, dtype=np.float64), modes, np.diff(modes, axis=1) if modes.size else modes
+    def _arrays(self) -> tuple[Array, Array]:
+        """The grid (G,) and the modes (r, G, d): what is asked for often is made of tuples once."""
+        return np.asarray(self.T, dtype=np.float64), np.asarray(self.modes, dtype=np.float64)
 
     def variance(self, T: ArrayLike, T_0: float | None = None) -> Array:
         """Return the variance (N, d) of the error at T (N,), or of its difference from that at T_0."""
@@ -122,10 +121,10 @@ class CurveError(Frozen):
         d = len(self.bend)
         if not self.modes:
             return np.zeros((0, len(T), d))
-        grid, values, differences = self._arrays
+        grid, values = self._arrays
         k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
         share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
-        return np.asarray(values[:, k] + differences[:, k] * share)
+        return np.asarray(values[:, k] + (values[:, k + 1] - values[:, k]) * share)
 
     def _beyond(self, T: Array) -> Array:
         x = np.maximum(np.maximum(self.T[0] - T, T - self.T[-1]), 0.0)

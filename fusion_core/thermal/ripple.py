@@ -63,20 +63,16 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
         if len(products) < TRIPLES:
             continue
         total, scatter = products.sum(axis=0), np.sqrt(np.sum(products**2, axis=0))
-        dips = _dips(ways[:, inner], noise[:, inner], where[inner], cell)
-        for axis, dip in enumerate(dips):
+        for axis, dip in enumerate(_dips(ways[:, inner], noise[:, inner], where[inner], cell)):
             seen = None
             if total[axis] > least * scatter[axis]:
                 rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
                 most = float(where[third][int(np.argmax(products[:, axis]))])
                 seen = Ripple(float(rms), float(chance), most, cell)
             # what repeats from cell to cell is everywhere, and a dip is not
-            found[axis] = max((one for one in (found[axis], dip, seen) if one is not None), key=_rank, default=None)
+            found[axis] = max((one for one in (found[axis], dip, seen) if one is not None), default=None,
+                              key=lambda one: (not one.dip, one.rms))  # fmt: skip
     return found
-
-
-def _rank(one: Ripple) -> tuple[bool, float]:
-    return not one.dip, one.rms
 
 
 def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Array, Integers]:
@@ -113,8 +109,7 @@ def _dips(ways: Array, noise: Array, where: Array, cell: float) -> list[Ripple |
     for axis, k in enumerate(np.argmax(beyond, axis=0)):
         if beyond[k, axis] > NARROW:
             chance = float(np.sqrt(np.mean((usual[:, axis] * noise[:, k]) ** 2) / 2))
-            depth = abs(float(np.mean(ways[:, k, axis])))
-            found[axis] = Ripple(depth, chance, float(where[k]), cell, dip=True)
+            found[axis] = Ripple(abs(float(np.mean(ways[:, k, axis]))), chance, float(where[k]), cell, dip=True)
     return found
 
 

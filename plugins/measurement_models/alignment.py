@@ -85,11 +85,6 @@ def _median(values: Array) -> Array:
     return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
-def _mean(values: Array) -> Array:
-    """Return the mean (d,) of values (N, d): NumPy's own takes twice as long over so few."""
-    return np.asarray(np.add.reduce(values) / len(values))
-
-
 def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked: str = "gyro") -> Alignment:
     """Freeze the reference from the epochs of a stretch at rest.
 
@@ -102,7 +97,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     inputs: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     if accel is not None:
-        f = _mean(window[accel.channel])
+        f = np.add.reduce(window[accel.channel]) / len(window)
         up = f / sqrt(f @ f)
         inputs[accel.channel] = gravity(site.latitude) * up
     if accel is not None and up is not None and site.latitude is not None:
@@ -122,7 +117,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
 def check_gravity(window: Chunk, site: Site) -> None:
     """Raise BadValue where what the accelerometers show at rest cannot be gravity: a unit that is not theirs."""
     expected = gravity(site.latitude)
-    measured = hypot(*_mean(window["accel"]).tolist())
+    measured = hypot(*(np.add.reduce(window["accel"]) / len(window)).tolist())
     if not abs(measured / expected - 1) < FAR_FROM_GRAVITY:
         raise BadValue(
             f"accel: shows {measured:.4g} m/s^2 at rest, {expected:.4g} was expected; "
@@ -171,8 +166,7 @@ def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
     rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * sin(site.latitude), RATE * cos(site.latitude)
     if site.heading is None:
         return rate, np.asarray(abs(s) * np.sqrt(np.maximum(1 - up**2, 0.0)))
-    east, north, (x, y, z) = sin(site.heading), cos(site.heading), up.tolist()
-    level = sqrt(1 - x**2)
+    east, north, (x, y, z), level = sin(site.heading), cos(site.heading), up.tolist(), sqrt(1 - up[0] ** 2)
     X, Y = np.array([level, -x * y / level, -x * z / level]), np.array([0.0, z / level, -y / level])
     along = s * X - c * north * up
     across = s * Y + c * (x / level * (east * X - north * Y) - east * up)
@@ -192,5 +186,6 @@ def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
         if len(values) < 2:
             ratios[sensor.channel] = np.ones(values.shape[1])
             continue
-        ratios[sensor.channel] = np.sqrt(_mean(np.square((values[1:] - values[:-1]) / root))) / sensor.noise
+        squares = np.add.reduce(np.square((values[1:] - values[:-1]) / root)) / len(root)
+        ratios[sensor.channel] = np.sqrt(squares) / sensor.noise
     return ratios

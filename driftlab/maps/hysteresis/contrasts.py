@@ -80,9 +80,8 @@ def _laws(t: bytes, span: bytes, recording: bytes) -> tuple[Array, list[Array], 
     """
     blocks = SoakRows(np.frombuffer(t), np.empty(0), np.empty(0), np.frombuffer(span), {})
     root = np.sqrt(blocks.span / np.mean(blocks.span))[:, None]
-    laws = [root * C * root.T for C in laws_of(blocks, np.frombuffer(recording, dtype=np.int64))]
-    own, V = np.linalg.eigh(laws[0])
-    return root, laws, (own, V)
+    laws = [root * C * root.T for C in laws_of(blocks, np.frombuffer(recording, np.int64))]
+    return root, laws, np.linalg.eigh(laws[0])
 
 
 def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:
@@ -128,8 +127,7 @@ class SoakContrasts:
         bias = self.blocks.bias
         self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
-        times = self.blocks.t, self.blocks.span, recording.astype(np.int64)
-        self.root, laws, walk = _laws(*(np.ascontiguousarray(x).tobytes() for x in times))
+        self.root, laws, walk = _laws(self.blocks.t.tobytes(), self.blocks.span.tobytes(), recording.tobytes())
         self.y = (bias - bias.mean(axis=0)) / self.scale * self.root
         levels = recording[:, None] == np.unique(recording)[1:]
         self.more = levels * self.root
@@ -267,16 +265,14 @@ class SoakContrasts:
         left = free * (one - gain @ again)
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
         half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        turned = _turned(V, regressors)
-        shown = np.swapaxes(half, 1, 2) @ (np.swapaxes(turned * w[:, None], 1, 2) @ turned) @ half
-        most = np.linalg.eigh(shown)[1][:, :, -RANKS:]
+        shown = np.sqrt(w)[:, None] * _turned(V, regressors) @ half
+        most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
     def late(self, inputs: Array) -> tuple[Array, Array]:
         """Return the splines where the curve sees inputs (S, J): of slots (S, J, p), and X of the blocks (J, K, P)."""
         there = self.curve(inputs.ravel()).reshape(*inputs.shape, -1)
-        late = self.means(there).swapaxes(0, 1) * self.root
-        return there, np.concatenate([late, np.broadcast_to(self.more, (*late.shape[:2], self.more.shape[1]))], axis=2)
+        return there, np.stack([np.hstack([one * self.root, self.more]) for one in self.means(there).swapaxes(0, 1)])
 
     def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
         """Return the bias that is added where the curve sees other temperatures (S, J).
@@ -296,8 +292,7 @@ class SoakContrasts:
         regressors = _turned(self.Z, late)  # (J, m, P)
         each = [self.curves_under(int(noise), axis, late, regressors) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
-        p = self.splines.shape[1]
-        there -= self.curve(self.soak.T)[:, None]
+        there, p = there - self.curve(self.soak.T)[:, None], self.splines.shape[1]
         slots = there @ bent[:p]
         J, d = slots.shape[1:]
         whole = np.einsum("jmp,pjd->mjd", regressors, curves)
@@ -375,8 +370,7 @@ class SoakContrasts:
         """
         some, other = np.triu_indices(ways.shape[2])
         # shapes last: whole rows are multiplied
-        ways, y = (np.ascontiguousarray(x.swapaxes(1, 2)) for x in (ways, y))
-        each = []
+        ways, y, each = *(np.ascontiguousarray(x.swapaxes(1, 2)) for x in (ways, y)), []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
             turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
@@ -401,8 +395,7 @@ class SoakContrasts:
 
 def _turned(V: Array, x: Array) -> Array:
     """Return V' x (J, m, p) of V (K, m) and x (J, K, p), by one product of matrices."""
-    J, K, p = x.shape
-    return np.ascontiguousarray((V.T @ x.swapaxes(0, 1).reshape(K, J * p)).reshape(-1, J, p).swapaxes(0, 1))
+    return np.ascontiguousarray(np.tensordot(V, x, axes=(0, 1)).swapaxes(0, 1))
 
 
 def _of_drift(C: Array, Z: Array) -> tuple[Array, Array]:

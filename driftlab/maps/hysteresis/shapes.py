@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,13 +167,9 @@ class Sweeps:
         self.up = np.array(up, dtype=bool)
         self.shown = np.array(shown).reshape(len(up), GRID, sum(part.shape[1] for part in values), d)
 
-    @cached_property
-    def _extremes(self) -> tuple[Array, Array]:
-        return _extremes(self.shown, self.up)
-
     def openings(self) -> tuple[Array, Array]:
         """Return the opening of each shape (J, d), warming less cooling, and at which temperature it is (J, d)."""
-        most, least = self._extremes
+        most, least = _extremes(self.shown, self.up)
         wide = np.where(np.abs(most) >= np.abs(least), most, least)
         known = np.isfinite(wide)
         at = np.argmax(np.where(known, np.abs(wide), 0.0), axis=0)
@@ -182,7 +177,7 @@ class Sweeps:
 
     def both_ways(self) -> NDArray[np.bool_]:
         """Return the shapes (J, d) that open almost as far the other way: a curve that bends has no sign."""
-        most, least = (np.where(np.isfinite(one), one, 0.0) for one in self._extremes)
+        most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(self.shown, self.up))
         sides = np.stack([np.max(most, axis=0), -np.min(least, axis=0)])
         return np.asarray(np.min(sides, axis=0) > OTHER * np.max(sides, axis=0))
 
