@@ -103,22 +103,24 @@ class BiasMeans:
             *(BiasWalk(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds)),
         ]
 
-    @cached_property
+    @property
     def covariances(self) -> list[Array]:
         """The covariance (K, K) of the rows by each law."""
-        return self._of_means(self.t, self.lasted)
+        return _of_laws(self.t.tobytes(), self.lasted, self.size)[0]
 
-    @cached_property
+    @property
     def inside(self) -> list[float]:
         """The variance of averages about their row by each law."""
-        n, step = self.size, self.lasted / self.size
-        if n < 2:
-            return [0.0] * len(self.laws)
-        covariances = self._of_means(self.t[0] + step * (np.arange(n) - (n - 1) / 2), step)
-        return [float(np.trace(C) - np.mean(C) * n) / (n - 1) for C in covariances]
+        return _of_laws(self.t.tobytes(), self.lasted, self.size)[1]
 
-    def _of_means(self, t: Array, lasted: float) -> list[Array]:
-        return [law.covariance(t, lasted) for law in self.laws]
+
+@lru_cache(maxsize=8)
+def _of_laws(t: bytes, lasted: float, size: int) -> tuple[list[Array], list[float]]:
+    """Return the covariances of rows and the variances inside: once for all recordings of a line that are as long."""
+    rows, step = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), 0), lasted / size
+    within = rows.t[0] + step * (np.arange(size) - (size - 1) / 2)
+    covariances, inside = ([law.covariance(*of) for law in rows.laws] for of in ((rows.t, lasted), (within, step)))
+    return covariances, [float(np.trace(C) - np.mean(C) * size) / max(size - 1, 1) for C in inside]
 
 
 def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:
@@ -197,9 +199,9 @@ def bounds(
         (v, log_v), v_inside = one.variances, 1 + RATIOS * one.inside
         squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
         n = len(one.V) + free
-        w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
-        cost = n * np.log(w) + squares / w + log_v + free * np.log(v_inside)
-        each_law.append((cost, w * (a + RATIOS * b)))
+        likely = np.maximum(squares, np.finfo(float).tiny) / n  # w (R,)
+        cost = n * (np.log(SCALES) + 1 / SCALES) + (n * np.log(likely) + log_v + free * np.log(v_inside))  # (S, R)
+        each_law.append((cost, SCALES * (likely * (a + RATIOS * b))))
         best = min(best, float(np.min(cost)))
     near = [E[cost <= np.min(cost) + REACH] for cost, E in each_law if np.min(cost) <= best + UNLIKELY]
     return min(float(np.min(E)) for E in near), max(float(np.max(E)) for E in near)

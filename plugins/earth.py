@@ -5,6 +5,8 @@ WGS 84: National Geospatial-Intelligence Agency, NGA.STND.0036 (2014), tables 3.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusion_core.chunk import Array
@@ -12,15 +14,14 @@ from fusion_core.errors import ConfigError
 
 RATE = 7.292115e-5  # rad/s
 STANDARD_GRAVITY = 9.80665  # m/s^2
-NEXT, LAST = [1, 2, 0], [2, 0, 1]  # axes of a cross product
 
 
 def gravity(latitude: float | None) -> float:
     """Return the magnitude of gravity on the ellipsoid in m/s^2; the standard value without a latitude (rad)."""
     if latitude is None:
         return STANDARD_GRAVITY
-    s2 = np.sin(latitude) ** 2
-    return float(9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2))
+    s2 = math.sin(latitude) ** 2
+    return 9.7803253359 * (1 + 0.00193185265241 * s2) / math.sqrt(1 - 0.00669437999014 * s2)
 
 
 def known_gravity(latitude: float | None) -> tuple[float, float]:
@@ -47,15 +48,15 @@ def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array
     ConfigError
         If a heading is given, `x_level` is not, and the x axis is vertical.
     """
-    vertical: Array = RATE * np.sin(latitude) * up
+    vertical: Array = RATE * math.sin(latitude) * up
     if heading is None:
         return vertical
     if x_level is None:
         x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
-        length = np.sqrt(x_level @ x_level)
+        length = math.sqrt(x_level @ x_level)
         if length < 1e-3:
             raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
         x_level /= length
-    across = up[NEXT] * x_level[LAST] - up[LAST] * x_level[NEXT]  # up x x_level
-    north = np.cos(heading) * x_level + np.sin(heading) * across
-    return np.asarray(vertical + RATE * np.cos(latitude) * north)
+    (a, b, c), (x, y, z) = up.tolist(), x_level.tolist()
+    across = np.array([b * z - c * y, c * x - a * z, a * y - b * x])  # up x x_level
+    return np.asarray(vertical + RATE * math.cos(latitude) * (math.cos(heading) * x_level + math.sin(heading) * across))

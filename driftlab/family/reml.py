@@ -435,8 +435,7 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) ->
     def cost(numbers: Array) -> tuple[float, Array]:
         """Return - log p of the module's text, a draw, and its derivatives."""
         nu, (Psi, by_numbers) = len(peaks) + 6.0, smooth(peaks, numbers)
-        own, inverse = _log_det(nu * Psi)
-        with_units, inverse_with = _log_det(nu * Psi + scatter)
+        (own, with_units), (inverse, inverse_with) = _log_det(np.stack([nu * Psi, nu * Psi + scatter]))
         slope = nu / 2 * ((nu + count) * inverse_with - nu * inverse)
         value = ((nu + count) * with_units - nu * own) / 2
         return value / count, by_numbers.reshape(5, -1) @ slope.ravel() / count
@@ -446,16 +445,17 @@ def likeliest_prior(peaks: Array, scatter: Array, count: float, start: Array) ->
     return best
 
 
-def _log_det(matrix: Array) -> tuple[float, Array]:
-    """Return the logarithm of the determinant of a covariance (q, q), and its inverse.
+def _log_det(matrices: Array) -> tuple[Array, Array]:
+    """Return the logarithms of the determinants (n,) of covariances (n, q, q), and their inverses.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If it is none.
     """
-    scale = np.sqrt(np.diag(matrix))
-    inverses, pivots = _swept((matrix / np.outer(scale, scale))[None])
+    scale = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    both = scale[:, :, None] * scale[:, None]
+    inverses, pivots = _swept(matrices / both)
     if not np.all(pivots > 0):
         raise np.linalg.LinAlgError("a covariance has an eigenvalue of zero or less")
-    return float(np.sum(np.log(pivots)) + 2 * np.sum(np.log(scale))), inverses[0] / np.outer(scale, scale)
+    return np.sum(np.log(pivots), axis=1) + 2 * np.sum(np.log(scale), axis=1), inverses / both

@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from driftlab.family.basis import SplineBasis
 from driftlab.soak.blocks import SoakRows
 from fusion_core.budget import arrays_in
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +127,10 @@ class UnitInformation:
         return file.getvalue()
 
     @classmethod
+    @lru_cache(maxsize=64)  # a small family is read again for each of its stages
     def from_bytes(cls, content: bytes) -> UnitInformation:
         """Return the information that `to_bytes` wrote."""
-        file = arrays_in(content)
+        file = {name: read_only(values) for name, values in arrays_in(content).items()}
         first, intervals, step = file["knots"]
         names = [name.split("/", 1) for name in file if "/" in name]
         recordings = []

@@ -17,7 +17,7 @@ Temperatures visited only once contribute nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,7 @@ from fusion_core.chunk import Array
 from fusion_core.thermal.sweeps import directions, sweeps_of
 
 GRID = np.linspace(-18.0, 14.0, 44)  # of log (walk over the whole soak / white noise of a row), its variance
+FINE = np.linspace(GRID[0], GRID[-1], 12801)
 GAIN = 2.71  # of - 2 log likelihood: a walk that gains less does not show, 95 % on one side
 RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
 MIN_FREEDOM = 8  # rows more than coefficients, for a walk
@@ -78,8 +79,9 @@ def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     likelihood, unit = _likelihood(recordings, step)
     costs, scales = likelihood.over(np.exp(GRID) * unit)
     none, s2_none, nu = likelihood.at(0.0)
-    columns = zip(costs.T, scales.T, none, s2_none, strict=True)
-    white, white_sigma, walk, walk_sigma, likely = np.array([_axis(*column, nu) for column in columns]).T
+    curves = _Curves(costs, scales)
+    each = [curves.densities(axis, *of_none, nu) for axis, of_none in enumerate(zip(none, s2_none, strict=True))]
+    white, white_sigma, walk, walk_sigma, likely = np.array(each).T
     root = np.sqrt(unit)  # from the ratio of the grid to that of the densities
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
@@ -98,31 +100,8 @@ def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> tuple[Array
     curves = [one.over(np.exp(GRID) * unit) for one, unit in zip(likelihoods, own, strict=True)]
     places = np.clip(GRID + middle - logs[:, None], GRID[0], GRID[-1])
     total = np.sum([CubicSpline(GRID, costs)(at) for at, (costs, _) in zip(places, curves, strict=True)], axis=0)
-    common = np.sqrt([_mean(*_fine(cost)) for cost in total.T]) * np.exp(middle / 2)
-    likely = [
-        [_likely(*_fine(cost), CubicSpline(GRID, np.log(s2))) for cost, s2 in zip(costs.T, scales.T, strict=True)]
-        for costs, scales in curves
-    ]
-    return common, np.array(likely) * np.exp(logs / 2)[:, None]
-
-
-def _fine(cost: Array) -> tuple[Array, Array]:
-    """Return log ratios (G,) and - 2 log likelihood there, from that on the grid."""
-    from scipy.interpolate import CubicSpline
-
-    at = np.linspace(GRID[0], GRID[-1], 12801)
-    return at, CubicSpline(GRID, cost)(at)
-
-
-def _mean(at: Array, cost: Array, scale: Array | float = 1.0) -> float:
-    """Return the mean of the walk's variance under the likelihood, even in the walk; `scale` is that of white noise."""
-    weight = np.exp(-(cost - cost.min()) / 2 + at / 2)
-    return float(np.sum(weight * scale * np.exp(at)) / np.sum(weight))
-
-
-def _likely(at: Array, cost: Array, scale: Callable[[Array], Array]) -> float:
-    """Return the likely walk of an axis, in the unit of the grid; `scale` is the logarithm of the white noise."""
-    return float(np.sqrt(_mean(at, cost, np.exp(scale(at)))))
+    common = _Curves(total, np.ones_like(total)).likely * np.exp(middle / 2)
+    return common, np.array([_Curves(*both).likely for both in curves]) * np.exp(logs / 2)[:, None]
 
 
 def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikelihood, float]:
@@ -144,22 +123,34 @@ def _likelihood(recordings: Sequence[SoakRows], step: float) -> tuple[LevelLikel
     return LevelLikelihood([(X, *noise) for X, noise in zip(columns, noises, strict=True)], U.shape[1]), unit
 
 
-def _axis(cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
-    """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
-    from scipy.interpolate import CubicSpline
+class _Curves:
+    """Curves over the log ratio of all axes, - 2 log likelihood and log s^2, from values (G, d) on the grid.
 
-    scale, (at, curve) = CubicSpline(GRID, np.log(s2)), _fine(cost)
-    likely = _likely(at, curve, scale)
-    k = int(np.argmin(curve))
-    if nu < MIN_FREEDOM:
-        return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
-    if none - curve[k] < GAIN:
-        return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
-    bend, slope = max(float(CubicSpline(GRID, cost)(at[k], 2)), 1e-3), float(scale(at[k], 1))
-    of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
-    of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
-    white, walk = np.exp(scale(at[k]) / 2), np.exp((scale(at[k]) + at[k]) / 2)
-    return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
+    `likely` (d,) is the likely walk, root of the mean of its variance under the likelihood, even in the walk, in the
+    unit of the grid.
+    """
+
+    def __init__(self, costs: Array, s2: Array) -> None:
+        from scipy.interpolate import CubicSpline
+
+        self.spline = CubicSpline(GRID, np.hstack([costs, np.log(s2)]))
+        self.costs, scales = np.split(self.spline(FINE), 2, axis=1)
+        weight = np.exp(-(self.costs - self.costs.min(axis=0)) / 2 + FINE[:, None] / 2)
+        self.likely = np.sqrt(np.sum(weight * np.exp(scales + FINE[:, None]), axis=0) / np.sum(weight, axis=0))
+
+    def densities(self, axis: int, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
+        """Return white, its sigma, walk, its sigma and the likely walk of an axis, the walk in the unit of the grid."""
+        likely, k = self.likely[axis], int(np.argmin(self.costs[:, axis]))
+        if nu < MIN_FREEDOM:
+            return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
+        if none - self.costs[k, axis] < GAIN:
+            return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
+        bend = max(float(self.spline(FINE[k], 2)[axis]), 1e-3)
+        scale, slope = (float(self.spline(FINE[k], order)[axis - len(self.likely)]) for order in (0, 1))
+        of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
+        of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
+        white, walk = np.exp(scale / 2), np.exp((scale + FINE[k]) / 2)
+        return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
 
 
 def walk_from_repeated_sweeps(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Array:

@@ -189,15 +189,8 @@ def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arr
     """
     if unit.config.filter is None:
         nothing = Figure.of(np.full(len(unit.axes), np.nan), np.full(len(unit.axes), np.nan))
-        return CoastResult(
-            "",
-            in_sample=False,
-            figures=dict.fromkeys(NAMES.values(), nothing),
-            limits=[],
-            notes=[],
-            doubts=[],
-            result=None,
-        )
+        figures = dict.fromkeys(NAMES.values(), nothing)
+        return CoastResult("", in_sample=False, figures=figures, limits=[], notes=[], doubts=[], result=None)
     config = unit.lenient if tests else unit.config
     name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
     of_run = result.run

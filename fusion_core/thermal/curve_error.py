@@ -124,7 +124,7 @@ class CurveError(Frozen):
         grid, values = self._arrays
         k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
         share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
-        return np.asarray(values[:, k] + np.diff(values, axis=1)[:, k] * share)
+        return np.asarray(values[:, k] + (values[:, k + 1] - values[:, k]) * share)
 
     def _beyond(self, T: Array) -> Array:
         x = np.maximum(np.maximum(self.T[0] - T, T - self.T[-1]), 0.0)

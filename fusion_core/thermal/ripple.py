@@ -63,19 +63,16 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
         if len(products) < TRIPLES:
             continue
         total, scatter = products.sum(axis=0), np.sqrt(np.sum(products**2, axis=0))
-        for axis in range(left.shape[1]):
-            dip, seen = _dip(ways[:, inner, axis], noise[:, inner], where[inner], cell), None
+        for axis, dip in enumerate(_dips(ways[:, inner], noise[:, inner], where[inner], cell)):
+            seen = None
             if total[axis] > least * scatter[axis]:
                 rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
                 most = float(where[third][int(np.argmax(products[:, axis]))])
                 seen = Ripple(float(rms), float(chance), most, cell)
             # what repeats from cell to cell is everywhere, and a dip is not
-            found[axis] = max((one for one in (found[axis], dip, seen) if one is not None), key=_rank, default=None)
+            found[axis] = max((one for one in (found[axis], dip, seen) if one is not None), default=None,
+                              key=lambda one: (not one.dip, one.rms))  # fmt: skip
     return found
-
-
-def _rank(one: Ripple) -> tuple[bool, float]:
-    return not one.dip, one.rms
 
 
 def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Array, Integers]:
@@ -96,23 +93,24 @@ def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Arra
     return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64) + 1
 
 
-def _dip(ways: Array, noise: Array, where: Array, cell: float) -> Ripple | None:
-    """Return the dip that u and v (2, M) of an axis show at temperatures (M,); None where there is none."""
+def _dips(ways: Array, noise: Array, where: Array, cell: float) -> list[Ripple | None]:
+    """Return the dip that u and v (2, M, d) of each axis show at temperatures (M,); None where there is none."""
+    found: list[Ripple | None] = [None] * ways.shape[2]
     if len(where) < TRIPLES:
-        return None
+        return found
     passed = np.all(np.abs(np.log(noise / np.median(noise))) < np.log(HELD), axis=0)
     if np.sum(passed) < TRIPLES:
-        return None
+        return found
     ways, noise, where = ways[:, passed], noise[:, passed], where[passed]
     noise = np.maximum(noise, np.median(noise) ** 2 / noise)  # white noise falls with the time in a cell, a walk grows
-    z = ways / noise
-    usual = 1.4826 * np.median(np.abs(z), axis=1)[:, None]
-    beyond = np.min(np.abs(z) / np.maximum(usual, np.finfo(float).tiny), axis=0) * (ways[0] * ways[1] > 0)
-    k = int(np.argmax(beyond))
-    if not beyond[k] > NARROW:
-        return None
-    chance = float(np.sqrt(np.mean((usual[:, 0] * noise[:, k]) ** 2) / 2))
-    return Ripple(abs(float(np.mean(ways[:, k]))), chance, float(where[k]), cell, dip=True)
+    z = np.abs(ways) / noise[:, :, None]
+    usual = 1.4826 * np.median(z, axis=1)
+    beyond = np.min(z / np.maximum(usual, np.finfo(float).tiny)[:, None], axis=0) * (ways[0] * ways[1] > 0)
+    for axis, k in enumerate(np.argmax(beyond, axis=0)):
+        if beyond[k, axis] > NARROW:
+            chance = float(np.sqrt(np.mean((usual[:, axis] * noise[:, k]) ** 2) / 2))
+            found[axis] = Ripple(abs(float(np.mean(ways[:, k, axis]))), chance, float(where[k]), cell, dip=True)
+    return found
 
 
 def ripple_modes(ripple: Ripple, grid: Array) -> Array:

@@ -15,7 +15,7 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -54,6 +54,7 @@ class Blocks:
     of_sample: Integers
     fine: Array
     nearest: Integers
+    _known: dict[int, tuple[Integers, csr_array]] = field(default_factory=dict, init=False)  # shares by their groups
 
     @cached_property
     def over(self) -> csr_array:
@@ -63,16 +64,20 @@ class Blocks:
     @cached_property
     def during(self) -> csr_array:
         """The spread of each block's samples over even stretches of time (K, S), sparse."""
-        N = len(self.of_sample)
-        stretches = min(STRETCHES, N)
+        stretches = min(STRETCHES, N := len(self.of_sample))
         return self._spread(np.arange(N) * stretches // N, stretches)
 
     def _spread(self, which: Integers, count: int) -> csr_array:
         return _shares(self.of_sample, which, (len(self.T), count))
 
     def shares(self, group: Integers, count: int) -> csr_array:
-        """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples."""
-        return _shares(group, self.of_sample, (count, len(self.T)))
+        """Return the share of each of `count` groups in each block (count, K), sparse; `group` (N,) of samples.
+
+        The axes of a fit have the same.
+        """
+        if id(group) not in self._known:
+            self._known[id(group)] = group, _shares(group, self.of_sample, (count, len(self.T)))
+        return self._known[id(group)][1]
 
 
 def _shares(group: Integers, part: Integers, shape: tuple[int, int]) -> csr_array:
@@ -193,6 +198,8 @@ class Contrasts:
 
     def noise(self, y: Array, left: Array) -> BlockNoise:
         """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
+        from scipy.linalg import cho_solve
+
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
         if K - self._free.shape[1] >= MIN_BLOCKS:
@@ -200,7 +207,7 @@ class Contrasts:
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
-        weighted = _solved(root, self.X)
+        weighted = np.asarray(cho_solve((root, True), self.X, check_finite=False))
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
         return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
@@ -258,13 +265,6 @@ def walk_root(blocks: Blocks) -> Array:
 def _root(covariance: Array) -> Array:
     values, V = np.linalg.eigh(covariance)
     return np.asarray(V * np.sqrt(np.clip(values, 0.0, None)))
-
-
-def _solved(root: Array, X: Array) -> Array:
-    """Return the solution of root root' W = X, `root` lower triangular."""
-    from scipy.linalg import cho_solve
-
-    return np.asarray(cho_solve((root, True), X, check_finite=False))
 
 
 def _expected(walk: Array, u: Array) -> tuple[float, float]:

@@ -8,6 +8,7 @@ themselves, or of what a smooth curve leaves of them, as steep as a bias may be 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import cos, hypot, sin, sqrt
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * root / sensor.noise
         scatter = _median(away) / 0.6745
-        level = np.all(scatter <= FAR_BEYOND) and np.all(away <= OUTLIER * np.maximum(scatter, 1.0))
+        level = (scatter <= FAR_BEYOND).all() and (away <= OUTLIER * np.maximum(scatter, 1.0)).all()
         if not (level or _follows_temperature(window, sensor)):
             return False
     return True
@@ -96,8 +97,8 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     inputs: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     if accel is not None:
-        f = np.mean(window[accel.channel], axis=0)
-        up = f / np.linalg.norm(f)
+        f = np.add.reduce(window[accel.channel]) / len(window)
+        up = f / sqrt(f @ f)
         inputs[accel.channel] = gravity(site.latitude) * up
     if accel is not None and up is not None and site.latitude is not None:
         place = ["xyz".index(axis) for axis in gyro.axes]
@@ -116,7 +117,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
 def check_gravity(window: Chunk, site: Site) -> None:
     """Raise BadValue where what the accelerometers show at rest cannot be gravity: a unit that is not theirs."""
     expected = gravity(site.latitude)
-    measured = float(np.linalg.norm(np.mean(window["accel"], axis=0)))
+    measured = hypot(*(np.add.reduce(window["accel"]) / len(window)).tolist())
     if not abs(measured / expected - 1) < FAR_FROM_GRAVITY:
         raise BadValue(
             f"accel: shows {measured:.4g} m/s^2 at rest, {expected:.4g} was expected; "
@@ -132,7 +133,7 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
     expected = gravity(site.latitude)
     if accel.bias.sigma_0 is not None:
         return accel.bias.sigma_0 / expected
-    return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
+    return hypot(sqrt(f @ f) / expected - 1, UNKNOWN) / sqrt(2)
 
 
 def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[str, ...]:
@@ -141,7 +142,7 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
     Across the vertical it is one with a tilt: `leak` (d,) is the Earth rate that goes to the gyro's bias for it.
     """
     declared = accel.bias.sigma_0 is not None or accel.calibration is not None
-    if declared or np.all(leak <= gyro.noise / np.sqrt(length)):
+    if declared or (leak <= gyro.noise / sqrt(length)).all():
         return ()
     each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
     return (
@@ -162,14 +163,13 @@ def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
     s and c the vertical and the level part of the Earth's rate.
     """
     assert site.latitude is not None
-    rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * np.sin(site.latitude), RATE * np.cos(site.latitude)
+    rate, s, c = earth_rate(up, site.latitude, site.heading), RATE * sin(site.latitude), RATE * cos(site.latitude)
     if site.heading is None:
         return rate, np.asarray(abs(s) * np.sqrt(np.maximum(1 - up**2, 0.0)))
-    sin, cos = np.sin(site.heading), np.cos(site.heading)
-    level = np.sqrt(1 - up[0] ** 2)
-    X, Y = np.array([level, -up[0] * up[1] / level, -up[0] * up[2] / level]), np.array([0.0, up[2], -up[1]]) / level
-    along = s * X - c * cos * up
-    across = s * Y + c * (up[0] / level * (sin * X - cos * Y) - sin * up)
+    east, north, (x, y, z), level = sin(site.heading), cos(site.heading), up.tolist(), sqrt(1 - up[0] ** 2)
+    X, Y = np.array([level, -x * y / level, -x * z / level]), np.array([0.0, z / level, -y / level])
+    along = s * X - c * north * up
+    across = s * Y + c * (x / level * (east * X - north * Y) - east * up)
     return rate, np.asarray(np.sqrt(along**2 + across**2))
 
 
@@ -186,6 +186,6 @@ def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
         if len(values) < 2:
             ratios[sensor.channel] = np.ones(values.shape[1])
             continue
-        spread = (values[1:] - values[:-1]) / root
-        ratios[sensor.channel] = np.sqrt(np.mean(spread**2, axis=0)) / sensor.noise
+        squares = np.add.reduce(np.square((values[1:] - values[:-1]) / root)) / len(root)
+        ratios[sensor.channel] = np.sqrt(squares) / sensor.noise
     return ratios

@@ -20,7 +20,7 @@ Source: J. A. Barnes and S. Jarvis, NBS Technical Note 604 (1971), for flicker n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,18 @@ class FreeCurve:
         return np.asarray(BSpline(self.knots, np.eye(len(self.knots) - 4), 3)(np.clip(T, *self.domain)))
 
 
+@lru_cache(maxsize=2)
+def _laws(t: bytes, span: bytes, recording: bytes) -> tuple[Array, list[Array], tuple[Array, Array]]:
+    """Return roots (K, 1) of spans over their mean, the laws times these, and eigenvalues and -vectors of the walk.
+
+    Once for all units of a line that are soaked for the same times.
+    """
+    blocks = SoakRows(np.frombuffer(t), np.empty(0), np.empty(0), np.frombuffer(span), {})
+    root = np.sqrt(blocks.span / np.mean(blocks.span))[:, None]
+    laws = [root * C * root.T for C in laws_of(blocks, np.frombuffer(recording, np.int64))]
+    return root, laws, np.linalg.eigh(laws[0])
+
+
 def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
     lasted = float(np.median(blocks.span))
@@ -115,12 +127,11 @@ class SoakContrasts:
         bias = self.blocks.bias
         self.scale = np.std(bias, axis=0)
         self.scale[self.scale == 0] = 1.0
-        self.root = np.sqrt(self.blocks.span / np.mean(self.blocks.span))[:, None]
+        self.root, laws, walk = _laws(self.blocks.t.tobytes(), self.blocks.span.tobytes(), recording.tobytes())
         self.y = (bias - bias.mean(axis=0)) / self.scale * self.root
         levels = recording[:, None] == np.unique(recording)[1:]
         self.more = levels * self.root
-        laws = [self.root * C * self.root.T for C in laws_of(self.blocks, recording)]
-        self.curve, self.splines = self._curve(soak, laws[0])
+        self.curve, self.splines = self._curve(soak, *walk)
         self.X = np.column_stack([self.splines * self.root, self.more])
         free_of_X = Complement(basis_of(self.X, RANK))
         self.Z = free_of_X.Z
@@ -143,13 +154,13 @@ class SoakContrasts:
         white = soak.white**2 * np.sum(soak.span) / np.sum(soak.count)
         return np.asarray(np.all(len(white) * slope**2 * off[:, None] <= white, axis=1))
 
-    def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
+    def _curve(self, soak: SoakSummary, own: Array, V: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
 
+        `own` (K,) and V (K, K) are the eigenvalues and eigenvectors of the walk.
         By Akaike's information criterion, from few knots on, as long as twice as many are better: a curve that is too
         stiff leaves more than one that is too free takes.
         """
-        own, V = np.linalg.eigh(walk)
         weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
         y, more, best = V.T @ self.y, V.T @ self.more, np.inf
         chosen: list[tuple[FreeCurve, Array]] = []
@@ -254,14 +265,14 @@ class SoakContrasts:
         left = free * (one - gain @ again)
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
         half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        shown = np.sqrt(w)[:, None] * (V.T @ regressors) @ half
+        shown = np.sqrt(w)[:, None] * _turned(V, regressors) @ half
         most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
     def late(self, inputs: Array) -> tuple[Array, Array]:
-        """Return the splines where the curve sees inputs (S, J): of slots (J, S, p), and X of the blocks (J, K, P)."""
-        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
-        return there, np.stack([np.column_stack([self.means(one) * self.root, self.more]) for one in there])
+        """Return the splines where the curve sees inputs (S, J): of slots (S, J, p), and X of the blocks (J, K, P)."""
+        there = self.curve(inputs.ravel()).reshape(*inputs.shape, -1)
+        return there, np.stack([np.hstack([one * self.root, self.more]) for one in self.means(there).swapaxes(0, 1)])
 
     def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, FollowingCurves]:
         """Return the bias that is added where the curve sees other temperatures (S, J).
@@ -278,12 +289,11 @@ class SoakContrasts:
             The likelier of the two.
         """
         there, late = self.late(inputs)
-        regressors = self.Z.T @ late  # (J, m, P)
+        regressors = _turned(self.Z, late)  # (J, m, P)
         each = [self.curves_under(int(noise), axis, late, regressors) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
-        here, p = self.curve(self.soak.T), self.splines.shape[1]
-        there -= here
-        slots = np.stack([one @ bent[:p] for one in there], axis=1)
+        there, p = there - self.curve(self.soak.T)[:, None], self.splines.shape[1]
+        slots = there @ bent[:p]
         J, d = slots.shape[1:]
         whole = np.einsum("jmp,pjd->mjd", regressors, curves)
         open_ = (regressors @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
@@ -292,7 +302,7 @@ class SoakContrasts:
         part, parts = self.parts(regressors[:, :, :p] @ smooth, int(noises[0]))
         likelier = log_mean(part) > log_mean(followed)
         coefficients = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
-        added = np.stack([one @ own for one, own in zip(there, coefficients, strict=True)], axis=1)
+        added = (there.swapaxes(0, 1) @ coefficients).swapaxes(0, 1)
         following = FollowingCurves(coefficients, likelier, added, late[:, :, :p])
         return slots, self.of(slots), np.stack([followed, part]), following
 
@@ -328,8 +338,8 @@ class SoakContrasts:
         in units in which what is shown most has g, one of SIZES: Zellner's prior of a whole curve.
         """
         w, V = self.under(noise)
-        white = np.sqrt(w)[:, None] * (V.T @ shown)
-        most = np.linalg.eigh(np.swapaxes(white, 1, 2) @ white)[1][:, :, -PARTS:]
+        turned = _turned(V, shown)
+        most = np.linalg.eigh(np.swapaxes(turned * w[:, None], 1, 2) @ turned)[1][:, :, -PARTS:]
         gram, B, Q = self._products(self.u[:, None], np.moveaxis(shown @ most, 0, 1))
         size, along = np.linalg.eigh(gram)
         size = np.maximum(size, FINEST * size[..., -1:] + TINY)
@@ -359,13 +369,14 @@ class SoakContrasts:
         They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.
         """
         some, other = np.triu_indices(ways.shape[2])
-        each = []
+        # shapes last: whole rows are multiplied
+        ways, y, each = *(np.ascontiguousarray(x.swapaxes(1, 2)) for x in (ways, y)), []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
             turned, u = (np.reshape(V.T @ x.reshape(len(x), -1), x.shape) for x in (ways, y))
-            products = turned[:, :, some] * turned[:, :, other], turned[..., None] * u[:, :, None], u**2
+            products = turned[:, some] * turned[:, other], turned[:, :, None] * u[:, None], u**2
             each.append([(w @ x.reshape(len(u), -1)).reshape(len(w), *x.shape[1:]) for x in products])
-        flat, B, Q = map(np.concatenate, zip(*each, strict=True))
+        flat, B, Q = (np.moveaxis(np.concatenate(parts), -1, 1) for parts in zip(*each, strict=True))
         gram = np.empty((*flat.shape[:2], *B.shape[2:3] * 2))
         gram[:, :, some, other] = gram[:, :, other, some] = flat
         return gram, B, Q
@@ -380,6 +391,11 @@ class SoakContrasts:
         thin = np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         log_w = self.log_w[thin, None]
         return np.asarray((log_w - log_size / 2)[..., None] - len(self.u) / 2 * np.log(left))
+
+
+def _turned(V: Array, x: Array) -> Array:
+    """Return V' x (J, m, p) of V (K, m) and x (J, K, p), by one product of matrices."""
+    return np.ascontiguousarray(np.tensordot(V, x, axes=(0, 1)).swapaxes(0, 1))
 
 
 def _of_drift(C: Array, Z: Array) -> tuple[Array, Array]:
@@ -400,6 +416,6 @@ def log_mean(x: Array) -> Array:
 
 def _cost(X: Array, y: Array) -> Array:
     """Return - 2 log-likelihood (d,) of y (K, d) about the best of X (K, p), white noise of any size."""
-    q = np.linalg.qr(X)[0]
-    left = np.maximum(np.sum(y**2, axis=0) - np.sum((q.T @ y) ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
+    R = np.asarray(np.linalg.qr(np.hstack([X, y]), mode="r"))
+    left = np.maximum(np.sum(R[X.shape[1] :, X.shape[1] :] ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
     return np.asarray(len(y) * np.log(np.maximum(left, 1e-300)))

@@ -251,20 +251,19 @@ class ShapeEvidence:
         `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
         taken to speak against one as much as it does at t = 1.
         """
-        d, prior = self.Q.shape[1], np.log(self.prior * len(self.prior))[:, None]
-        prior = prior - np.log(2) * (np.arange(len(prior)) >= self.added)[:, None]  # or the whole curve follows
+        d, weight = self.Q.shape[1], self.prior / 2
+        weight[self.added :] /= 2  # or the whole curve follows
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.z.shape[1:])
         for axis in range(d):
-            low, high = np.zeros(len(prior)), np.full(len(prior), MAX_T)
+            low, high = np.zeros(len(weight)), np.full(len(weight), MAX_T)
             for _ in range(HALVINGS):
                 t = (low + high) / 2
-                each = []
-                for g, other in zip(SIZES, still, strict=True):
-                    t2 = t**2 * alike[:, :, axis]
-                    factor = np.log1p(np.exp(g / (1 + g) * t2 / 2 - np.log1p(g) / 2)) - np.log(2)
-                    each.append(log_mean(factor + prior) + (d - 1) * other)
-                reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
+                t2 = t**2 * alike[:, :, axis]
+                factors = [weight @ (1 + np.exp(g / (1 + g) * t2 / 2) / np.sqrt(1 + g)) for g in SIZES]
+                reached = np.exp((d - 1) * still) @ factors >= 2 * len(SIZES) * np.exp(
+                    SEEN
+                )  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
             needed[:, axis] = np.where(low > 0.99 * MAX_T, np.inf, high)
         spread = np.sum(

@@ -331,12 +331,9 @@ class _MemoryTest:
             return forms
         inputs, noises = self.shapes.inputs, np.argmax(evidence.noises, axis=0)
         there = Sweeps(self.contrasts.soak, inputs[:, :, None]).shown[..., 0]
-        J, d = self.curves.partly.shape
-        ends = np.empty((2, J, d))
-        for j, axis in np.ndindex(J, d):
-            above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, evidence.added + j, axis])
-            ends[:, j, axis] = there[[above, below], g, j]
-        up, down = self.contrasts.curve(np.nan_to_num(ends).ravel()).reshape(2, J, d, -1)
+        above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, evidence.added :])
+        ends = there[np.stack([above, below]), g, np.arange(len(g))[:, None]]
+        up, down = self.contrasts.curve(np.nan_to_num(ends).ravel()).reshape(*ends.shape, -1)
         between = up - down
         s2 = np.nan_to_num(np.take_along_axis(evidence.left, noises[None], axis=0)[0]) / evidence.m
         variances = self.contrasts.form_variances(self.curves, noises, np.maximum(s2, FINEST), between)

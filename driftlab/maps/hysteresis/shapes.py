@@ -188,16 +188,15 @@ class Sweeps:
         gradient = shown[above, g] - shown[below, g]
         return float(gradient @ coefficients), gradient
 
-    def widest(self, together: Array) -> tuple[int, int, int]:
-        """Return between which sweeps, up and down, and where on T something shown (W, G) opens most."""
-        most, least = _extremes(together, self.up)
-        wide = np.where(np.isfinite(most), most, 0.0), np.where(np.isfinite(least), least, 0.0)
-        sign = 1 if np.max(wide[0]) >= -np.min(wide[1]) else -1
-        g = int(np.argmax(wide[0]) if sign > 0 else np.argmin(wide[1]))
-        signed = np.where(np.isnan(together[:, g]), -np.inf, sign * together[:, g])
-        above = int(np.argmax(np.where(self.up, signed, -np.inf)))
-        signed = np.where(np.isnan(together[:, g]), np.inf, sign * together[:, g])
-        return above, int(np.argmin(np.where(self.up, np.inf, signed))), g
+    def widest(self, together: Array) -> tuple[Integers, Integers, Integers]:
+        """Return between which sweeps, up and down, and where on T each thing shown (W, G, ...) opens most."""
+        most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(together, self.up))
+        most_of_all = np.max(most, axis=0) >= -np.min(least, axis=0)
+        g = np.where(most_of_all, np.argmax(most, axis=0), np.argmin(least, axis=0))
+        there = np.take_along_axis(together, g[None, None], axis=1)[:, 0]
+        signed, up = np.where(most_of_all, there, -there), self.up.reshape(-1, *[1] * (there.ndim - 1))
+        above = np.argmax(np.where(up & ~np.isnan(there), signed, -np.inf), axis=0)
+        return above, np.argmin(np.where(up | np.isnan(there), np.inf, signed), axis=0), g
 
     def mean_differences(self) -> Array:
         """Return warming less cooling in the mean over the sweeps (G, J, d); NaN where one of the two is missing."""

@@ -141,9 +141,9 @@ def test_inverses_by_sweeps_are_lapacks() -> None:
         scale = np.max(np.abs(np.linalg.inv(matrices)))
         assert_allclose(inverse(matrices), np.linalg.inv(matrices), atol=1e-16 * 50 * condition * scale)
         assert_allclose(inverse(matrices), inverse(np.tril(matrices)))  # the lower triangle is read
-        log_det, inverted = _log_det(matrices[0] * 1e-9)
-        assert_allclose(log_det, np.linalg.slogdet(matrices[0] * 1e-9)[1], rtol=1e-10)
-        assert_allclose(inverted * 1e-9, np.linalg.inv(matrices[0]), atol=1e-16 * 50 * condition * scale)
+        log_det, inverted = _log_det(matrices * 1e-9)
+        assert_allclose(log_det, np.linalg.slogdet(matrices * 1e-9)[1], rtol=1e-10)
+        assert_allclose(inverted * 1e-9, np.linalg.inv(matrices), atol=1e-16 * 50 * condition * scale)
 
 
 def test_derivatives_of_the_smooth_prior_are_differences() -> None:
