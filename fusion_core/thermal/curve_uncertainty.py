@@ -75,19 +75,32 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     return found
 
 
-def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: Sequence[Array]) -> FittedMap:
+def with_errors(
+    fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: Sequence[Array], *, beside: bool = False
+) -> FittedMap:
     """Return a map whose curve is off by its answer to errors of the blocks that it was fitted on.
 
-    They are in the place of the noise that the fit has seen; a misfit that it has seen, and what holes may hide, stay.
-    `errors` (K, r), one an axis, are roots of their covariance. A map that does not tell how sure it is stays as it is.
+    They are in the place of the noise that the fit has seen, or `beside` it; a misfit that it has seen, and what holes
+    may hide, stay. `errors` (K, r), one an axis, are roots of their covariance. A map that does not tell how sure it is
+    stays as it is.
     """
     error = fitted.record.error
     if error is None:
         return fitted
-    grid = np.asarray(error.T)
-    more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
-    modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    return fitted.noting(error=error.model_copy(update={"modes": (*modes_kept, *nested(modes_of_axes(more)))}))
+    more = _answers(blocks, np.asarray(error.T), smoother, errors)
+    kept = error.modes if beside or error.misfits else error.modes[len(error.modes) - len(error.holes) :]
+    return fitted.noting(error=error.model_copy(update={"modes": (*kept, *nested(modes_of_axes(more)))}))
+
+
+def answered(T: Array, blocks: Blocks, errors: Sequence[Array], smoother: Smoother) -> CurveError:
+    """Return the error of a curve on samples at T (N,) whose blocks have errors of the roots (K, r), one an axis."""
+    grid = np.linspace(T.min(), T.max(), GRID)
+    return _joined(grid, _answers(blocks, grid, smoother, errors), np.zeros(len(errors)), find_holes(T))
+
+
+def _answers(blocks: Blocks, grid: Array, smoother: Smoother, errors: Sequence[Array]) -> list[Array]:
+    """Return the modes (r, G) of each axis."""
+    return [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
@@ -106,15 +119,10 @@ def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoothe
     smoother : function
         How the kind of map answers to noise (`ThermalMap.smoother`).
     """
-    d = len(noise)
-    grid = np.linspace(T.min(), T.max(), GRID)
-    blocks = blocks_of(T, np.zeros((len(T), d)))
-    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.sqrt(1 / (blocks.n * dt))
-    modes = []
-    for axis in range(d):
-        H = _answer(blocks, grid, smoother, axis)
-        modes.append(_largest(np.column_stack([H @ wandering * walk[axis], H * white * noise[axis]])))
-    return _joined(grid, modes, np.zeros(d), find_holes(T))
+    blocks = blocks_of(T, np.zeros((len(T), len(noise))))
+    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.diag(np.sqrt(1 / (blocks.n * dt)))
+    errors = [np.hstack([wandering * w, white * n]) for n, w in zip(noise, walk, strict=True)]
+    return answered(T, blocks, errors, smoother)
 
 
 def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> CurveError:
