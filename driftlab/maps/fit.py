@@ -276,7 +276,7 @@ class GatheredSoak:
         return np.asarray(self.bias - way[:, None] * between / 2 * self.memory.apart)
 
     def wandered(self, bias: Array) -> Wandered | None:
-        """Return what `bias` (N, d) has wandered in several recordings; None of one, and of levels that are known."""
+        """Return the wander of `bias` (N, d) in several recordings; None of one, and where levels are known."""
         several = len(self.starts) > 1 and self.placements is None
         return wandered(self.T, bias, self.starts) if several else None
 

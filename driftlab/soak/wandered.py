@@ -1,4 +1,4 @@
-"""What the bias has wandered in several recordings of one unit, beside their common curve.
+"""Wander of the bias in several recordings of one unit, beside their common curve.
 
 The blocks of all recordings (`fusion_core.thermal.soak_noise`) are::
 
@@ -6,10 +6,14 @@ The blocks of all recordings (`fusion_core.thermal.soak_noise`) are::
 
 with walk and white as there, and f straight lines between knots, whose bends have the penalty P. White noise and walk
 are the means over their restricted likelihood beside a free curve and free levels, tau and rho the likeliest beside
-these; tau is no less than what the walk makes in the time of a recording, as it goes on in the pauses, too. The mean of o_r and walk, given y, is taken off the samples. By the equations of the mixed model, least squares
-on what is left are generalised least squares on y, whichever kind of map is fitted: the curve at each temperature has
-its weight from what the recordings know of it, and not from the number of samples. N samples, K blocks, R recordings,
-d axes.
+these; tau is at least what the walk makes in the time of a recording, since it goes on in a pause, too.
+
+Each recording says its means in cells of temperature. The mean of o_r and walk, given these, is taken off the samples:
+by the equations of the mixed model, least squares on the rest are generalised least squares on the means, whichever
+kind of map is fitted. So a recording has weight by what it knows of the curve at a temperature, and not by its number
+of samples. Blocks of their own would say more if the bias were a curve and a walk; but one that lags or remembers
+follows the temperature less within minutes than it does over hours, and passes up and down have to be averaged.
+N samples, K blocks, R recordings, m means, d axes.
 
 Source: C. R. Henderson, Best linear unbiased estimation and prediction under a selection model, Biometrics 31 (1975)
 423; G. K. Robinson, That BLUP is a good thing: the estimation of random effects, Statistical Science 6 (1991) 15.
@@ -17,7 +21,7 @@ Source: C. R. Henderson, Best linear unbiased estimation and prediction under a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,9 +30,9 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.curve_error import CurveError
-from fusion_core.thermal.curve_uncertainty import answered, with_errors
+from fusion_core.thermal.curve_uncertainty import KnownErrors, answered, curve_error
 from fusion_core.thermal.penalised import smooth_lines
-from fusion_core.thermal.soak_noise import MIN_BLOCKS, Blocks, Contrasts, Smoother, blocks_of
+from fusion_core.thermal.soak_noise import CELLS, MIN_BLOCKS, Contrasts, Smoother, blocks_of
 from fusion_core.threads import one_thread
 
 STRAIGHT = 1e-9  # of the largest eigenvalue of the penalty: a shape that bends less is a line
@@ -47,36 +51,39 @@ class WanderNoise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Wandered:
-    """What is taken off (N, d) the samples of recordings, and what of it stays in the K blocks of each axis.
-
-    `errors` (K, r), one an axis, are roots of the covariance of what is left but for white noise.
-    """
+    """Wander (N, d) that is taken off the samples of recordings, and the errors of what is left in their blocks."""
 
     taken: Array
-    blocks: Blocks
     noises: tuple[WanderNoise, ...]
-    errors: tuple[Array, ...]
+    errors: KnownErrors
 
     def densities(self, dt: float) -> tuple[Array, Array]:
         """Return the densities (d,) of white noise and walk, of samples that are `dt` apart in s."""
-        n, walk, white = self.blocks.n, *np.array(self.noises).T[:2]
-        return np.sqrt(white * np.mean(n) * dt), np.sqrt(walk / (np.sum(n) * dt))
+        n, variances = self.errors.blocks.n, np.array(self.noises)
+        return np.sqrt(variances[:, 1] * np.mean(n) * dt), np.sqrt(variances[:, 0] / (np.sum(n) * dt))
 
 
 def fitted_jointly(
-    settings: ThermalMap, T: Array, bias: Array, about: dict[str, str], found: Wandered | None
+    settings: ThermalMap, T: Array, bias: Array, about: Mapping[str, str], found: Wandered | None
 ) -> FittedMap:
-    """Return the map of samples T (N,) and bias (N, d) less what they have wandered, if that was found."""
+    """Return the map of samples T (N,) and bias (N, d) less what they have wandered, if that was found.
+
+    Its residual is that of the samples as they are.
+    """
+    fitted = settings.fit(T, bias if found is None else bias - found.taken, about)
     if found is None:
-        return settings.fit(T, bias, about)
+        return fitted
+    residual = tuple(np.sqrt(np.mean((bias - fitted.bias(T)) ** 2, axis=0)).tolist())
+    if fitted.record.error is None:
+        return fitted.noting(residual=residual)
     left = bias - found.taken
-    fitted = settings.fit(T, left, about)
-    fitted = with_errors(fitted, found.blocks, settings.smoother(T, left), found.errors, beside=True)
-    return fitted.noting(residual=tuple(np.sqrt(np.mean((bias - fitted.bias(T)) ** 2, axis=0)).tolist()))
+    with one_thread():
+        error = curve_error(settings.kind, T, left, fitted.bias, settings.smoother(T, left), found.errors)
+    return fitted.noting(residual=residual, error=error)
 
 
 def wandered(T: Array, bias: Array, starts: Sequence[int]) -> Wandered | None:
-    """Return what bias (N, d) at T (N,) has wandered in the recordings that begin at `starts`; None if too short."""
+    """Return the wander of bias (N, d) at T (N,) in the recordings that begin at `starts`; None if they are short."""
     if np.ptp(T) == 0:
         return None
     with one_thread():
@@ -85,10 +92,11 @@ def wandered(T: Array, bias: Array, starts: Sequence[int]) -> Wandered | None:
             return None
         y = design.blocks.y
         noises = tuple(design.noise(column) for column in y.T)
-        answers = [design.taken(noise) for noise in noises]
-        errors = tuple(design.slow(noise, W) for noise, W in zip(noises, answers, strict=True))
-    taken = np.stack([W @ column for W, column in zip(answers, y.T, strict=True)], axis=1)
-    return Wandered(taken[design.blocks.of_sample], design.blocks, noises, errors)
+        operators = [design.taken(noise) for noise in noises]
+        roots = [design.left(noise, W) for noise, W in zip(noises, operators, strict=True)]
+    taken = np.stack([W @ column for W, column in zip(operators, y.T, strict=True)], axis=1)
+    errors = KnownErrors(design.blocks, roots, [noise.white for noise in noises])
+    return Wandered(taken[design.blocks.of_sample], noises, errors)
 
 
 def expected_joint_error(
@@ -103,18 +111,16 @@ def expected_joint_error(
         design = WanderDesign(T, np.zeros((len(T), len(noises))), starts)
         n, roots = design.blocks.n, []
         for white, walk, bends, levels in noises:
-            noise = WanderNoise(walk**2 * np.sum(n) * dt, white**2 / (np.mean(n) * dt), bends, levels)
-            W = design.taken(noise)
-            own = (np.eye(len(n)) - W) * np.sqrt(noise.white * design.contrasts.white)
-            roots.append(np.hstack([design.slow(noise, W), own]))
+            noise = WanderNoise(walk**2 * np.sum(n) * dt, white**2 / (float(np.mean(n)) * dt), bends, levels)
+            roots.append(design.left(noise, design.taken(noise)))
         return answered(T, design.blocks, roots, smoother)
 
 
 class WanderDesign:
-    """Blocks of samples T (N,) and bias (N, d), and the columns of their curve and levels.
+    """Blocks of samples T (N,) and bias (N, d), their `means` (m, K), and the columns of their curve and levels.
 
     `groups` are columns of a free line (K, 2), of bends (K, q), and of levels (K, R - 1): contrasts of the recordings,
-    since their mean is of the line.
+    since their mean is of the line. `columns` (m, p) are the means of all.
     """
 
     def __init__(self, T: Array, bias: Array, starts: Sequence[int]) -> None:
@@ -131,7 +137,11 @@ class WanderDesign:
         line = np.stack([np.ones_like(blocks.fine), (blocks.fine - low) / (high - low)], axis=1)
         apart = np.linalg.qr(np.hstack([np.ones((R, 1)), np.eye(R)[:, 1:]]))[0][:, 1:]
         self.groups = blocks.over @ line, blocks.over @ bends, Z @ apart
-        self.columns, self.sizes = np.hstack(self.groups), [group.shape[1] for group in self.groups]
+        cell = np.minimum(((blocks.T - low) * (CELLS / (high - low))).astype(np.int64), CELLS - 1)
+        place = np.unique(np.argmax(Z, axis=1) * CELLS + cell, return_inverse=True)[1]
+        means = (place == np.arange(np.max(place) + 1)[:, None]) * blocks.n
+        self.means = means / np.sum(means, axis=1, keepdims=True)
+        self.columns, self.sizes = self.means @ np.hstack(self.groups), [group.shape[1] for group in self.groups]
 
     @property
     def separates(self) -> bool:
@@ -144,11 +154,12 @@ class WanderDesign:
 
         found = self.contrasts.noise(y, np.eye(len(y)))
         scale = float(np.mean(y**2)) or 1.0
-        white = np.linalg.solve(found.root, np.column_stack([self.columns, y]))
+        root = np.linalg.qr((self.means @ found.root).T)[1].T
+        white = np.linalg.solve(root, np.column_stack([self.columns, self.means @ y]))
         N = white.T @ white
         G, b, varied = N[:-1, :-1], N[:-1, -1], self.sizes[0]
 
-        def cost(logs: Sequence[float]) -> float:
+        def cost(logs: tuple[float, float] | Array) -> float:
             """Minus twice the logarithm of the restricted likelihood."""
             precision = np.repeat([0.0, *np.exp(-np.asarray(logs)) / scale], self.sizes)
             L = np.linalg.cholesky(G + np.diag(precision))
@@ -156,26 +167,27 @@ class WanderDesign:
             return float(2 * np.sum(np.log(np.diag(L))) - np.sum(np.log(precision[varied:])) - explained @ explained)
 
         paused = float(np.clip(np.log(max(found.walk, 1e-300) / (self.sizes[2] + 1) / scale), LEAST, MOST - 1))
-        begin = min(((r, max(t, paused)) for r in TRIED for t in TRIED), key=cost)
-        bounds, close = [(LEAST, MOST), (paused, MOST)], {"xatol": 0.05, "fatol": 0.01}
-        logs = minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=close).x
-        bends, levels = scale * np.exp(logs)
-        return WanderNoise(found.walk, found.white, float(bends), float(levels))
+        begin: Array = np.array(min(((r, max(t, paused)) for r in TRIED for t in TRIED), key=cost))
+        bounds = [(LEAST, MOST), (paused, MOST)]
+        logs = minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options={"xatol": 0.05, "fatol": 0.01}).x
+        bends, levels = (scale * np.exp(logs)).tolist()
+        return WanderNoise(found.walk, found.white, bends, levels)
 
     def taken(self, noise: WanderNoise) -> Array:
         """Return the operator (K, K) that takes blocks to the mean of their levels and walk, less that over all."""
-        K, walk = len(self.blocks.n), noise.walk * self.contrasts.covariance
+        A, walk = self.means, noise.walk * self.contrasts.covariance
         least = 1e-9 * (noise.walk + noise.white) + 1e-12 * (noise.bends + noise.levels)  # of samples without noise
-        V = walk + np.diag(noise.white * self.contrasts.white + least)
-        solved = np.linalg.solve(V, np.hstack([self.columns, np.eye(K)]))
+        V = A @ (walk + np.diag(noise.white * self.contrasts.white + least)) @ A.T
+        solved = np.linalg.solve(V, np.hstack([self.columns, A]))
         p = self.columns.shape[1]
         precision = np.repeat([0.0, 1 / noise.bends, 1 / noise.levels], self.sizes)
-        operator = np.linalg.solve(self.columns.T @ solved[:, :p] + np.diag(precision), solved[:, :p].T)
-        W = walk @ (solved[:, p:] - solved[:, :p] @ operator) + self.groups[2] @ operator[p - self.sizes[2] :]
+        operator = np.linalg.solve(self.columns.T @ solved[:, :p] + np.diag(precision), solved[:, :p].T @ A)
+        W = walk @ A.T @ (solved[:, p:] - solved[:, :p] @ operator) + self.groups[2] @ operator[p - self.sizes[2] :]
         return np.asarray(W - self.blocks.n @ W / np.sum(self.blocks.n))
 
-    def slow(self, noise: WanderNoise, taken: Array) -> Array:
-        """Return a root (K, r) of what is left of walk and levels, and of what is `taken` (K, K) of the curve."""
-        left = np.eye(len(taken)) - taken
-        walk, levels = self.contrasts.walk * np.sqrt(noise.walk), self.groups[2] * np.sqrt(noise.levels)
-        return np.hstack([left @ walk, left @ levels, taken @ self.groups[1] * np.sqrt(noise.bends)])
+    def left(self, noise: WanderNoise, taken: Array) -> Array:
+        """Return a root (K, r) of the errors that are left where so much is `taken` (K, K), of the curve, too."""
+        white = np.diag(np.sqrt(noise.white * self.contrasts.white))
+        of_noise = [self.contrasts.walk * np.sqrt(noise.walk), self.groups[2] * np.sqrt(noise.levels), white]
+        errors = np.hstack(of_noise)
+        return np.hstack([errors - taken @ errors, taken @ self.groups[1] * np.sqrt(noise.bends)])
