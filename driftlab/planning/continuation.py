@@ -53,8 +53,7 @@ class RecordedSoak(SigmaCurve):
     temperature: Array  # (G,): over the range, degC
     sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
     misfit: Array  # (G, d): the part of it that the kind of map is to blame for
-    bends: Array  # (d,): variance of its bends, as `wandered` has it
-    levels: Array  # (d,): variance of the level of a recording
+    kinds: Array  # (3, d): variances of bends of the curve, and of level and shape of a recording, as `wandered` has it
 
     @property
     def T(self) -> Array:
@@ -74,7 +73,7 @@ class RecordedSoak(SigmaCurve):
     def expected(self, more: Sequence[Array]) -> CurveError:
         """Return the error of the map that is fitted to these and to `more` recordings at T (N_r,), noise alone."""
         parts, subject = [*(T for T, _ in self.parts), *more], self.subject
-        T, noises = np.concatenate(parts), (subject.noise, subject.walk, self.bends, self.levels)
+        T, noises = np.concatenate(parts), (subject.noise, subject.walk, *self.kinds)
         still = replace(subject, walk=np.zeros_like(subject.walk)).drawn(T, self.dt, seed=0)
         return expected_joint_error(parts, self.dt, list(zip(*noises, strict=True)), subject.map.smoother(T, still))
 
@@ -139,13 +138,14 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
         shape=straight.bias, shape_of="as fitted so far",
     )  # fmt: skip
     unknown = np.var(bias, axis=0)  # the level of a recording after one, of which nothing is known
-    levels = unknown if joint is None else np.array([own.levels for own in joint.noises])
-    bends = unknown if found is None else np.array([own.bends for own in found.noises])
+    kinds = np.stack([unknown, unknown, 0 * unknown] if found is None else np.array(found.noises).T[2:])
+    if joint is None:
+        kinds[1:] = unknown, 0 * unknown
     grid = np.linspace(chamber.low, chamber.high, GRID)
     near = EDGE * chamber.swing
     inside = (grid >= T.min() - near) & (grid <= T.max() + near)
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
-    before = RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, np.zeros_like(sigma), bends, levels)
+    before = RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, np.zeros_like(sigma), kinds)
     alone = expected_curve_error(T_m, step, noise, walk, answer) if joint is None else before.expected([])
     return replace(before, misfit=np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone.variance(grid), 0.0, None)))
 

@@ -2,13 +2,15 @@
 
 The blocks of all recordings (`fusion_core.thermal.soak_noise`) are::
 
-    y = f(T) + o_r + walk + white,    o_r ~ N(0, tau^2) in each recording,    f = line + N(0, rho^2 P^+)
+    y = f(T) + o_r + g_r(T) + walk + white,    f = line + N(0, rho^2 P^+),    o_r ~ N(0, tau^2)
 
-with walk and white as there, and f straight lines between knots, whose bends have the penalty P. White noise and walk
-are the means over their restricted likelihood beside a free curve and free levels, tau and rho the likeliest beside
-these; tau is at least what the walk makes in the time of a recording, since it goes on in a pause, too.
+with walk and white as there. f are straight lines between knots, whose bends have the penalty P; recording r has its
+level o_r and its shape g_r, a random walk over temperature of the variance eta^2 over the range: a bias that lags or
+remembers has another curve in each kind of soak. White noise and walk are the means over their restricted likelihood
+beside a free curve and free levels, rho, tau and eta the likeliest beside these; tau is at least what the walk makes in
+the time of a recording, since it goes on in a pause, too.
 
-Each recording says its means in cells of temperature. The mean of o_r and walk, given these, is taken off the samples:
+Each recording says its means in cells of temperature. The mean of o_r + g_r + walk, given these, is taken off samples:
 by the equations of the mixed model, least squares on the rest are generalised least squares on the means, whichever
 kind of map is fitted. So a recording has weight by what it knows of the curve at a temperature, and not by its number
 of samples. Blocks of their own would say more if the bias were a curve and a walk; but one that lags or remembers
@@ -32,21 +34,25 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.curve_uncertainty import KnownErrors, answered, curve_error
 from fusion_core.thermal.penalised import smooth_lines
-from fusion_core.thermal.soak_noise import CELLS, MIN_BLOCKS, Contrasts, Smoother, blocks_of
+from fusion_core.thermal.soak_noise import MIN_BLOCKS, Contrasts, Smoother, blocks_of
 from fusion_core.threads import one_thread
 
+CELLS = 8, 40  # of temperature, fewest and most
+MEANS = 240  # in cells of all recordings, about
 STRAIGHT = 1e-9  # of the largest eigenvalue of the penalty: a shape that bends less is a line
-TRIED = np.arange(-20.0, 5.0, 4.0)  # logarithms of rho^2 and tau^2 by the blocks' variance, to begin from
+TRIED = np.arange(-20.0, 5.0, 6.0)  # logarithms of rho^2, tau^2 and eta^2 by the blocks' variance, to begin from
 LEAST, MOST = -24.0, 8.0
+LITTLE = 1e-9  # of the noise: no combination of blocks is without
 
 
 class WanderNoise(NamedTuple):
-    """Variances of one axis: the walk over all samples, white noise of a mean block, bends (rho^2), levels (tau^2)."""
+    """Variances of one axis: of the walk over all samples, of white noise of a mean block, and rho^2, tau^2, eta^2."""
 
     walk: float
     white: float
     bends: float
     levels: float
+    shapes: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +98,7 @@ def wandered(T: Array, bias: Array, starts: Sequence[int]) -> Wandered | None:
             return None
         y = design.blocks.y
         noises = tuple(design.noise(column) for column in y.T)
-        operators = [design.taken(noise) for noise in noises]
-        roots = [design.left(noise, W) for noise, W in zip(noises, operators, strict=True)]
+        operators, roots = zip(*map(design.left, noises), strict=True)
     taken = np.stack([W @ column for W, column in zip(operators, y.T, strict=True)], axis=1)
     errors = KnownErrors(design.blocks, roots, [noise.white for noise in noises])
     return Wandered(taken[design.blocks.of_sample], noises, errors)
@@ -104,90 +109,80 @@ def expected_joint_error(
 ) -> CurveError:
     """Return the error of a curve that is fitted jointly to recordings at T (N_r,) each, samples `dt` apart in s.
 
-    `noises` are, of each axis, the densities of white noise and walk, and the variances of bends and levels.
+    `noises` are, of each axis, the densities of white noise and walk, and rho^2, tau^2 and eta^2.
     """
     T, starts = np.concatenate(parts), np.cumsum([0, *map(len, parts)])[:-1].tolist()
     with one_thread():
         design = WanderDesign(T, np.zeros((len(T), len(noises))), starts)
         n, roots = design.blocks.n, []
-        for white, walk, bends, levels in noises:
-            noise = WanderNoise(walk**2 * np.sum(n) * dt, white**2 / (float(np.mean(n)) * dt), bends, levels)
-            roots.append(design.left(noise, design.taken(noise)))
+        for white, walk, *kinds in noises:
+            noise = WanderNoise(walk**2 * np.sum(n) * dt, white**2 / (float(np.mean(n)) * dt), *kinds)
+            roots.append(design.left(noise)[1])
         return answered(T, design.blocks, roots, smoother)
 
 
 class WanderDesign:
-    """Blocks of samples T (N,) and bias (N, d), their `means` (m, K), and the columns of their curve and levels.
+    """Blocks of samples T (N,) and bias (N, d), their `means` (m, K), and covariances (K, K) of 1 of what they hold.
 
-    `groups` are columns of a free line (K, 2), of bends (K, q), and of levels (K, R - 1): contrasts of the recordings,
-    since their mean is of the line. `columns` (m, p) are the means of all.
+    `line` (K, 2) are columns of a free line, `kinds` the covariances of bends, levels and shapes of recordings.
     """
 
     def __init__(self, T: Array, bias: Array, starts: Sequence[int]) -> None:
-        R = len(starts)
+        self.R = R = len(starts)
         recording = np.repeat(np.arange(R), np.diff([*starts, len(T)]))
         self.blocks = blocks = blocks_of(T, bias, recording)
         Z = np.asarray(blocks.shares(recording, R).toarray().T > 0, dtype=np.float64)
-        self.contrasts = Contrasts(blocks, Z)
-        low, high = float(blocks.fine[0]), float(blocks.fine[-1])
-        basis = smooth_lines((low, high))
-        e, U = np.linalg.eigh(basis.penalty)
-        some = e > STRAIGHT * e[-1]
-        bends = basis.values(blocks.fine) @ (U[:, some] / np.sqrt(e[some]))
-        line = np.stack([np.ones_like(blocks.fine), (blocks.fine - low) / (high - low)], axis=1)
-        apart = np.linalg.qr(np.hstack([np.ones((R, 1)), np.eye(R)[:, 1:]]))[0][:, 1:]
-        self.groups = blocks.over @ line, blocks.over @ bends, Z @ apart
-        cell = np.minimum(((blocks.T - low) * (CELLS / (high - low))).astype(np.int64), CELLS - 1)
-        place = np.unique(np.argmax(Z, axis=1) * CELLS + cell, return_inverse=True)[1]
-        means = (place == np.arange(np.max(place) + 1)[:, None]) * blocks.n
+        self.contrasts, same = Contrasts(blocks, Z), Z @ Z.T
+        u, x = (blocks.T - blocks.T.min()) / np.ptp(blocks.T), blocks.fine - blocks.fine[0]
+        basis = smooth_lines((float(blocks.fine[0]), float(blocks.fine[-1])))
+        curve = blocks.over @ basis.values(blocks.fine)
+        bends = curve @ np.linalg.pinv(basis.penalty, rcond=STRAIGHT, hermitian=True) @ curve.T
+        self.line = blocks.over @ np.stack([np.ones_like(x), x / x[-1]], axis=1)
+        self.kinds = bends, same, same * np.minimum.outer(u, u)
+        cells = int(np.clip(MEANS // R, *CELLS))
+        cell = np.argmax(Z, axis=1) * cells + np.minimum((u * cells).astype(np.int64), cells - 1)
+        means = (cell == np.unique(cell)[:, None]) * blocks.n
         self.means = means / np.sum(means, axis=1, keepdims=True)
-        self.columns, self.sizes = self.means @ np.hstack(self.groups), [group.shape[1] for group in self.groups]
 
     @property
     def separates(self) -> bool:
         """True where there are blocks enough to separate walk from white noise."""
-        return len(self.blocks.T) - len(self.contrasts.knots) - self.sizes[2] >= MIN_BLOCKS
+        return len(self.blocks.T) - len(self.contrasts.knots) - self.R >= MIN_BLOCKS
 
     def noise(self, y: Array) -> WanderNoise:
         """Return the variances in blocks y (K,)."""
         from scipy.optimize import minimize
 
-        found = self.contrasts.noise(y, np.eye(len(y)))
-        scale = float(np.mean(y**2)) or 1.0
-        root = np.linalg.qr((self.means @ found.root).T)[1].T
-        white = np.linalg.solve(root, np.column_stack([self.columns, self.means @ y]))
-        N = white.T @ white
-        G, b, varied = N[:-1, :-1], N[:-1, -1], self.sizes[0]
+        A, found, scale = self.means, self.contrasts.noise(y, np.eye(len(y))), float(np.mean(y**2)) or 1.0
+        X, of_noise = np.column_stack([A @ self.line, A @ y]), A @ found.root @ found.root.T @ A.T
+        kinds = [scale * A @ C @ A.T for C in self.kinds]
 
-        def cost(logs: tuple[float, float] | Array) -> float:
+        def cost(logs: tuple[float, ...] | Array) -> float:
             """Minus twice the logarithm of the restricted likelihood."""
-            precision = np.repeat([0.0, *np.exp(-np.asarray(logs)) / scale], self.sizes)
-            L = np.linalg.cholesky(G + np.diag(precision))
-            explained = np.linalg.solve(L, b)
-            return float(2 * np.sum(np.log(np.diag(L))) - np.sum(np.log(precision[varied:])) - explained @ explained)
+            L = np.linalg.cholesky(of_noise + sum(np.exp(log) * C for log, C in zip(logs, kinds, strict=True)))
+            R = np.linalg.qr(np.linalg.solve(L, X))[1]
+            return float(2 * np.sum(np.log(np.diag(L))) + 2 * np.sum(np.log(np.abs(np.diag(R)[:2]))) + R[2, 2] ** 2)
 
-        paused = float(np.clip(np.log(max(found.walk, 1e-300) / (self.sizes[2] + 1) / scale), LEAST, MOST - 1))
-        begin: Array = np.array(min(((r, max(t, paused)) for r in TRIED for t in TRIED), key=cost))
-        bounds = [(LEAST, MOST), (paused, MOST)]
+        paused = float(np.clip(np.log(max(found.walk, 1e-300) / self.R / scale), LEAST, MOST - 1))
+        begin: Array = np.array(min(((r, max(t, paused), g) for r in TRIED for t in TRIED for g in TRIED), key=cost))
+        bounds = [(LEAST, MOST), (paused, MOST), (LEAST, MOST)]
         logs = minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options={"xatol": 0.05, "fatol": 0.01}).x
-        bends, levels = (scale * np.exp(logs)).tolist()
-        return WanderNoise(found.walk, found.white, bends, levels)
+        return WanderNoise(found.walk, found.white, *(scale * np.exp(logs)).tolist())
 
-    def taken(self, noise: WanderNoise) -> Array:
-        """Return the operator (K, K) that takes blocks to the mean of their levels and walk, less that over all."""
-        A, walk = self.means, noise.walk * self.contrasts.covariance
-        least = 1e-9 * (noise.walk + noise.white) + 1e-12 * (noise.bends + noise.levels)  # of samples without noise
-        V = A @ (walk + np.diag(noise.white * self.contrasts.white + least)) @ A.T
-        solved = np.linalg.solve(V, np.hstack([self.columns, A]))
-        p = self.columns.shape[1]
-        precision = np.repeat([0.0, 1 / noise.bends, 1 / noise.levels], self.sizes)
-        operator = np.linalg.solve(self.columns.T @ solved[:, :p] + np.diag(precision), solved[:, :p].T @ A)
-        W = walk @ A.T @ (solved[:, p:] - solved[:, :p] @ operator) + self.groups[2] @ operator[p - self.sizes[2] :]
-        return np.asarray(W - self.blocks.n @ W / np.sum(self.blocks.n))
+    def left(self, noise: WanderNoise) -> tuple[Array, Array]:
+        """Return the operator (K, K) that takes blocks to their wander, and a root (K, K) of the errors that it leaves.
 
-    def left(self, noise: WanderNoise, taken: Array) -> Array:
-        """Return a root (K, r) of the errors that are left where so much is `taken` (K, K), of the curve, too."""
-        white = np.diag(np.sqrt(noise.white * self.contrasts.white))
-        of_noise = [self.contrasts.walk * np.sqrt(noise.walk), self.groups[2] * np.sqrt(noise.levels), white]
-        errors = np.hstack(of_noise)
-        return np.hstack([errors - taken @ errors, taken @ self.groups[1] * np.sqrt(noise.bends)])
+        The wander is the mean of level, shape and walk, less that over all samples.
+        """
+        bends, levels, shapes = (
+            size * C for size, C in zip((noise.bends, noise.levels, noise.shapes), self.kinds, strict=True)
+        )
+        wander, A, n = noise.walk * self.contrasts.covariance + levels + shapes, self.means, self.blocks.n
+        least = LITTLE * (noise.walk + noise.white + noise.levels)  # of samples without noise
+        white, X = np.diag(noise.white * self.contrasts.white + max(least, np.finfo(float).tiny)), A @ self.line
+        solved = np.linalg.solve(A @ (wander + white + bends) @ A.T, np.hstack([X, A]))
+        line = np.linalg.solve(X.T @ solved[:, :2], solved[:, :2].T @ A)
+        W = wander @ A.T @ (solved[:, 2:] - solved[:, :2] @ line)
+        W -= n @ W / np.sum(n)
+        rest = np.eye(len(n)) - W
+        return W, np.linalg.cholesky(rest @ (wander + white) @ rest.T + W @ bends @ W.T + least * np.eye(len(n)))
