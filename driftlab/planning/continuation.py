@@ -138,9 +138,9 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
         shape=straight.bias, shape_of="as fitted so far",
     )  # fmt: skip
     unknown = np.var(bias, axis=0)  # the level of a recording after one, of which nothing is known
-    kinds = np.stack([unknown, unknown, 0 * unknown] if found is None else np.array(found.noises).T[2:])
-    if joint is None:
-        kinds[1:] = unknown, 0 * unknown
+    kinds = np.array([unknown, unknown, 0 * unknown])
+    if found is not None:
+        kinds[: 1 if joint is None else 3] = np.array(found.noises).T[2 : 3 if joint is None else 5]
     grid = np.linspace(chamber.low, chamber.high, GRID)
     near = EDGE * chamber.swing
     inside = (grid >= T.min() - near) & (grid <= T.max() + near)

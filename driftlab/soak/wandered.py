@@ -42,6 +42,7 @@ MEANS = 240  # in cells of all recordings, about
 STRAIGHT = 1e-9  # of the largest eigenvalue of the penalty: a shape that bends less is a line
 TRIED = np.arange(-20.0, 5.0, 6.0)  # logarithms of rho^2, tau^2 and eta^2 by the blocks' variance, to begin from
 LEAST, MOST = -24.0, 8.0
+NOTHING = 1e-30  # SI, of a channel that is zero
 LITTLE = 1e-9  # of the noise: no combination of blocks is without
 
 
@@ -153,8 +154,11 @@ class WanderDesign:
         """Return the variances in blocks y (K,)."""
         from scipy.optimize import minimize
 
-        A, found, scale = self.means, self.contrasts.noise(y, np.eye(len(y))), float(np.mean(y**2)) or 1.0
-        X, of_noise = np.column_stack([A @ self.line, A @ y]), A @ found.root @ found.root.T @ A.T
+        A, found, scale = self.means, self.contrasts.noise(y, np.eye(len(y))), float(np.mean(y**2))
+        if scale < NOTHING:
+            return WanderNoise(0.0, 0.0, 0.0, 0.0, 0.0)
+        X = np.column_stack([A @ self.line, A @ y])
+        of_noise = A @ found.root @ found.root.T @ A.T + LITTLE * scale * np.eye(len(A))
         kinds = [scale * A @ C @ A.T for C in self.kinds]
 
         def cost(logs: tuple[float, ...] | Array) -> float:
@@ -178,8 +182,8 @@ class WanderDesign:
             size * C for size, C in zip((noise.bends, noise.levels, noise.shapes), self.kinds, strict=True)
         )
         wander, A, n = noise.walk * self.contrasts.covariance + levels + shapes, self.means, self.blocks.n
-        least = LITTLE * (noise.walk + noise.white + noise.levels)  # of samples without noise
-        white, X = np.diag(noise.white * self.contrasts.white + max(least, np.finfo(float).tiny)), A @ self.line
+        least = LITTLE * (noise.walk + noise.white + noise.levels) + NOTHING  # of samples without noise
+        white, X = np.diag(noise.white * self.contrasts.white + least), A @ self.line
         solved = np.linalg.solve(A @ (wander + white + bends) @ A.T, np.hstack([X, A]))
         line = np.linalg.solve(X.T @ solved[:, :2], solved[:, :2].T @ A)
         W = wander @ A.T @ (solved[:, 2:] - solved[:, :2] @ line)
