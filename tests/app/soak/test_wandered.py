@@ -1,4 +1,4 @@
-"""Joint fits of several recordings are generalised least squares: against a dense solution, and where more is recorded."""
+"""Joint fits of several recordings: generalised least squares by a dense solution, and errors within sigma."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_least_squares_on_what_is_left_are_generalised_least_squares():
     design = WanderDesign(T, drawn(profiles, 0), [0, len(profiles[0])])
     noise = WanderNoise(walk=40.0, white=0.3, bends=0.0, levels=25.0, shapes=2.0)
     A, y, n = design.means, design.blocks.y[:, 0], design.blocks.n
-    bends, levels, shapes = design.kinds
+    _, levels, shapes = design.kinds
     white = np.diag(0.3 * np.mean(n) / n)
     V = A @ (40.0 * design.contrasts.covariance + 25.0 * levels + 2.0 * shapes + white) @ A.T
     X = A @ design.line
