@@ -56,7 +56,7 @@ def one(seed):
     parts = [before.parts[0], (T_2[: len(own)], curve(T_2)[: len(own)] + own)]
     both = of_samples(parts, 1.0, subject, CHAMBER)
     straight = replace(both.map, outside="tangent")
-    error = straight.bias(both.grid) - curve(both.grid)
+    error = straight.bias(both.temperature) - curve(both.temperature)
     error -= np.mean(straight.bias(both.T) - curve(both.T), axis=0)
     sigmas = [rms(item.sigma) for item in (before, foretold, both)]
     return np.stack(sigmas) * UNIT.factor, rms(error) * UNIT.factor

@@ -23,6 +23,7 @@ from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
 from driftlab.soak.placements import Placements, placed
 from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import between_steps, of_thermometer, soak_temperatures, without_noise
+from driftlab.soak.wander import Wander, fitted_jointly, wander_of
 from driftlab.units import BiasUnit, duration
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap, TriadMatrix
@@ -99,7 +100,7 @@ def fit_gathered(
     about = {**soak.about, **provenance(settings, soak.names), **(more or {})}
     bias = soak.of_both_ways if of_both_ways else soak.bias
     try:
-        fitted = settings.fit(_to_fit(soak), bias, about)
+        fitted = fitted_jointly(settings, _to_fit(soak), bias, about, soak.wander(bias))
     except (SingularFit, SwingTooSmall) as error:
         raise type(error)(_likelier(error, soak)) from None
     if bias is not soak.bias:
@@ -273,6 +274,11 @@ class GatheredSoak:
         between = _smooth(T, difference, up * down / (up + down), self.T)
         way = np.repeat(self.summary.way, np.round(self.summary.span / self.interval).astype(np.int64))
         return np.asarray(self.bias - way[:, None] * between / 2 * self.memory.apart)
+
+    def wander(self, bias: Array) -> Wander | None:
+        """Return the wander of `bias` (N, d) in several recordings; None of one, and where levels are known."""
+        several = len(self.starts) > 1 and self.placements is None
+        return wander_of(self.T, bias, self.starts) if several else None
 
     def rows(self, channel: str) -> tuple[SoakRows, ...]:
         """Return the rows of samples with their windows, of each recording or placement; `channel` is the sensor's."""

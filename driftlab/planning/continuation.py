@@ -28,11 +28,12 @@ from driftlab.planning.search import (
 )
 from driftlab.planning.unit_model import UnitModel
 from driftlab.soak.blocks import means, runs
+from driftlab.soak.wander import expected_joint_error, fitted_jointly, wander_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.faults import Faults
+from fusion_core.thermal.curve_error import CurveError
 from fusion_core.thermal.curve_uncertainty import expected_curve_error, measured_noise
-from fusion_core.threads import one_thread
 
 LITTLE = 0.05  # of sigma: an hour that gains less is not worth it
 EDGE = 0.02  # of the range, by which its end may be missed
@@ -52,6 +53,9 @@ class RecordedSoak(SigmaCurve):
     temperature: Array  # (G,): over the range, degC
     sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
     misfit: Array  # (G, d): the part of it that the kind of map is to blame for
+    kinds: (
+        Array  # (3, d): variances of bends of the curve, and of level and shape of a recording, as `wander_of` has it
+    )
 
     @property
     def T(self) -> Array:
@@ -67,6 +71,13 @@ class RecordedSoak(SigmaCurve):
     def hours(self) -> float:
         """Length in all."""
         return len(self.T) * self.dt / 3600
+
+    def expected(self, more: Sequence[Array]) -> CurveError:
+        """Return the error of the map that is fitted to these and to `more` recordings at T (N_r,), noise alone."""
+        parts, subject = [*(T for T, _ in self.parts), *more], self.subject
+        T, noises = np.concatenate(parts), (subject.noise, subject.walk, *self.kinds)
+        still = replace(subject, walk=np.zeros_like(subject.walk)).drawn(T, self.dt, seed=0)
+        return expected_joint_error(parts, self.dt, list(zip(*noises, strict=True)), subject.map.smoother(T, still))
 
     @property
     def seen(self) -> tuple[float, float]:
@@ -113,38 +124,40 @@ def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tup
 def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:
     """Return the soak of samples, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
-    fitted = subject.map.fit(T, bias, {})
+    found = wander_of(T, bias, np.cumsum([0, *(len(T_r) for T_r, _ in parts)])[:-1].tolist())
+    joint = found if len(parts) > 1 else None
+    fitted = fitted_jointly(subject.map, T, bias, {}, joint)
     many = int(np.ceil(len(T) / SAMPLES[1]))
     cuts = [runs([0], len(T_r), many) for T_r, _ in parts]
     rows = tuple((means(T_r, own), means(b_r, own)) for (T_r, b_r), own in zip(parts, cuts, strict=True))
     T_m, b_m = (np.concatenate(values) for values in zip(*rows, strict=True))
     answer, step = subject.map.smoother(T_m, b_m), dt * many
-    noise, walk = measured_noise(T_m, b_m - fitted.bias(T_m), step, answer)
+    measured = measured_noise(T_m, b_m - fitted.bias(T_m), step, answer)
+    noise, walk = measured if joint is None else joint.densities(dt)
     straight = replace(fitted, outside="tangent")
     known = replace(
         subject, noise=noise, walk=walk, noise_of="measured on what was recorded",
         shape=straight.bias, shape_of="as fitted so far",
     )  # fmt: skip
+    unknown = np.var(bias, axis=0)  # the level of a recording after one, of which nothing is known
+    kinds = np.array([unknown, unknown, 0 * unknown])
+    if found is not None:
+        kinds[: 1 if joint is None else 3] = np.array(found.noises).T[2 : 3 if joint is None else 5]
     grid = np.linspace(chamber.low, chamber.high, GRID)
     near = EDGE * chamber.swing
     inside = (grid >= T.min() - near) & (grid <= T.max() + near)
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
-    alone = expected_curve_error(T_m, step, noise, walk, answer).variance(grid)
-    misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone, 0.0, None))
-    return RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, misfit)
+    before = RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, np.zeros_like(sigma), kinds)
+    alone = expected_curve_error(T_m, step, noise, walk, answer) if joint is None else before.expected([])
+    return replace(before, misfit=np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone.variance(grid), 0.0, None)))
 
 
 def jointly(profile: Profile, before: RecordedSoak) -> RatedProfile:
     """Return the rating of the map that is fitted to the recordings and a further profile together."""
-    subject, chamber = before.subject, before.chamber
+    chamber, grid = before.chamber, before.temperature
     new = profile.samples(chamber.lag, max(int(profile.duration / before.dt), 2))[1]
-    T = np.concatenate([before.T, new])
-    bias = np.concatenate([before.bias, subject.drawn(new, before.dt, seed=0)])
-    with one_thread():
-        answer = subject.map.smoother(T, bias)
-        error = expected_curve_error(T, before.dt, subject.noise, subject.walk, answer)
-    grid = before.temperature
-    return RatedProfile.of(profile, chamber, T, grid, error.variance(grid), before.misfit**2)
+    T, variance = np.concatenate([before.T, new]), before.expected([new]).variance(grid)
+    return RatedProfile.of(profile, chamber, T, grid, variance, before.misfit**2)
 
 
 def continuation_of(

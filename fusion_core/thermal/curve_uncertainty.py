@@ -11,6 +11,7 @@ that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d ax
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from fusion_core.thermal.soak_noise import (
     blocks_of,
     cells_of,
     straight_pieces,
+    summed,
     walk_root,
 )
 
@@ -38,13 +40,36 @@ MIN_VARIANCE = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
 HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
 TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
+LEAST = 1e-9  # of the mean variance of blocks: no combination of them is without noise
 NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 SURE = 2.0  # deviations of the place of a misfit, of which chance is excluded by all places together
 
 
-def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother) -> CurveError:
+@dataclass(frozen=True, eq=False)
+class KnownErrors:
+    """Errors of the K blocks of d axes: roots (K, r) of their covariance, and the variance of white noise (d,) in it.
+
+    The white noise is that of a mean block.
+    """
+
+    blocks: Blocks
+    roots: Sequence[Array]
+    white: Sequence[float]
+
+    def noise(self, contrasts: Contrasts, blocks: Blocks, axis: int) -> BlockNoise:
+        """Return them as the noise of an axis of these blocks, of which a curve leaves `blocks.y` (K, d)."""
+        S, white = self.roots[axis] @ self.roots[axis].T, self.white[axis]
+        S[np.diag_indices(len(S))] += max(LEAST * np.trace(S) / len(S), np.finfo(float).tiny)
+        return contrasts.known(S, blocks.y[:, axis], 0.0, white)
+
+
+def curve_error(
+    kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother, known: KnownErrors | None = None
+) -> CurveError:
     """Return the error of a curve that was fitted to samples T (N,) and bias (N, d), in the order of time.
+
+    Their noise is that of the blocks where it is `known`, and else follows from what the curve leaves.
 
     Raises
     ------
@@ -55,7 +80,7 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     grid = np.linspace(*domain, GRID)
     d = bias.shape[1]
     left = bias - predict(T)
-    blocks = blocks_of(T, left)
+    blocks = blocks_of(T, left) if known is None else summed(T, left, known.blocks.of_sample)
     holes = find_holes(T)
     fitted = predict(np.sort(blocks.T))
     swing = np.ptp(fitted, axis=0)
@@ -65,7 +90,7 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     found_ripples = ripples(T, left, float(np.median(np.diff(contrasts.knots))))
     per_axis, misfits = zip(
         *(
-            _axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis], found_ripples[axis])
+            _axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis], found_ripples[axis], known)
             for axis in range(d)
         ),
         strict=True,
@@ -84,10 +109,20 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     error = fitted.record.error
     if error is None:
         return fitted
-    grid = np.asarray(error.T)
-    more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
-    modes_kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    return fitted.noting(error=error.model_copy(update={"modes": (*modes_kept, *nested(modes_of_axes(more)))}))
+    more = _answers(blocks, np.asarray(error.T), smoother, errors)
+    kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
+    return fitted.noting(error=error.model_copy(update={"modes": (*kept, *nested(modes_of_axes(more)))}))
+
+
+def answered(T: Array, blocks: Blocks, errors: Sequence[Array], smoother: Smoother) -> CurveError:
+    """Return the error of a curve on samples at T (N,) whose blocks have errors of the roots (K, r), one an axis."""
+    grid = np.linspace(T.min(), T.max(), GRID)
+    return _joined(grid, _answers(blocks, grid, smoother, errors), np.zeros(len(errors)), find_holes(T))
+
+
+def _answers(blocks: Blocks, grid: Array, smoother: Smoother, errors: Sequence[Array]) -> list[Array]:
+    """Return the modes (r, G) of each axis."""
+    return [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
@@ -106,15 +141,10 @@ def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoothe
     smoother : function
         How the kind of map answers to noise (`ThermalMap.smoother`).
     """
-    d = len(noise)
-    grid = np.linspace(T.min(), T.max(), GRID)
-    blocks = blocks_of(T, np.zeros((len(T), d)))
-    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.sqrt(1 / (blocks.n * dt))
-    modes = []
-    for axis in range(d):
-        H = _answer(blocks, grid, smoother, axis)
-        modes.append(_largest(np.column_stack([H @ wandering * walk[axis], H * white * noise[axis]])))
-    return _joined(grid, modes, np.zeros(d), find_holes(T))
+    blocks = blocks_of(T, np.zeros((len(T), len(noise))))
+    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.diag(np.sqrt(1 / (blocks.n * dt)))
+    errors = [np.hstack([wandering * w, white * n]) for n, w in zip(noise, walk, strict=True)]
+    return answered(T, blocks, errors, smoother)
 
 
 def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> CurveError:
@@ -199,7 +229,7 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
 
 def _axis_modes(
     blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int, smoothed: Array,
-    ripple: Ripple | None,
+    ripple: Ripple | None, known: KnownErrors | None,
 ) -> tuple[Array, Misfit | None]:  # fmt: skip
     """Return the modes (r, G) of the curve's error, and where a misfit is seen.
 
@@ -209,7 +239,7 @@ def _axis_modes(
     both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
     taken = np.asarray(blocks.over @ both[G:])
     H, left = both[:G] - (blocks.n / np.sum(blocks.n)) @ taken, np.eye(K) - taken
-    noise = contrasts.noise(blocks.y[:, axis], left)
+    noise = contrasts.noise(blocks.y[:, axis], left) if known is None else known.noise(contrasts, blocks, axis)
     modes = np.column_stack([H @ noise.root, smoothed])
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
     if np.any(shape):

@@ -15,7 +15,7 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -198,18 +198,23 @@ class Contrasts:
 
     def noise(self, y: Array, left: Array) -> BlockNoise:
         """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
-        from scipy.linalg import cho_solve
-
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
         k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
         if K - self._free.shape[1] >= MIN_BLOCKS:
             k2, s2 = _expected(*self._turned(y / scale, left))
         S = k2 * self.covariance
         S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
+        found = self.known(S, y, k2 * scale**2, s2 * scale**2)
+        return replace(found, root=scale * found.root)
+
+    def known(self, S: Array, y: Array, walk: float, white: float) -> BlockNoise:
+        """Return the noise of a covariance S (K, K), in blocks of which a map leaves y (K,)."""
+        from scipy.linalg import cho_solve
+
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
         weighted = np.asarray(cho_solve((root, True), self.X, check_finite=False))
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
-        return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
+        return BlockNoise(root, operator @ y, operator, walk, white)
 
     def _turned(self, y: Array, left: Array) -> tuple[Array, Array]:
         """Return the walk's covariance (r, r) and u (r,) in contrasts turned so that white noise has one of 1.
