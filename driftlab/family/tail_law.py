@@ -23,7 +23,7 @@ from fusion_core.contracts import SLAB
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
 ALIKE = 0.9  # chance that both sides are
-SHARES = (0.002, 0.01)  # of odd values: of all axes together, each unit may have one or two
+SHARES = (0.002, 0.01, 0.05)  # of odd values: of all axes together, each unit may have one or two, or many units are
 SURE = 0.7  # of a unit: what a width found robustly is worth
 MIN_UNITS = 8
 WIDTH = 1e-9  # of the largest deviation: a side without has no width

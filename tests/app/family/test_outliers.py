@@ -69,6 +69,18 @@ def test_a_law_that_ends_on_one_side_has_no_heavy_tail_there() -> None:
     assert np.median(high) > 1e-3
 
 
+def test_many_odd_units_leave_the_tails_as_they_are():
+    """Of 60 units 8 are off by twelve deviations: five are still rare, of a Gaussian law; a heavy one stays heavy."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        x = rng.normal(size=(60, 3))
+        x[:8] += 12 * rng.choice([-1, 1], size=(8, 3))
+        assert np.all(TailLaw.of(x).p(np.full((1, 3), 5.0), upper=False) < 0.003)
+    heavy = [TailLaw.of(np.random.default_rng(seed).standard_t(3, size=(60, 3))).share for seed in range(20)]
+    assert np.mean(np.array(heavy)[:, :, :2].sum(axis=2)) > 4 * 0.1  # before the data are seen, 0.1
+
+
+
 def test_where_most_values_are_the_same_others_are_judged_by_their_own_deviations() -> None:
     """Of most units a walk does not show: one that shows by a deviation is like them, one by eight is not."""
     x = np.concatenate([np.zeros((12, 1)), [[0.9], [1.2], [1.5], [8.0]]])
