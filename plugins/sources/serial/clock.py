@@ -23,7 +23,7 @@ import numpy as np
 from fusion_core.chunk import Array, Flags, Integers
 from fusion_core.contracts.framing import Counter
 from fusion_core.errors import seconds
-from fusion_core.faults import LOST, Faults
+from fusion_core.faults import LOST, RESTARTS, Faults
 
 TOLERANCE = 0.25  # s between the two clocks over one read, and
 DRIFT = 0.01  # of the time that has passed: more is no jitter
@@ -119,7 +119,7 @@ class SampleClock:
         steps = np.where(stuck, self.step, steps)
         others = int(np.sum(steps) - steps[k])
         steps[k] = max(self.step, round(elapsed / self.pace) - others)
-        self._report("restarts of the device's counter", 1)
+        self._report(RESTARTS, 1)
         return steps
 
     def _judge(self) -> None:
