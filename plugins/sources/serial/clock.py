@@ -108,7 +108,8 @@ class SampleClock:
         away = np.sum(steps) * self.pace - elapsed
         stuck = steps <= 0
         stuck[0] &= not first
-        if abs(away) > TOLERANCE + DRIFT * elapsed or np.any(stuck):
+        burst = away > 0 and np.max(steps) < 2 * self.step  # of samples that had waited: none is missing
+        if (abs(away) > TOLERANCE + DRIFT * elapsed and not burst) or np.any(stuck):
             return self._restarted(steps, elapsed, stuck)
         lost = int(np.sum(np.maximum(np.rint(steps[int(first) :] / self.step) - 1, 0)))
         self._report(LOST, lost)

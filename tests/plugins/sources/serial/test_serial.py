@@ -192,6 +192,7 @@ def test_a_backlog_at_the_start_is_no_other_rate(clock):
         seen.append(len(faults.found))
     assert not [what for what in faults.found if what.startswith("rate not as declared")], faults.found
     assert seen[-1] == 0 or not any("source.interval" in what for what in faults.found)
+    assert RESTARTS not in faults.found  # no sample is missing
 
 
 def test_advice_on_the_rate_is_taken_back_when_it_is_no_longer_so():
