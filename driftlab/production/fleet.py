@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,7 +22,7 @@ from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
 from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
+from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress, some
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS
 from driftlab.production.unit_terms import terms_of_units
@@ -161,7 +161,19 @@ def fleet(
             command.to_database(database, summary)
         if not command.status.done:
             raise _none_done(command.status.failed, str(units))
+        _check_noted(options.notes, summary["family"] or {})
         return FleetResult(Path(out), summary)
+
+
+def _check_noted(notes: Iterable[str], family: Mapping[str, Any]) -> None:
+    """Raise ConfigError where there is a note on a unit without an alarm; all else is done by then."""
+    known = family.get("acknowledged", {})
+    if none := sorted(set(notes) - known.keys()):
+        alarmed = sorted({*family.get("open", ()), *known})
+        raise ConfigError(
+            f"--acknowledge {quote(none[0])}: is neither odd nor out of control, so its note is not kept; all else is "
+            f"done; {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has an alarm'}"
+        )
 
 
 def _none_done(failed: RecordsOfUnits, units: str) -> DataError:
@@ -313,7 +325,6 @@ class _Command:
             alarms={line.units[k]: [one.text for one in why] for k, why in alarms(line).items()},
             acknowledged={unit: note.brief() for unit, note in acknowledged.items()},
             open=[unit for unit in about if unit not in acknowledged],
-            without_alarm=[unit for unit in self.jobs.options.notes if unit not in about],
             capability=[
                 row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability
             ],

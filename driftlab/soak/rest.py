@@ -108,8 +108,10 @@ class Used:
     def read(self, faults: Faults, before: Faults) -> None:
         """Take the rows of a recording, and why some were left out, beside the faults before it."""
         self.rows, self.usable = self.rows + faults.rows - before.rows, self.usable + faults.usable - before.usable
-        left_out = {what: fault.count for what, fault in faults.found.items() if "rows" in what and "left out" in what}
-        self.why = max(left_out, key=lambda what: left_out[what], default="").replace(", left out", "")
+        left_out = [(f.count, what, f) for what, f in faults.found.items() if "rows" in what and "left out" in what]
+        if left_out:
+            _, what, fault = max(left_out)
+            self.why = f"{what.replace(', left out', '')}, first {fault.first}"
 
     def note(self, T: Array) -> None:
         """Take the temperatures (N,) of epochs, whether they are used or not."""
@@ -138,6 +140,8 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             refused -= len(part)
             model.check(part, config.site)
             alignment = model.aligned(corrected(part, others), config.site)
+            for text in () if noise else alignment.off:
+                faults.note(text)
             noise.append((float(np.mean(part["temperature"])), len(part), alignment.noise_ratio[channel]))
             if placing is not None:
                 alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])

@@ -12,8 +12,8 @@ from fusion_plugins.thermal_maps.spline import Spline
 DEG_H = np.deg2rad(1 / 3600)
 CHAMBER = Chamber(-20.0, 60.0, 25.0, 1.5 / 60, 480.0)
 SUBJECT = UnitModel(
-    "gyro", ("x", "y"), BiasUnit("rad/s", "deg/h"), Spline(), np.full(2, 2 * DEG_H), np.full(2, 0.03 * DEG_H), "a guess",
-    None, "",
+    "gyro", ("x", "y"), BiasUnit("rad/s", "deg/h"), Spline(), np.full(2, 2 * DEG_H), np.full(2, 0.03 * DEG_H),
+    "a guess", None, "",
 )  # fmt: skip
 
 
