@@ -70,7 +70,7 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
 
 
 def _off(model: MeasurementModel, site: Site, first: Chunk) -> list[str]:
-    """Return what the first rows show, where they are at rest, that known inputs do not; of sensors without a map."""
+    """Return the notes on the first rows, where they are at rest: readings of sensors without a map that are off."""
     model = model.only(first.channels.keys())
     window = concatenate(list(epochs([first], model.update_interval)))
     window = window.part(0, int(np.searchsorted(window.t, window.t[0] + model.align)))

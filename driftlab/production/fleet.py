@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -159,21 +159,8 @@ def fleet(
         summary = command.all()
         if database is not None:
             command.to_database(database, summary)
-        if not command.status.done:
-            raise _none_done(command.status.failed, str(units))
-        _check_noted(options.notes, summary["family"] or {})
+        command.check(str(units), summary["family"] or {})
         return FleetResult(Path(out), summary)
-
-
-def _check_noted(notes: Iterable[str], family: Mapping[str, Any]) -> None:
-    """Raise ConfigError where there is a note on a unit without an alarm; all else is done by then."""
-    known = family.get("acknowledged", {})
-    if none := sorted(set(notes) - known.keys()):
-        alarmed = sorted({*family.get("open", ()), *known})
-        raise ConfigError(
-            f"--acknowledge {quote(none[0])}: is neither odd nor out of control, so its note is not kept; all else is "
-            f"done; {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has an alarm'}"
-        )
 
 
 def _none_done(failed: RecordsOfUnits, units: str) -> DataError:
@@ -304,6 +291,18 @@ class _Command:
             self._timed("tables", written)
         family = self._family(analysis, acknowledged, about)
         return self._mark(complete=True, key=key, family=family, pages=pages)
+
+    def check(self, units: str, family: Mapping[str, Any]) -> None:
+        """Raise DataError where no unit is done, ConfigError where there is a note on a unit without an alarm."""
+        if not self.status.done:
+            raise _none_done(self.status.failed, units)
+        known = family.get("acknowledged", {})
+        if none := sorted(self.jobs.options.notes.keys() - known.keys()):
+            alarmed = sorted({*family.get("open", ()), *known})
+            raise ConfigError(
+                f"--acknowledge {quote(none[0])}: is neither odd nor out of control, so its note is not kept; all else "
+                f"is done; {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has an alarm'}"
+            )
 
     def to_database(self, database: Database, summary: Mapping[str, Any]) -> None:
         """Replace the rows of the fleet in a database by those of `fleet.json`, table and records."""

@@ -74,9 +74,9 @@ class Frames:
         for name, values in self.channels.items():
             old = np.concatenate([before.channels[name][-1:] if before.N else values[:1], values[:-1]])
             again &= ((old == values) | (np.isnan(old) & np.isnan(values))).reshape(self.N, -1).all(axis=1)
-        keep = ~again
+        keep, left = ~again, np.cumsum(~again, dtype=np.int64)
         channels = {name: values[keep] for name, values in self.channels.items()}
-        return Frames(int(np.sum(keep)), channels, self.count[keep], self.rejected), np.cumsum(keep)[again]
+        return Frames(int(left[-1]), channels, self.count[keep], self.rejected), left[again]
 
 
 class Framing(Plugin):
