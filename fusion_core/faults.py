@@ -19,6 +19,7 @@ LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond
 RANGES = {"temperature": (-273.15, 5000.0, "degC")}  # of what can be; a logger writes -999 where it has nothing
 DOUBT = "doubt"  # in the provenance of a map: why its soak may not be what its config said
 LOST = "samples lost on the way, by the device's counter"
+RESTARTS = "restarts or jumps of the device's counter"
 NO_FRAME = "bytes that came for a second or more without a frame, check baudrate and framing"
 
 

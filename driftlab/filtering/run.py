@@ -172,7 +172,7 @@ class Run:
         if waiting.alignment is None:
             return None
         self.journal.alignments.append(waiting.alignment)
-        for text in waiting.alignment.notes:
+        for text in (*waiting.alignment.notes, *waiting.alignment.off):
             self.journal.faults.note(text)
         state = prior_at(self.model, chunk, waiting.alignment)
         return Tracker(self.plan, self.journal, waiting.alignment, state)

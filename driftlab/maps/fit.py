@@ -127,7 +127,8 @@ def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:
     """Return the text of an error with what is likelier its cause: first that most is not used, then the length."""
     unused, lasts = soak.used.sentence(), duration(soak.interval * len(soak.T))
     if soak.used.share > MOST:
-        return f"{unused}; of the {lasts} that are left, {error}"
+        left = str(error).partition(";")[0]  # which says what to do about the soak, and that is not at fault
+        return f"{unused}; the {lasts} that are left are too few ({left}); see why, or record again"
     text = f"{error}; {unused}" if unused else str(error)
     if isinstance(error, SingularFit):
         return text

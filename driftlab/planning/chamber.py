@@ -124,6 +124,14 @@ def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
     return _joined(name, "ramps", chamber, levels, np.full(len(levels), hold), moves)
 
 
+def quickest(chamber: Chamber, cycles: int) -> float:
+    """Return the hours below which `ramps` are None: as fast as chamber and body can."""
+    ends = 2 * cycles + 1
+    rate = _fastest(chamber, ends)
+    moves = abs(chamber.start - chamber.low) / chamber.rate + (ends - 1) * chamber.swing / rate
+    return (1 + 1e-9) * (moves + ends * chamber.settling(rate)) / 3600
+
+
 def mixed(chamber: Chamber, hours: float, cycles: int, step: float) -> Profile | None:
     """Return ramps for half of the hours, then levels up and down: rates and holds that tell effects apart."""
     first, held = ramps(chamber, hours / 2, cycles), None
@@ -147,11 +155,17 @@ def _rate(chamber: Chamber, hours: float, levels: Array) -> float | None:
         rate = float(np.exp(log))
         return float(left - way / rate - count * chamber.settling(rate))
 
-    # faster than that, the body needs longer at the ends than the ramps are shorter
-    fastest = min(chamber.rate, way / (count * chamber.lag)) if chamber.lag > 0 else chamber.rate
+    fastest = _fastest(chamber, count)
     if spare(np.log(fastest)) < 0:
         return None
     return float(np.exp(brentq(spare, np.log(chamber.swing / (hours * 3600)) - 1.0, np.log(fastest))))
+
+
+def _fastest(chamber: Chamber, ends: int) -> float:
+    """Return the rate, K/s, beyond which the body needs longer at the ends than the ramps between are shorter."""
+    if chamber.lag == 0:
+        return chamber.rate
+    return min(chamber.rate, (ends - 1) * chamber.swing / (ends * chamber.lag))
 
 
 def _moves(chamber: Chamber, levels: Array) -> Array:

@@ -7,12 +7,12 @@ where each temperature is passed again and again, going up and going down, it lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from driftlab.planning.chamber import Chamber, Profile, mixed, ramps, staircase
+from driftlab.planning.chamber import Chamber, Profile, mixed, quickest, ramps, staircase
 from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
@@ -26,6 +26,7 @@ CLASSIC = 5.0  # K, step of the staircase that others are compared with
 MIX = 10.0  # K, step of the levels after ramps
 MIN_COVERAGE = 0.97  # of the range, by a profile
 ALIKE = 1.05  # profiles whose sigma differs by less than this factor are as good
+SLOWER = 1.25  # times as long as the quickest ramps, again and again: profiles that any more hours allow
 SHARES = (0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the hours, for the Pareto curve
 GRID = 121
 DRAWS = 4  # of samples by which a kind's smoothing is found
@@ -175,6 +176,66 @@ def ranked(rated: list[RatedProfile]) -> list[RatedProfile]:
     return [first, *(item for item in order if item is not first)]
 
 
+class Ratings:
+    """Ratings of profiles of a unit in a chamber, all that were asked for."""
+
+    def __init__(self, subject: UnitModel, chamber: Chamber) -> None:
+        self.subject, self.chamber = subject, chamber
+        self.every: list[RatedProfile] = []
+        self.hours: list[float] = []  # of the points
+        self._ramps: dict[int, list[RatedProfile]] = {cycles: [] for cycles in CYCLES}  # each SLOWER than the last
+
+    def of(self, profiles: Iterable[Profile]) -> list[RatedProfile]:
+        """Return the ratings of profiles."""
+        rated = [judge(profile, self.subject, self.chamber) for profile in profiles]
+        self.every += rated
+        return rated
+
+    def whole(self, hours: float) -> list[RatedProfile]:
+        """Return those that cover the range within up to so many hours, with ramps that do not depend on the hours.
+
+        These are the quickest of each number of cycles, and slower ones for as long as that makes them better.
+        """
+        for cycles, known in self._ramps.items():
+            longer = quickest(self.chamber, cycles) * SLOWER ** len(known)
+            while longer <= hours and (len(known) < 2 or known[-1].score < known[-2].score):
+                known += self.of(possible(ramps(self.chamber, longer, cycles)))
+                longer *= SLOWER
+        return [item for item in self.every if item.profile.hours <= hours and item.share >= MIN_COVERAGE]
+
+    def best(self, point: Point) -> RatedProfile:
+        """Return the best profile of up to the point's hours."""
+        return min([point.best, *self.whole(point.hours)], key=lambda item: item.score)
+
+    def point(self, hours: float) -> Point | None:
+        """Return the best profile that fills the hours; None where none of them covers the range."""
+        tried = self.of(leading(self.chamber, hours))
+        self.hours.append(hours)
+        if max((item.share for item in tried), default=0.0) < MIN_COVERAGE:
+            return None
+        return Point(hours, ranked(tried)[0], next((item for item in tried if _is_classic(item)), None))
+
+    def shortest(self, hours: float, target: float) -> RatedProfile | None:
+        """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
+
+        def reached(within: float) -> RatedProfile | None:
+            good = [item for item in self.whole(within) if item.score <= target]
+            return min(good, key=lambda item: item.profile.hours, default=None)
+
+        high = max([hours, *self.hours])
+        while (best := reached(high)) is None and high < LONGEST * hours:
+            high *= 2
+            self.point(high)
+        low = 0.0
+        while best is not None and best.profile.hours > 1.03 * low:
+            longest = best.profile.hours
+            low = max((tried for tried in self.hours if tried < longest), default=longest / 8)
+            if longest > 1.03 * low:
+                self.point(float(np.sqrt(low * longest)))
+                best = reached(longest)
+        return best
+
+
 def search(
     subject: UnitModel, chamber: Chamber, hours: float, target: float | None = None, progress: Progress = None
 ) -> SearchResult:
@@ -187,35 +248,27 @@ def search(
     """
     say = progress or (lambda *state: None)
     say(f"profiles of {hours:g} h")
-    tried = [judge(profile, subject, chamber) for profile in candidates(chamber, hours)]
+    ratings = Ratings(subject, chamber)
+    tried = ratings.of(candidates(chamber, hours))
     if max((item.share for item in tried), default=0.0) < MIN_COVERAGE:
         raise ConfigError(_too_short(chamber, hours, tried))
     points: list[Point] = []
     for share in SHARES:
         say(f"profiles of {share * hours:g} h")
-        point = _point(subject, chamber, share * hours) if share != 1.0 else Point(hours, ranked(tried)[0], None)
+        point = ratings.point(share * hours) if share != 1.0 else Point(hours, ranked(tried)[0], None)
         points += [] if point is None else [point]
     # where a cycle more does not fit, a slower one is worse by the walk: then the recording ends earlier
-    early = min((p.best for p in points if p.hours < hours), key=lambda item: item.score, default=None)
+    early = min((item for item in ratings.whole(hours) if item not in tried), key=lambda item: item.score, default=None)
     tried += [early] if early is not None and ALIKE * early.score < ranked(tried)[0].score else []
     order = ranked(tried)
     classic = next((item for item in tried if _is_classic(item)), None)
-    keep = order[:2] + [item for item in (classic,) if item is not None and item not in order[:2]]
-    finer = {item: judge(item.profile, subject, chamber, DRAWS) for item in keep}
-    order = [finer.get(item, item) for item in order]
+    finer = {item: judge(item.profile, subject, chamber, DRAWS) for item in {*order[:2], classic or order[0]}}
+    order = ranked([finer.get(item, item) for item in order])
     classic = None if classic is None else finer[classic]
-    pareto = _falling([Point(hours, order[0], classic) if p.hours == hours else p for p in points])
-    shortest = None if target is None else _shortest(subject, chamber, hours, target, pareto)
+    points = [replace(p, best=order[0], classic=classic) if p.hours == hours else p for p in points]
+    pareto = tuple(replace(p, best=ratings.best(p)) for p in points)  # who has more hours may stop earlier
+    shortest = None if target is None else ratings.shortest(hours, target)
     return SearchResult(subject, chamber, hours, tuple(order), classic, pareto, target, shortest)
-
-
-def _falling(points: list[Point]) -> tuple[Point, ...]:
-    """Return the points with the best profile of up to so many hours: who has more may stop earlier."""
-
-    def best(hours: float) -> RatedProfile:
-        return min((point.best for point in points if point.hours <= hours), key=lambda item: item.score)
-
-    return tuple(replace(point, best=best(point.hours)) for point in points)
 
 
 def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str:
@@ -232,34 +285,3 @@ def _is_classic(item: RatedProfile) -> bool:
     """Return True if a profile is a staircase whose last step leads up: it never comes back."""
     moving = item.profile.rates[item.profile.rates != 0]
     return item.profile.family == "staircase" and bool(moving[-1] > 0)
-
-
-def _point(subject: UnitModel, chamber: Chamber, hours: float) -> Point | None:
-    tried = [judge(profile, subject, chamber) for profile in leading(chamber, hours)]
-    if not tried or max(item.share for item in tried) < MIN_COVERAGE:
-        return None
-    return Point(hours, ranked(tried)[0], next((item for item in tried if _is_classic(item)), None))
-
-
-def _shortest(
-    subject: UnitModel, chamber: Chamber, hours: float, target: float, points: tuple[Point, ...]
-) -> RatedProfile | None:
-    """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
-    reached = next((point for point in points if point.best.score <= target), None)
-    low = max((p.hours for p in points if reached is None or p.hours < reached.hours), default=points[0].hours / 8)
-    high = points[-1].hours
-    while reached is None and high < LONGEST * hours:
-        low, high = high, 2 * high
-        point = _point(subject, chamber, high)
-        reached = point if point is not None and point.best.score <= target else None
-    if reached is None:
-        return None
-    best, high = reached.best, reached.hours
-    while high > 1.03 * low:
-        middle = float(np.sqrt(low * high))
-        point = _point(subject, chamber, middle)
-        if point is not None and point.best.score <= target:
-            best, high = point.best, middle
-        else:
-            low = middle
-    return best

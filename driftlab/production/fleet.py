@@ -22,7 +22,7 @@ from driftlab.production.family import FamilyAnalysis, analyse
 from driftlab.production.fleet_folder import FAMILY, REPORT, TABLE, fleet_folder, stored_units
 from driftlab.production.manifest import Manifest, read_manifest
 from driftlab.production.result import FleetResult
-from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress
+from driftlab.production.summary import FamilySummary, FleetProgress, FleetSummary, Stage, fleet_progress, some
 from driftlab.production.tables import write_fleet
 from driftlab.production.unit import STIMULUS
 from driftlab.production.unit_terms import terms_of_units
@@ -159,8 +159,7 @@ def fleet(
         summary = command.all()
         if database is not None:
             command.to_database(database, summary)
-        if not command.status.done:
-            raise _none_done(command.status.failed, str(units))
+        command.check(str(units), summary["family"] or {})
         return FleetResult(Path(out), summary)
 
 
@@ -293,6 +292,18 @@ class _Command:
         family = self._family(analysis, acknowledged, about)
         return self._mark(complete=True, key=key, family=family, pages=pages)
 
+    def check(self, units: str, family: Mapping[str, Any]) -> None:
+        """Raise DataError where no unit is done, ConfigError where there is a note on a unit without an alarm."""
+        if not self.status.done:
+            raise _none_done(self.status.failed, units)
+        known = family.get("acknowledged", {})
+        if none := sorted(self.jobs.options.notes.keys() - known.keys()):
+            alarmed = sorted({*family.get("open", ()), *known})
+            raise ConfigError(
+                f"--acknowledge {quote(none[0])}: is neither odd nor out of control, so its note is not kept; all else "
+                f"is done; {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has an alarm'}"
+            )
+
     def to_database(self, database: Database, summary: Mapping[str, Any]) -> None:
         """Replace the rows of the fleet in a database by those of `fleet.json`, table and records."""
         self.jobs.progress(Stage("database"))
@@ -313,7 +324,6 @@ class _Command:
             alarms={line.units[k]: [one.text for one in why] for k, why in alarms(line).items()},
             acknowledged={unit: note.brief() for unit, note in acknowledged.items()},
             open=[unit for unit in about if unit not in acknowledged],
-            without_alarm=[unit for unit in self.jobs.options.notes if unit not in about],
             capability=[
                 row.as_json(line.shown(row.quantity).si, line.units[row.since]) for row in line.capability
             ],

@@ -101,9 +101,8 @@ class FamilySummary(BaseModel):
     """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line.
 
     `alarms` are why units are out of control, by frozen limits and run rules; `acknowledged` has the notes on units
-    whose alarms are all known, `open` the units with others, odd ones among both; `without_alarm` are units with a note
-    on nothing. `capability` has the indices, `charts` limits, changes and lots of each chart,
-    `differences` the figures that differ between groups of units.
+    whose alarms are all known, `open` the units with others, odd ones among both. `capability` has the indices,
+    `charts` limits, changes and lots of each chart, `differences` the figures that differ between groups of units.
     """
 
     units: int
@@ -114,7 +113,6 @@ class FamilySummary(BaseModel):
     alarms: dict[str, list[str]] = {}
     acknowledged: dict[str, dict[str, str]] = {}
     open: list[str] = []
-    without_alarm: Annotated[list[str], Field(exclude=True)] = []
     capability: list[dict[str, Any]] = []
     charts: list[dict[str, Any]] = []
     differences: list[dict[str, Any]] = []
@@ -140,9 +138,6 @@ class FamilySummary(BaseModel):
         lines += [f"acknowledged: unit {unit}: {n['note']} ({n['by']}, {n['at'][:10]})" for unit, n in notes[:NAMED]]
         if len(notes) > NAMED:
             lines.append(f"and {len(notes) - NAMED:,} more units are acknowledged: `family.acknowledged` of fleet.json")
-        if none := self.without_alarm:
-            verb = "is neither" if len(none) == 1 else "are neither"
-            lines.append(f"not acknowledged: {some(none)} {verb} odd nor out of control")
         return lines
 
 

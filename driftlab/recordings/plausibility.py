@@ -28,6 +28,8 @@ FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
 AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the rows next to it: at least
 BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
+HELD = "is held by what writes it down"  # in the doubt about it
+ENDS, CHANCE, SHARE = 10, 1e-6, 0.01  # ends of repetitions, chance of a longer one, share of the rows: of readings held
 MANY, SOME = 20, 10  # chunks, after which one in SOME is looked at: of steps
 EXACT = 0.01  # of a step: so far changes may be from multiples of it
 MINUTE = 60.0  # s; a mean over it is to be off by no more than its noise
@@ -100,12 +102,13 @@ class Rounding:
         self.name, self.sensor = name, sensor
         self.step = np.full(d, np.inf)  # of which all changes are multiples; 0: of none
         self.chunks = 0  # so far
+        self.holds = Holds(name, sensor, d)
         self.squares: list[Array] = []  # (B, d): mean squares of the changes in each block
         self.dt: list[float] = []
 
     def look(self, chunk: Chunk) -> None:
         """Look at blocks of the next rows."""
-        if self.sensor is None or len(chunk) < BLOCK or not np.any(self.step):
+        if len(chunk) < BLOCK:
             return
         self.chunks += 1
         if self.chunks > MANY and self.chunks % SOME:
@@ -113,6 +116,9 @@ class Rounding:
         starts = np.unique(np.linspace(0, len(chunk) - BLOCK, min(BLOCKS, len(chunk) // BLOCK)).astype(np.intp))
         rows = starts[:, None] + np.arange(BLOCK)
         changes = np.abs(np.diff(chunk[self.name][rows], axis=1))
+        self.holds.look(changes)
+        if self.sensor is None or not np.any(self.step):
+            return
         self.squares.append(np.mean(changes**2, axis=1))
         self.dt.append(float(np.median(np.diff(chunk.t[rows], axis=1))))
         step = np.minimum(self.step, np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf))
@@ -122,7 +128,8 @@ class Rounding:
         self.step = np.where(odd < EXACT, step, 0.0)
 
     def judge(self, faults: Faults) -> None:
-        """Note a doubt about each axis whose means are off by more than the noise of a minute."""
+        """Note a doubt about each axis whose means are off by more than the noise of a minute, or that is held."""
+        self.holds.judge(faults)
         if self.sensor is None or not self.squares:
             return
         each = np.concatenate(self.squares) / 2
@@ -141,6 +148,62 @@ class Rounding:
                     f"them is {s / q:.2g} of one: a mean is off by up to {off:.2g} {self.sensor.unit}, which no "
                     "averaging takes out; choose a smaller range of the sensor, or more digits of its file"
                 )
+
+
+class Holds:
+    """Repetitions of the readings of a sensor, beside what its noise makes of its steps.
+
+    Noise whose changes have the mean square m, in least changes, repeats a reading with a chance of
+
+    ::
+
+        p = 1 / sqrt(1 + 2 pi (m - 1)),
+
+    which is 1 / sqrt(2 pi m) where it is many steps, and 1 where no reading is farther than a step from the one before.
+    m is that of the changes that end a repetition: of a sensor that moves at times the others are larger.
+    """
+
+    def __init__(self, name: str, sensor: Sensor | None, d: int) -> None:
+        self.name, self.axes = name, axes_in(sensor, d)
+        self.rows = 0
+        self.runs = np.zeros((d, BLOCK), dtype=np.int64)  # how often a reading came again so many times
+        self.least = np.full(d, np.inf)  # of the changes
+        self.ends: list[list[Array]] = [[] for _ in range(d)]  # changes behind a repetition
+
+    def look(self, changes: Array) -> None:
+        """Look at the sizes of changes from row to row in blocks (B, BLOCK - 1, d)."""
+        self.rows += changes.shape[0] * BLOCK
+        self.least = np.minimum(self.least, np.min(changes, axis=(0, 1), where=changes > 0, initial=np.inf))
+        for axis, same in enumerate(np.moveaxis(changes == 0, -1, 0)):
+            if not np.any(same):
+                continue
+            turns = np.diff(np.pad(same, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+            lengths = np.nonzero(turns < 0)[1] - np.nonzero(turns > 0)[1]
+            self.runs[axis] += np.bincount(lengths, minlength=BLOCK)
+            self.ends[axis].append(changes[:, 1:, axis][same[:, :-1] & ~same[:, 1:]])
+
+    def judge(self, faults: Faults) -> None:
+        """Note a doubt about each axis that repeats its reading for longer than its noise does, in many rows.
+
+        Where all axes do, and evenly, the rows only come faster than the readings: that is a note.
+        """
+        times, found = np.arange(BLOCK), {}
+        for k, axis in enumerate(self.axes):
+            behind, runs = np.concatenate([*self.ends[k], np.empty(0)]), self.runs[k]
+            m = float(np.median(behind / self.least[k])) ** 2 if len(behind) >= ENDS else 1.0
+            if m > 1:
+                most = 2 * np.log(self.rows / CHANCE) / np.log1p(2 * np.pi * (m - 1))
+                share = float((times * runs)[times > most].sum()) / self.rows
+                if share >= SHARE:
+                    found[axis] = most, share, int(np.max(np.flatnonzero(runs))), float(times @ runs / np.sum(runs))
+        even = len(found) == len(self.axes) and all(longest <= 2 * mean for *_, longest, mean in found.values())
+        for axis, (most, share, longest, _) in found.items():
+            text = (
+                f"{axis_name(self.name, axis)} shows the very same reading up to {longest + 1} times in a row, in "
+                f"{share:.0%} of the rows, where its noise would not {most + 1:.0f} times: it {HELD}, as over a "
+                "link that loses samples; record each reading once, or correct the logger"
+            )
+            (faults.note if even else faults.doubt)(text)
 
 
 def axes_in(sensor: Sensor | None, d: int) -> list[str]:

@@ -220,6 +220,10 @@ def head(config: Config) -> tuple[Chunk | None, list[str]]:
     first = next(rows)
     while len(first) < FIRST and (more := next(rows, None)) is not None:
         first = concatenate([first, more])
+    for name in first.sensors:
+        look = Rounding(name, None, first[name].shape[1])
+        look.look(first)
+        look.judge(faults)
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():

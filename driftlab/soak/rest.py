@@ -28,6 +28,7 @@ from driftlab.filtering.setup import (
     noise_remarks,
     other_calibrations,
 )
+from driftlab.recordings.plausibility import HELD
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor
@@ -108,8 +109,10 @@ class Used:
     def read(self, faults: Faults, before: Faults) -> None:
         """Take the rows of a recording, and why some were left out, beside the faults before it."""
         self.rows, self.usable = self.rows + faults.rows - before.rows, self.usable + faults.usable - before.usable
-        left_out = {what: fault.count for what, fault in faults.found.items() if "rows" in what and "left out" in what}
-        self.why = max(left_out, key=lambda what: left_out[what], default="").replace(", left out", "")
+        left_out = [(f.count, what, f) for what, f in faults.found.items() if "rows" in what and "left out" in what]
+        if left_out:
+            _, what, fault = max(left_out)
+            self.why = f"{what.replace(', left out', '')}, first {fault.first}"
 
     def note(self, T: Array) -> None:
         """Take the temperatures (N,) of epochs, whether they are used or not."""
@@ -139,6 +142,8 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             refused -= len(part)
             model.check(part, config.site)
             alignment = model.aligned(corrected(part, others), config.site)
+            for text in () if noise else alignment.off:
+                faults.note(text)
             noise.append((float(np.mean(part["temperature"])), len(part), alignment.noise_ratio[channel]))
             if placing is not None:
                 alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])
@@ -169,7 +174,8 @@ def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults:
     usual = np.median(ratios, axis=0)
     over = np.max(np.divide(ratios, usual, out=np.zeros_like(ratios), where=usual > 0), axis=1)
     loud = (over > LOUD) & (epochs >= ENOUGH)
-    if np.sum(epochs[loud]) >= NOTED * np.sum(epochs):
+    held = any(HELD in text for text in faults.doubts)  # then noise is what comes when a hold ends
+    if np.sum(epochs[loud]) >= NOTED * np.sum(epochs) and not held:
         faults.doubt(
             f"{sensor.channel}: noise is {np.median(over[loud]):.2g} times the usual between {np.min(T[loud]):.3g} and "
             f"{np.max(T[loud]):.3g} °C ({np.sum(epochs[loud]) / np.sum(epochs):.0%} of the rest), as of vibration, "

@@ -11,12 +11,15 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from fusion_core.chunk import Array, Chunk, Integers
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.errors import ConfigError
 
 GARBAGE = "bytes that belong to no frame, left out"
 DAMAGED = "frames whose checksum or constants are wrong, left out"
+REPEATED = "frames repeated by the device, left out"
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,25 @@ class Frames:
     channels: Mapping[str, Array]
     count: Integers | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
+
+    def without_repeats(self, before: Frames) -> tuple[Frames, Integers]:
+        """Return the frames that differ, in counter or values, from the one before them.
+
+        `before` ends with the frame before the first, or has none. The second array (K,) says of each of the K others
+        how many frames are left before it. Without a counter all are left: two samples may show the same.
+        """
+        again = np.zeros(self.N, dtype=np.bool_)
+        if self.count is not None and self.N:
+            first = self.count[0] - 1 if before.count is None or not before.N else before.count[-1]
+            again = np.diff(self.count, prepend=first) == 0
+        if self.count is None or not np.any(again):
+            return self, np.empty(0, dtype=np.int64)
+        for name, values in self.channels.items():
+            old = np.concatenate([before.channels[name][-1:] if before.N else values[:1], values[:-1]])
+            again &= ((old == values) | (np.isnan(old) & np.isnan(values))).reshape(self.N, -1).all(axis=1)
+        keep, left = ~again, np.cumsum(~again, dtype=np.int64)
+        channels = {name: values[keep] for name, values in self.channels.items()}
+        return Frames(int(left[-1]), channels, self.count[keep], self.rejected), left[again]
 
 
 class Framing(Plugin):

@@ -120,6 +120,8 @@ class Alignment:
         Mean reading less input over the stretch, a first look at the bias, where the model asks for it.
     notes : tuple of str
         What one should know of it, a sentence each.
+    off : tuple of str
+        What the readings show that the known inputs do not, a sentence each.
     """
 
     t: float
@@ -130,6 +132,7 @@ class Alignment:
     up: Array | None = None
     levels: dict[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    off: tuple[str, ...] = ()
 
     @cached_property
     def gate_scale(self) -> float:

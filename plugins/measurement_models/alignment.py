@@ -19,6 +19,7 @@ from fusion_plugins.earth import RATE, earth_rate, gravity
 
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
+OFF, SURE = 0.03, 3.0  # of gravity, and deviations of the declared bias: more is an error of scale
 OUTLIER = 8.0  # times the scatter of the stretch itself
 STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1e-2}  # a K: 150 deg/h, 1 mg
 STEEP = 5.0  # times the density of the white noise, a K: what is in a unit of its own
@@ -95,11 +96,12 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     up = None
     omega_ie = unsure = np.zeros(len(gyro.axes))
     inputs: dict[str, Array] = {}
-    notes: tuple[str, ...] = ()
+    notes, off = tuple[str, ...](), tuple[str, ...]()
     if accel is not None:
         f = np.add.reduce(window[accel.channel]) / len(window)
         up = f / sqrt(f @ f)
         inputs[accel.channel] = gravity(site.latitude) * up
+        off = _of_scale(f, site, accel)
     if accel is not None and up is not None and site.latitude is not None:
         place = ["xyz".index(axis) for axis in gyro.axes]
         omega_ie, a_radian = (rate[place] for rate in _rate_and_tilt(up, site))
@@ -111,7 +113,7 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     sensors = (gyro,) if accel is None else (gyro, accel)
     if accel is not None and tracked == accel.channel:
         unsure = np.zeros(len(accel.axes))
-    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up, notes=notes)
+    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up, notes=notes, off=off)
 
 
 def check_gravity(window: Chunk, site: Site) -> None:
@@ -134,6 +136,18 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
     if accel.bias.sigma_0 is not None:
         return accel.bias.sigma_0 / expected
     return hypot(sqrt(f @ f) / expected - 1, UNKNOWN) / sqrt(2)
+
+
+def _of_scale(f: Array, site: Site, accel: Sensor) -> tuple[str, ...]:
+    """Return a note on a specific force f (3,) whose length no declared bias makes that of gravity."""
+    expected, measured = gravity(site.latitude), float(np.linalg.norm(f))
+    if abs(measured / expected - 1) <= max(OFF, SURE * (accel.bias.sigma_0 or 0.0) / expected):
+        return ()
+    return (
+        f"{accel.channel}: shows {measured:.4g} m/s^2 at rest, gravity there is {expected:.4g}: its scale, or its bias "
+        f"along the vertical, is off by {measured / expected - 1:+.1%}; correct the unit of source.channels."
+        f"{accel.channel}, calibrate it, or declare {accel.section}.bias.sigma_0",
+    )
 
 
 def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[str, ...]:

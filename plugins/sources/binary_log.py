@@ -24,9 +24,9 @@ from fusion_core import contracts
 from fusion_core.budget import TEXTS, check_all
 from fusion_core.chunk import Array, Integers
 from fusion_core.contracts.file_source import Conversions
-from fusion_core.contracts.framing import DAMAGED
+from fusion_core.contracts.framing import DAMAGED, REPEATED
 from fusion_core.errors import UnreadableFile, seconds
-from fusion_core.faults import LOST, Faults
+from fusion_core.faults import LOST, RESTARTS, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.units import problem
@@ -35,7 +35,11 @@ from fusion_plugins.sources.unpacked import Stream, beginning, opened
 BLOCK = 1 << 20  # bytes decoded at a time
 HEAD = 1 << 18  # bytes at the beginning that tell the usual step of the counter
 OFF = 0.02  # of the declared interval: more is reported
-RESTARTS = "restarts of the device's counter"
+CHANCE = 0.05  # that a counter is at its beginning after some loss: less may be a restart
+BEGUN = (
+    "losses that may be restarts, as the device's counter is at its beginning behind them (then time is too long; "
+    "use the parts before and behind as PATH::START:STOP)"
+)
 TIME = "time"
 STAMP = ""  # under which a block gives the times that are made here: no field is called so
 
@@ -76,6 +80,7 @@ class BinaryLog(contracts.FileSource):
         with opened(path) as file:
             first = beginning(file, path)
             head, _ = self.framing.decode(file.read(HEAD), None)
+            head, _ = head.without_repeats(contracts.Frames(0, {}))
             file.seek(0)
             if head.N == 0 and contracts.recognised(first):
                 raise contracts.foreign(path, first, self.kind)
@@ -112,8 +117,8 @@ class FramedFile(contracts.Table):
             frames, memory = self.framing.decode(data, memory)
             check_all(frames.N)
             damaged += frames.rejected.get(DAMAGED, 0)
-            t = self.stamps.of(frames)
             whole += frames.N
+            frames, t = self.stamps.of(frames)
             if not whole and length > TEXTS:
                 break
             if frames.N:
@@ -155,40 +160,49 @@ class Stamps:
                     f"rate not as declared: samples are {apart} apart by the device's clock; correct source.interval",
                     1, "at the start",
                 )  # fmt: skip
-        self.raw: int | None = None
         self.x = 0  # the counter without its wraps; of the last sample
+        self.losses = 0  # times that samples were lost
+        self.last = contracts.Frames(0, {})
 
-    def of(self, frames: contracts.Frames) -> Array:
-        """Return the times (N,) of the next samples, s from the first; report what was rejected before them."""
-        where = "at the start" if self.raw is None or self.tick is None else f"after {seconds(self.x * self.tick)}"
+    def of(self, frames: contracts.Frames) -> tuple[contracts.Frames, Array]:
+        """Return the next N samples less repeated ones, and their times (N,), s from the first; report the others."""
+        where = "at the start" if self.last.N == 0 else self._after(self.x)
         for what, count in frames.rejected.items():
             self.faults.add(what, count, where)
-        if frames.N == 0:
-            return np.empty(0)
-        first = self.raw is None
-        if frames.count is None:
-            steps = np.ones(frames.N, dtype=np.int64)
-            steps[0] = 0 if first else 1
-            self.raw = 0
-        else:
-            steps = self._steps(frames.count, where)
-        x = self.x + np.cumsum(steps)
+        frames, again = frames.without_repeats(self.last)
+        x = np.array([self.x])
+        if frames.N:
+            steps = np.ones(frames.N, dtype=np.int64) if frames.count is None else self._steps(frames.count)
+            steps[0] *= self.last.N > 0
+            x = self.x + np.cumsum(steps)
+            self.last = frames
+        if len(again):
+            self.faults.add(REPEATED, len(again), self._after(x[again[0] - 1] if again[0] else self.x))
         self.x = int(x[-1])
-        return np.asarray(x * (self.tick or 0.0), dtype=np.float64)
+        return frames, np.asarray(x[: frames.N] * (self.tick or 0.0), dtype=np.float64)
 
-    def _steps(self, count: Integers, where: str) -> Integers:
+    def _after(self, x: int) -> str:
+        return f"after {seconds(x * (self.tick or 0.0))}"
+
+    def _add(self, what: str, counts: Integers, steps: Integers) -> None:
+        """Count (N,) cases of what is wrong; `steps` lead to each of the samples."""
+        k = int(np.argmax(counts > 0))
+        self.faults.add(what, int(np.sum(counts)), self._after(self.x + int(np.sum(steps[:k]))))
+
+    def _steps(self, count: Integers) -> Integers:
         """Return the steps of the counter, without its wraps; one that ran backwards has begun anew."""
         assert self.counter is not None
-        modulo, first = self.counter.modulo, self.raw is None
-        before = int(count[0]) if self.raw is None else self.raw
-        steps = np.diff(np.concatenate([[before], count])) % modulo
-        self.raw = int(count[-1])
+        modulo, before = self.counter.modulo, self.last.count
+        steps = np.diff(count, prepend=count[0] - self.step if before is None else before[-1]) % modulo
         anew = steps == 0
         if self.counter.tick is not None:
             anew |= steps > modulo // 2
-        anew[0] &= not first
-        self.faults.add(RESTARTS, int(np.sum(anew)), where)
         steps = np.where(anew, self.step, steps)
-        lost = np.maximum(np.rint(steps[int(first) :] / self.step) - 1, 0)
-        self.faults.add(LOST, int(np.sum(lost)), where)
+        self._add(RESTARTS, anew.astype(np.int64), steps)
+        lost = np.maximum(np.rint(steps / self.step) - 1, 0).astype(np.int64)
+        self._add(LOST, lost, steps)
+        times = self.losses + np.cumsum(lost > 0)
+        self.losses = int(times[-1])
+        begun = (lost > 0) & (count < 2 * self.step) & (times * 2 * self.step < CHANCE * modulo)
+        self._add(BEGUN, begun.astype(np.int64), steps)
         return steps

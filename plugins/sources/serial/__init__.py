@@ -29,7 +29,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import Counter, Framing, Source
+from fusion_core.contracts import Counter, Frames, Framing, Source
+from fusion_core.contracts.framing import REPEATED
 from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl
@@ -98,7 +99,7 @@ class Serial(Source):
             counter = Counter(counter.modulo, counter.tick / self.speed)  # by the host's clock
         kind = self.clock or ("host" if counter is None else "device")
         clock = SampleClock(self.interval / self.speed, counter, kind, self.window, faults)
-        memory = None
+        memory, last = None, Frames(0, {})
         heard = spoke = whole_at = time.monotonic()
         silent, unused = False, 0  # bytes since the last frame
         with Port(self.port, self.baudrate, self.buffer) as port:
@@ -112,9 +113,12 @@ class Serial(Source):
                     where = f"after {seconds(max(clock.t, 0.0))}"
                     for what, count in frames.rejected.items():
                         faults.add(what, count, where)
-                    t = clock.stamp(frames.N, frames.count, arrived.at) * self.speed
                     if frames.N:
                         spoke, whole_at, unused = now, now, 0
+                    frames, again = frames.without_repeats(last)
+                    faults.add(REPEATED, len(again), where)
+                    last = frames if frames.N else last
+                    t = clock.stamp(frames.N, frames.count, arrived.at) * self.speed
                     whole = Chunk(t, frames.channels)
                     for start in range(0, frames.N, size):
                         yield whole.part(start, min(start + size, frames.N))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from driftlab.planning.chamber import Chamber, Profile, mixed, ramps, staircase
+from driftlab.planning.chamber import Chamber, Profile, mixed, quickest, ramps, staircase
 from driftlab.planning.search import MIN_COVERAGE, candidates
 
 CHAMBER = Chamber(-20.0, 50.0, 25.0, 2 / 60, 600.0)
@@ -27,6 +27,15 @@ def test_a_body_without_lag_is_the_chamber():
     t = np.linspace(0, profile.duration, 1000)
     np.testing.assert_array_equal(profile.body(t, 0.0), profile.chamber(t))
     np.testing.assert_allclose(profile.body(t, 1e-3), profile.chamber(t), atol=1e-4)
+
+
+@pytest.mark.parametrize("lag", [0.0, 60.0, 600.0, 5000.0])
+@pytest.mark.parametrize("cycles", [1, 3, 24])
+def test_below_the_quickest_hours_there_are_no_ramps(lag, cycles):
+    chamber = Chamber(-20.0, 50.0, 25.0, 2 / 60, lag)
+    hours = quickest(chamber, cycles)
+    assert ramps(chamber, hours, cycles).hours == pytest.approx(hours)
+    assert ramps(chamber, 0.9999 * hours, cycles) is None
 
 
 @given(

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer
+from driftlab.recordings.plausibility import HELD, Copies, Rails, Rounding, Thermometer
 from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
@@ -200,3 +200,40 @@ STEADY = {
 @pytest.mark.parametrize("values", STEADY.values(), ids=STEADY)
 def test_values_without_steps_or_with_small_ones_are_in_no_doubt(values):
     assert rounded(values, DT, 5.0) == []
+
+
+def of_holds(x, size=N):
+    """Return the doubts and the notes about readings (N, 3) that are held."""
+    faults, looks, t = Faults(first_row=0.0), Rounding("gyro", None, 3), np.arange(len(x)) * DT
+    for start in range(0, len(x), size):
+        looks.look(Chunk(t[start : start + size], {"gyro": x[start : start + size]}))
+    looks.judge(faults)
+    return faults.doubts, [line for line in faults.lines() if HELD in line]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 0.3, 0.5, 1.0, 5.0, 100.0])
+@pytest.mark.parametrize("ramp", [0.0, 1e-4, 1e-2, 0.3])
+@pytest.mark.parametrize("walk", [0.0, 0.01])
+def test_what_rounds_to_steps_is_not_held(noise, ramp, walk):
+    """However long it shows one reading: noise of a part of a step repeats it as long as the bias stands."""
+    rng = np.random.default_rng(1)
+    moved = np.cumsum(walk * rng.normal(size=(N, 3)) + ramp, axis=0) + np.array([0.0, 0.3, 0.5])
+    assert of_holds(np.rint(moved + noise * rng.normal(size=(N, 3))), 7000) == ([], [])
+
+
+@pytest.mark.parametrize("rounded", [True, False])
+@pytest.mark.parametrize(("times", "apart"), [(12, 12), (30, 300), (90, 90), (90, 95)])
+def test_an_axis_that_is_held_is_a_doubt(rounded, times, apart):
+    rng, i = np.random.default_rng(2), np.arange(N)
+    x = 20 * rng.normal(size=(N, 3)) + 1e-2 * i[:, None]
+    x[:, 2] = x[i - np.where(i % apart < times, i % apart, 0), 2]
+    doubts, _ = of_holds(np.rint(x) if rounded else x)
+    assert len(doubts) == 1
+    assert doubts[0].startswith("gyro z shows the very same reading up to ")
+
+
+def test_rows_that_come_faster_than_readings_are_a_note():
+    x = np.repeat(np.random.default_rng(3).normal(size=(N // 20, 3)), 20, axis=0)
+    doubts, notes = of_holds(x)
+    assert doubts == []
+    assert len(notes) == 3

@@ -103,6 +103,23 @@ def test_an_unknown_bias_of_the_accelerometers_is_noted_where_the_gyro_could_see
     assert np.all(told) == (sigma_0 is not None), "what is said of it is in the sigma"
 
 
+@pytest.mark.parametrize(
+    ("factor", "sigma_0", "noted"),
+    [(1.02, None, False), (1.04, None, True), (0.9, None, True), (1.04, "20 mg", False), (1.1, "20 mg", True)],
+)
+def test_accelerometers_that_do_not_show_gravity_are_noted(factor, sigma_0, noted):
+    """However the unit lies: by 3 % of gravity, or by three deviations of the bias that is declared."""
+    bias = SETTINGS["filter"]["accel"]["bias"] | ({"sigma_0": sigma_0} if sigma_0 else {})
+    filter = SETTINGS["filter"] | {"accel": SETTINGS["filter"]["accel"] | {"bias": bias}}
+    config = Config.model_validate({"latitude": "40.9 deg", "filter": filter})
+    force = factor * gravity(config.site.latitude) * np.array([0.6, 0.0, -0.8])
+    chunk = epoch_chunk(0.1, 0.1, 600)
+    found = config.filter.aligned(chunk.having(accel=np.tile(force, (600, 1))), config.site)
+    assert bool(found.off) == noted
+    if noted:
+        assert f"is off by {factor - 1:+.1%}; " in found.off[0]
+
+
 @pytest.mark.parametrize("heading", [None, "0.7 rad"])
 @pytest.mark.parametrize("up", [(0, 0, 1), (0.3, -0.5, 0.8), (-0.8, 0.1, 0.5)])
 def test_a_tilt_is_unsure_by_what_it_moves_the_earth_rate(up, heading):

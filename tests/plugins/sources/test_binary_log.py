@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from recordings_on_disk import read, text
 
-from fusion_core.contracts.framing import DAMAGED, GARBAGE
-from fusion_core.errors import UnreadableFile
-from fusion_core.faults import LOST, Faults
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, REPEATED
+from fusion_core.errors import UnreadableFile, seconds
+from fusion_core.faults import LOST, RESTARTS, Faults
 from fusion_core.testing import check_plugin
 from fusion_plugins.sources import binary_log
-from fusion_plugins.sources.binary_log import RESTARTS, BinaryLog
+from fusion_plugins.sources.binary_log import BEGUN, BinaryLog
 
 PLAIN = {key: value for key, value in FRAMING.items() if key != "counter"}
 CLOCK = {
@@ -104,6 +104,35 @@ def test_a_clock_that_begins_anew_goes_on(tmp_path):
     got, faults = told(log(text(tmp_path, b"".join(map(clocked, stamps)), "a.dat"), CLOCK))
     np.testing.assert_allclose(np.diff(got.t), 5e-3)
     assert faults == {RESTARTS: 1}
+
+
+def test_frames_that_are_sent_twice_are_one_sample(tmp_path):
+    """Every one twice from the fifth on, also a clock's, whose usual step is then still that of samples."""
+    for pack, framing, more in (
+        (frame, FRAMING, {"interval": 0.01}),
+        (lambda k: clocked(5000 * k), CLOCK, {}),
+    ):
+        data = b"".join(pack(k) * (1 + (k >= 5)) for k in range(100))
+        source = log(text(tmp_path, data, "a.bin"), framing, **more)
+        faults = Faults()
+        got = read(source, faults=faults)
+        np.testing.assert_allclose(np.diff(got.t), got.t[1])
+        assert (len(got), list(faults.found)) == (100, [REPEATED])
+        fault = faults.found[REPEATED]
+        assert (fault.count, fault.first) == (95, f"after {seconds(got.t[5])}")
+
+
+def test_a_counter_of_frames_at_its_beginning_may_have_restarted(tmp_path):
+    """62,536 samples are lost by the counter; that it is at zero behind them, one in 65,536 losses would bring."""
+    data = b"".join(frame(k % 3000) for k in range(3010))
+    faults = Faults()
+    got = read(log(text(tmp_path, data, "a.bin")), faults=faults)
+    assert got.t[-1] == pytest.approx((65536 + 9) * 0.01)
+    assert {what: (fault.count, fault.first) for what, fault in faults.found.items()} == {
+        LOST: (62536, "after 29.99 s"), BEGUN: (1, "after 29.99 s")
+    }  # fmt: skip
+    lost = b"".join(frame(k) for k in [*range(65000, 65500), *range(65540, 65600)])
+    assert told(log(text(tmp_path, lost, "b.bin")))[1] == {LOST: 40}
 
 
 def test_a_time_in_the_frames_is_the_time(tmp_path):

@@ -13,9 +13,9 @@ from bench import FRAMING, SIZE, Device, frame, paced, some
 from pydantic import ValidationError
 
 from fusion_core.contracts import Source
-from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, REPEATED, Counter
 from fusion_core.errors import UnreadableFile
-from fusion_core.faults import LOST, Faults, usable
+from fusion_core.faults import LOST, RESTARTS, Faults, usable
 from fusion_core.host.registry import registry
 from fusion_plugins.sources.serial import Port
 from fusion_plugins.sources.serial.clock import SampleClock
@@ -88,7 +88,7 @@ def test_unplugged_and_plugged_in_again(device):
     assert 1.0 < after.t[0] - before.t[-1] < pause + 0.2
     np.testing.assert_allclose(np.diff(after.t), 0.01)
     assert faults.found["times that the connection was lost"].count == 1
-    assert LOST in faults.found or "restarts of the device's counter" in faults.found
+    assert LOST in faults.found or RESTARTS in faults.found
 
 
 def test_a_device_that_resets_goes_on(device):
@@ -100,10 +100,34 @@ def test_a_device_that_resets_goes_on(device):
     device.send(b"".join(frame(k) for k in range(20)))
     second = some(chunks, 20)
     chunks.close()
-    assert faults.found["restarts of the device's counter"].count == 1
+    assert faults.found[RESTARTS].count == 1
     assert LOST not in faults.found
     assert 0.2 < second.t[0] - first.t[-1] < 2.0
     assert np.all(np.diff(second.t) > 0)
+
+
+def test_frames_that_are_sent_twice_are_one_sample(device):
+    """The counter and all are the same; a sample that shows what the one before it shows is another one."""
+    faults = Faults()
+    chunks = started(source(device.path), 1000, faults)
+    device.send(b"".join(frame(k) * (1 + (k >= 20)) for k in range(30)))
+    got = some(chunks, 30)
+    device.send(frame(29) + frame(30) + frame(31, gyro=(1, 2, 3)))
+    np.testing.assert_array_equal(numbers(got), np.arange(30))
+    np.testing.assert_array_equal(numbers(some(chunks, 2)), [30, 31])
+    chunks.close()
+    assert {what: fault.count for what, fault in faults.found.items()} == {REPEATED: 11}
+
+
+def test_a_counter_that_jumps_and_one_that_passes_over_samples():
+    """By the host's clock a step of 20,000 took no time, one of 301 took 3 s: these are lost, those are not."""
+    faults = Faults()
+    found = SampleClock(0.01, Counter(65536), "device", 60.0, faults)
+    sent = np.concatenate([np.arange(1500), np.arange(1801, 2500), np.arange(22500, 23000), np.arange(18000, 18500)])
+    passed = np.concatenate([np.arange(1500), np.arange(1801, 3500)])
+    t = [found.stamp(1, np.array([n]), 7.0 + 0.01 * k) for n, k in zip(sent, passed, strict=True)]
+    np.testing.assert_allclose(np.concatenate(t), 0.01 * passed, atol=0.011)
+    assert {what: fault.count for what, fault in faults.found.items()} == {LOST: 301, RESTARTS: 2}
 
 
 def test_a_silent_device_is_reported_once(device):
@@ -168,6 +192,7 @@ def test_a_backlog_at_the_start_is_no_other_rate(clock):
         seen.append(len(faults.found))
     assert not [what for what in faults.found if what.startswith("rate not as declared")], faults.found
     assert seen[-1] == 0 or not any("source.interval" in what for what in faults.found)
+    assert RESTARTS not in faults.found  # no sample is missing
 
 
 def test_advice_on_the_rate_is_taken_back_when_it_is_no_longer_so():
