@@ -115,7 +115,8 @@ class SoakContrasts:
     and `laws` the eigenvalues (m,) and eigenvectors (m, m) of each law.
     """
 
-    def __init__(self, soak: SoakSummary) -> None:
+    def __init__(self, soak: SoakSummary, beside: Array | None = None) -> None:
+        """Take the soak; columns `beside` (S, q) on its slots are as free as its levels are."""
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
         self.starts = runs(first, len(soak.T), -(-len(soak.T) // BLOCKS))
         blocks, self.soak = soak.coarsened(self.starts), soak
@@ -130,7 +131,7 @@ class SoakContrasts:
         self.root, laws, walk = _laws(self.blocks.t.tobytes(), self.blocks.span.tobytes(), recording.tobytes())
         self.y = (bias - bias.mean(axis=0)) / self.scale * self.root
         levels = recording[:, None] == np.unique(recording)[1:]
-        self.more = levels * self.root
+        self.more = (levels if beside is None else np.column_stack([levels, self.means(beside)])) * self.root
         self.curve, self.splines = self._curve(soak, *walk)
         self.X = np.column_stack([self.splines * self.root, self.more])
         free_of_X = Complement(basis_of(self.X, RANK))
@@ -340,7 +341,7 @@ class SoakContrasts:
         w, V = self.under(noise)
         turned = _turned(V, shown)
         most = np.linalg.eigh(np.swapaxes(turned * w[:, None], 1, 2) @ turned)[1][:, :, -PARTS:]
-        gram, B, Q = self._products(self.u[:, None], np.moveaxis(shown @ most, 0, 1))
+        gram, B, Q = self.products(self.u[:, None], np.moveaxis(shown @ most, 0, 1))
         size, along = np.linalg.eigh(gram)
         size = np.maximum(size, FINEST * size[..., -1:] + TINY)
         B = np.swapaxes(along, 2, 3) @ B / size[..., None]
@@ -357,13 +358,13 @@ class SoakContrasts:
         Of y = z + ways a + noise, a ~ N(0, s^2).
         """
         m, J, d, q = ways.shape
-        gram, B, Q = self._products((self.u[:, None] - z).reshape(m, J * d, 1), ways.reshape(m, J * d, q))
+        gram, B, Q = self.products((self.u[:, None] - z).reshape(m, J * d, 1), ways.reshape(m, J * d, q))
         root = np.linalg.cholesky(gram + np.eye(q))
         explained = np.sum(np.linalg.solve(root, B) ** 2, axis=2)
         log_size = 2 * np.sum(np.log(np.diagonal(root, axis1=2, axis2=3)), axis=2)
         return self._integrated(Q, explained, log_size).reshape(-1, J, d)
 
-    def _products(self, y: Array, ways: Array) -> tuple[Array, Array, Array]:
+    def products(self, y: Array, ways: Array) -> tuple[Array, Array, Array]:
         """Return inner products under every THIN-th ratio (R', J, q, q), (R', J, q, e) and (R', J, e) or (R', 1, e).
 
         They are of ways (m, J, q) among one another, of these with y (m, J, e) or (m, 1, e), and of y with itself.

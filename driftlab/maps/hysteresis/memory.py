@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence, of_a_jump
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
+from driftlab.maps.hysteresis.tones import tone_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from fusion_core.chunk import Array, Flags
 from fusion_core.threads import one_thread
@@ -21,6 +22,7 @@ ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be distingui
 PAIRS = 24
 HINT = 1.0  # of the evidence: more is worth a mention (Kass and Raftery, 1995)
 CLEAR = 1.96  # deviations of a size, on one axis at least: with less a size is not signed
+TONES = 3  # in time, that a memory is looked for beside
 TWO = 3.0  # of the evidence of two shapes against one: both are there
 BESIDE = 4  # cells of temperature on either side, that a narrow difference stands out of
 NARROW = 8.0  # deviations of a cell's difference from those beside it: more is a narrow loop, or a jump
@@ -43,6 +45,8 @@ WHY = {
     "remembers more is not known; let it settle before the soak, or leave the first hours out with PATH::START:STOP",
     "jump": "up and down differ as where the bias jumped after {hours:.3g} h: whether it remembers is not known; go up "
     "and down again, by the same steps",
+    "tone": "a period of {period:.0f} s in time explains as much of what is between up and down: whether it remembers "
+    "is not known; keep what has that period away from the sensor, or go up and down again, at another pace",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
     "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
@@ -75,6 +79,7 @@ class MemoryVerdict:
     # (G, d): warming less cooling there in the mean over the sweeps, if there is a memory, and its standard deviation
     difference: Array = field(default_factory=lambda: np.empty((0, 0)))
     spread: Array = field(default_factory=lambda: np.empty((0, 0)))
+    period: float = np.nan  # s, of a tone in time that explains as much; NaN: none was looked for, or found
     over: float = 0.0  # K: a memory that spans as much has been looked for; a narrower one shows where it stands out
 
     @classmethod
@@ -132,16 +137,34 @@ def memory_of(soak: SoakSummary) -> MemoryVerdict:
     if reason:
         return MemoryVerdict.unknown(d, WHY[reason])
     with one_thread():
-        contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
-        if not contrasts.laws or not shapes.kinds:
-            return MemoryVerdict.unknown(d, WHY["short" if np.all(contrasts.known) else "coarse"])
-        z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-        followed, slots, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), np.empty((len(soak.T), 0, d)), None
-        if shapes.inputs.size:
-            noises = np.argmax(contrasts.without, axis=0)
-            slots, more, followed, curves = contrasts.added_by_inputs(shapes.inputs, noises)
-            z = np.concatenate([z, more], axis=1)
-        return _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), slots, shapes, curves).verdict()
+        return _beside_tones(soak, shapes_of(soak), None, TONES)
+
+
+def _beside_tones(soak: SoakSummary, shapes: MemoryShapes, lines: Array | None, more: int) -> MemoryVerdict:
+    """Return the verdict beside the lines (S, q) of tones in time, and beside so many more that explain as much."""
+    d, contrasts = soak.bias.shape[1], SoakContrasts(soak, lines)
+    if not contrasts.laws or not shapes.kinds:
+        return MemoryVerdict.unknown(d, WHY["short" if np.all(contrasts.known) else "coarse"])
+    z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
+    followed, slots, curves = np.empty((2, len(contrasts.Q[::THIN]), 0, d)), np.empty((len(soak.T), 0, d)), None
+    if shapes.inputs.size:
+        noises = np.argmax(contrasts.without, axis=0)
+        slots, added, followed, curves = contrasts.added_by_inputs(shapes.inputs, noises)
+        z = np.concatenate([z, added], axis=1)
+    test = _MemoryTest(ShapeEvidence(contrasts, z, shapes.kinds, followed), slots, shapes, curves)
+    verdict = test.verdict()
+    if not more or not np.isfinite(verdict.period):
+        return verdict
+    own = test.tone[2]
+    beside = _beside_tones(soak, shapes, own if lines is None else np.column_stack([lines, own]), more - 1)
+    if beside.answer == "seen":
+        return beside
+    return replace(beside, answer="undecided", none_larger_than=np.full(d, np.inf), why=verdict.why)
+
+
+def _reason(key: str, shapes: MemoryShapes, **about: Any) -> str:
+    """Return a reason of WHY with what it names, and which effects could not be tried."""
+    return "; ".join([WHY[key].format(**about), *(f"could not be tried: {text}" for text in shapes.broken)])
 
 
 def _unseen(soak: SoakSummary) -> str:
@@ -209,17 +232,18 @@ class _MemoryTest:
         pairs = Pairs.of(sized.evidence, noise, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = sized._sizes(pairs, self.evidence)
         why, about = self._why(settles, clear=bool(np.any(np.abs(size) > CLEAR * sigma)))
-        if why in ("brief", "settles", "jump", "slight", "narrow"):
+        if why in ("brief", "settles", "jump", "tone", "slight", "narrow"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        reason = "; ".join([WHY[why].format(**about), *(f"could not be tried: {text}" for text in self.shapes.broken)])
+        reason = _reason(why, self.shapes, **about)
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
         return MemoryVerdict(
-            answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread, over
-        )
+            answer, kinds, size, sigma, unseen, where, reason, total, both, T, difference, spread,
+            about.get("period", np.nan), over,
+        )  # fmt: skip
 
     def _why(self, settles: float, *, clear: bool) -> tuple[str, dict[str, Any]]:
         """Return the reason, a key of WHY, with what it names; `clear`: whether the size is beyond its uncertainty.
@@ -233,6 +257,8 @@ class _MemoryTest:
             rival = max(rivals, key=rivals.__getitem__)
             if total - rivals[rival] < SEEN:
                 return rival, {"hours": (when - contrasts.soak.t[0]) / 3600}
+            if total - self.tone[0] < SEEN:
+                return "tone", {"period": self.tone[1]}
             if clear:
                 return "seen", {}
             why = "slight"
@@ -240,6 +266,11 @@ class _MemoryTest:
             why = "hint"
         narrow = _narrow(contrasts.soak)
         return (why, {}) if narrow is None else ("narrow", narrow)
+
+    @cached_property
+    def tone(self) -> tuple[float, float, Array]:
+        """Log evidence of a tone in time, its period, s, and its lines (S, q)."""
+        return tone_of(self.contrasts)
 
     def _following(self) -> _MemoryTest:
         """Return the same of shapes whose curves follow their inputs, estimated from the soak: for their sizes."""
