@@ -99,7 +99,7 @@ def table(rows: list[dict[str, Any]]) -> None:
     print("tones: seen", answers(tones, "seen"), "| undecided", answers(tones, "undecided"))
     z, wrong = _z([row for row in beside if row["answer"] == "seen"]), sum(map(_denied_wrongly, beside))
     print("beside a tone: seen", answers(beside, "seen"), "| a limit below the true size", share(wrong, len(beside)))
-    print(f"  sizes within 1.96 sigma {share(int(np.sum(z < 1.96)), len(z))}, rms of z {np.sqrt(np.mean(z**2)):.2f}")
+    print(f"  sizes within 1.96 sigma {share(int(np.sum(z < 1.96)), len(z))}")
     print(f"told at least {TOLD:g} nats: seen", answers(strong, "seen"), "| denied", answers(strong, "none"))
     fair = [row for row in planted if row["fitted"] >= TOLD]
     print(f"  the same, its noise and law fitted: seen {answers(fair, 'seen')} | denied {answers(fair, 'none')}")

@@ -21,7 +21,7 @@ from driftlab.maps.hysteresis.contrasts import RANK, RATIOS, THIN, TINY, SoakCon
 from driftlab.soak.blocks import SoakSummary
 from fusion_core.chunk import Array, Flags
 
-LEAST = 2.5  # cycles of a soak: less is a slow noise
+LEAST = 2.0  # cycles of a soak: less is a slow noise
 TURNS = 40.0  # cycles of the temperature, at most
 LINES = (1, 2, 4, 8)  # side by side
 BROAD = 0.5  # of a frequency
@@ -63,7 +63,7 @@ def _of_temperature(soak: SoakSummary) -> Array:
 
 
 def _apart(cycles: Array, own: Array) -> Flags:
-    return np.asarray(np.all(np.abs(cycles[:, None] - own) >= 1.0, axis=1))
+    return np.asarray(np.all(np.abs(cycles[:, None] - own) >= STEP, axis=1))
 
 
 def _whole(soak: SoakSummary) -> float:
