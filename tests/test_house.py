@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4080
+    assert 0 < count <= 4108
 
 
 def imports():
@@ -257,38 +257,38 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 634,
-    "driftlab/commands": 3808,
-    "driftlab/evaluation": 1608,
-    "driftlab/family": 3414,
-    "driftlab/filtering": 1291,
-    "driftlab/identification": 2295,
+    "driftlab/commands": 3818,
+    "driftlab/evaluation": 1610,
+    "driftlab/family": 3410,
+    "driftlab/filtering": 1310,
+    "driftlab/identification": 2337,
     "driftlab/live": 844,
-    "driftlab/maps": 1995,
+    "driftlab/maps": 2085,
     "driftlab/noise": 1544,
-    "driftlab/planning": 1226,
-    "driftlab/production": 3219,
+    "driftlab/planning": 1259,
+    "driftlab/production": 3221,
     "driftlab/products": 6,
-    "driftlab/recordings": 686,
+    "driftlab/recordings": 736,
     "driftlab/reports": 3561,
-    "driftlab/soak": 759,
-    "driftlab/spc": 1680,
+    "driftlab/soak": 885,
+    "driftlab/spc": 1679,
     "driftlab/starter": 927,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,
-    "fusion_core": 1965,
-    "fusion_core/contracts": 1977,
+    "fusion_core": 1977,
+    "fusion_core/contracts": 1993,
     "fusion_core/fast": 861,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1272,
+    "fusion_core/thermal": 1288,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 251,
     "plugins/effects": 711,
     "plugins/exporters": 1720,
     "plugins/framings": 625,
-    "plugins/measurement_models": 737,
-    "plugins/sources": 5461,
+    "plugins/measurement_models": 748,
+    "plugins/sources": 5478,
     "plugins/stimuli": 298,
     "plugins/thermal_maps": 889,
 }
