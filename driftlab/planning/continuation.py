@@ -53,9 +53,7 @@ class RecordedSoak(SigmaCurve):
     temperature: Array  # (G,): over the range, degC
     sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
     misfit: Array  # (G, d): the part of it that the kind of map is to blame for
-    kinds: (
-        Array  # (3, d): variances of bends of the curve, and of level and shape of a recording, as `wander_of` has it
-    )
+    kinds: Array  # (3, d): variances of the curve's bends, and of level and shape of a recording (`wander_of`)
 
     @property
     def T(self) -> Array:

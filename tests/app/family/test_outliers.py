@@ -80,7 +80,6 @@ def test_many_odd_units_leave_the_tails_as_they_are():
     assert np.mean(np.array(heavy)[:, :, :2].sum(axis=2)) > 4 * 0.1  # before the data are seen, 0.1
 
 
-
 def test_where_most_values_are_the_same_others_are_judged_by_their_own_deviations() -> None:
     """Of most units a walk does not show: one that shows by a deviation is like them, one by eight is not."""
     x = np.concatenate([np.zeros((12, 1)), [[0.9], [1.2], [1.5], [8.0]]])
