@@ -88,6 +88,13 @@ class FrozenLimits(BaseModel):
         return scores if self.tails is None else np.interp(scores, self.scores(GRID), GRID)
 
 
+def covers(domain: tuple[float, float], whole: tuple[float, float]) -> bool:
+    """Return True if a soak over a `domain` is one over the `whole` range, and no wider, degC."""
+    (low, high), width = whole, whole[1] - whole[0]
+    both = min(domain[1], high) - max(domain[0], low)
+    return both >= WHOLE * width and domain[1] - domain[0] - both <= (1 - WHOLE) * width
+
+
 def usable(tails: TailLaw) -> bool:
     """Return True if a law is of one column that has a width: not of values of which most are the same."""
     columns = (tails.centre, tails.below, tails.above)
@@ -191,9 +198,7 @@ class Baseline(BaseModel):
         """Return True if a soak over a `domain` (degC) is one over the range of the baseline's units, and no wider."""
         if self.domain is None or domain is None:
             return self.domain is domain
-        (low, high), width = self.domain, self.domain[1] - self.domain[0]
-        both = min(domain[1], high) - max(domain[0], low)
-        return both >= WHOLE * width and domain[1] - domain[0] - both <= (1 - WHOLE) * width
+        return covers(domain, self.domain)
 
     @model_validator(mode="after")
     def _together_have_limits(self) -> Baseline:

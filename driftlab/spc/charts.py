@@ -289,8 +289,9 @@ class LineReport:
     multivariate : tuple of TSquaredChart
     baseline : Baseline or None
         Frozen limits on which the charts stand.
-    partial : int
-        Units that were soaked over less than the range of the baseline: neither swing nor prediction is charted.
+    partial : tuple of int
+        Places of units that were soaked over another range than most, or than that of the baseline: then neither swing
+        nor prediction is charted.
     differences : tuple of GroupDifference
         Figures that differ between the groups of a column of the units' table.
     sentences : tuple of str
@@ -309,7 +310,7 @@ class LineReport:
     too_few: tuple[str, ...] = ()
     multivariate: tuple[TSquaredChart, ...] = ()
     baseline: Baseline | None = None
-    partial: int = 0
+    partial: tuple[int, ...] = ()
     differences: tuple[GroupDifference, ...] = ()
     sentences: tuple[str, ...] = ()
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
-from driftlab.family.baseline import Baseline, FrozenLimits, Together, usable
+from driftlab.family.baseline import Baseline, FrozenLimits, Together, covers, usable
 from driftlab.family.outliers import SHAPE, LotOutlier
 from driftlab.family.record import FIGURES, PER, UnitRecord, figure_name
 from driftlab.family.tail_law import TailLaw
@@ -83,8 +83,9 @@ def line_of(
     known = {} if baseline is None else {(one.quantity, one.axis): one for one in baseline.limits}
     part = _partial(line, baseline)
     levels = None if levels is None else levels[place]
-    quantities = _Quantities(at_places(done, place), line.axes, levels, part, known)
-    line = replace(line, baseline=baseline, partial=int(np.sum(part)))
+    left_out = part if baseline is not None else np.zeros_like(part)
+    quantities = _Quantities(at_places(done, place), line.axes, levels, left_out, known)
+    line = replace(line, baseline=baseline, partial=tuple(np.flatnonzero(part).tolist()))
     enough = quantities.enough()
     alpha = FALSE / max(sum(enough.values()), 1)
     of_rules, everywhere = RULES.get(rules or "", {}), np.arange(len(line.units))
@@ -100,11 +101,15 @@ def line_of(
 
 
 def _partial(line: LineReport, baseline: Baseline | None) -> NDArray[np.bool_]:
-    """Return the units (n,) that were soaked over a part of the range of a baseline."""
-    if baseline is None:
-        return np.zeros(len(line.units), dtype=bool)
-    spans = (None if low != low else (low, high) for low, high in line.domains.tolist())
-    return np.array([not baseline.covered(span) for span in spans], dtype=bool)
+    """Return the units (n,) that were soaked over another range than those of a baseline, or than most."""
+    spans = [None if low != low else (low, high) for low, high in line.domains.tolist()]
+    if baseline is not None:
+        return np.array([not baseline.covered(span) for span in spans], dtype=bool)
+    some = np.array([span for span in spans if span is not None])
+    if len(some) < MIN_UNITS:
+        return np.zeros(len(spans), dtype=bool)
+    low, high = np.median(some, axis=0).tolist()
+    return np.array([span is not None and not covers(span, (low, high)) for span in spans], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,10 @@ def sentences(line: LineReport) -> list[str]:
         which = f"at {units(len(places))}: {_names(line, places)}" if places else "at no unit"
         lines.append(f"Run rules begin to alarm {which}.")
     if line.partial:
-        soaked = "unit was" if line.partial == 1 else "units were"
-        lines.append(f"{line.partial:,} {soaked} soaked over another range: no swing, no prediction on the charts.")
+        soaked = "unit was" if len(line.partial) == 1 else "units were"
+        of_charts = "" if line.baseline is None else ": no swing, no prediction on the charts"
+        which = _names(line, [*line.partial])
+        lines.append(f"{len(line.partial):,} {soaked} soaked over another range than the others ({which}){of_charts}.")
     return [*judged, *lines, *_differences(line), *_now(line, counted=not judged), *_limits(line)]
 
 

@@ -198,7 +198,16 @@ def test_a_soak_over_another_range_has_no_swing_on_the_charts(domain):
     records = [one.model_copy(update={"domain": domain}) for one in line(12, 4)]
     found = judged(records, frozen(60, 2))
     assert {chart.quantity for chart in found.controls} == {"residual", "noise", "walk", "level"}
-    assert "12 units were soaked over another range" in " ".join(found.sentences)
+    assert "12 units were soaked over another range than the others (" in " ".join(found.sentences)
+
+
+def test_a_unit_soaked_over_a_part_of_the_range_of_most_is_named_without_a_baseline_too():
+    records = line(12, 4)
+    whole = records[0].domain
+    records[5] = records[5].model_copy(update={"domain": (whole[0], sum(whole) / 2)})
+    said = " ".join(line_of(records, None).sentences)
+    assert f"1 unit was soaked over another range than the others ({records[5].unit})." in said
+    assert "another range" not in " ".join(line_of(line(12, 4), None).sentences)
 
 
 @pytest.mark.parametrize(
