@@ -24,7 +24,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, locked
 
 REACH = 1.96**2  # of twice the log-likelihood: 1.645^2 were 93 % on one side, of so few squares as these
 UNLIKELY = 6.0  # of twice the log-likelihood: a law so far below the best is left out
@@ -119,7 +119,8 @@ def _of_laws(t: bytes, lasted: float, size: int) -> tuple[list[Array], list[floa
     """Return the covariances of rows and the variances inside: once for all recordings of a line that are as long."""
     rows, step = BiasMeans(np.frombuffer(t), lasted, size, np.empty(0), 0), lasted / size
     within = rows.t[0] + step * (np.arange(size) - (size - 1) / 2)
-    covariances, inside = ([law.covariance(*of) for law in rows.laws] for of in ((rows.t, lasted), (within, step)))
+    both = (rows.t, lasted), (within, step)
+    covariances, inside = ([locked(law.covariance(*of)) for law in rows.laws] for of in both)
     return covariances, [float(np.trace(C) - np.mean(C) * size) / max(size - 1, 1) for C in inside]
 
 

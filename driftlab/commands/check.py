@@ -72,7 +72,10 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units | None = No
 def _off(model: MeasurementModel, site: Site, first: Chunk) -> list[str]:
     """Return the notes on the first rows, where they are at rest: readings of sensors without a map that are off."""
     model = model.only(first.channels.keys())
-    window = concatenate(list(epochs([first], model.update_interval)))
+    found = list(epochs([first], model.update_interval))
+    if not found:  # of one row
+        return []
+    window = concatenate(found)
     window = window.part(0, int(np.searchsorted(window.t, window.t[0] + model.align)))
     if len(window) < ENOUGH or not model.still(window):
         return []

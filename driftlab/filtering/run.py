@@ -41,6 +41,8 @@ from fusion_core.kalman import SHORT
 from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
 
+ENOUGH = 3  # updates of an alignment
+
 
 class Moment(NamedTuple):
     """The state of the filter between two chunks of epochs: the time in s, the tracker's snapshot, its alignments."""
@@ -157,7 +159,7 @@ class Run:
                 if self.settled is not None:
                     yield Moment(done, tracker.snapshot(), list(self.journal.alignments))
         if tracker is None:
-            raise NotAtRest(self._never_at_rest(waiting.chunk))
+            raise NotAtRest(self._never_at_rest(waiting))
 
     @contextmanager
     def _timed_errors(self) -> Generator[None]:
@@ -229,19 +231,18 @@ class Run:
                 self.journal.beyond[effect.kind, name] += count
                 self.journal.faults.add(what, count, f"at {self.journal.faults.when(chunk.t[k])}")
 
-    def _never_at_rest(self, waiting: Chunk | None) -> str:
-        align_s = self.model.align
-        have = 0.0 if waiting is None else float(waiting.t[-1] - waiting.t[0])
+    def _never_at_rest(self, waiting: FirstRest) -> str:
+        align_s, chunk = self.model.align, waiting.chunk
+        have = 0.0 if chunk is None else float(chunk.t[-1] - chunk.t[0])
         name = self.config.source.name if self.config.source else "the recording"
         left_out = "".join(f"; {line}" for line in self.journal.faults.lines(notes=False))
         left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
-        apart = self.model.update_interval  # or longer, where samples are rarer
-        if waiting is not None and len(waiting) > 1:
-            apart = max(apart, float(np.median(np.diff(waiting.t))))
-        if align_s < 2 * apart:
+        if 0 < waiting.rows < ENOUGH:
+            apart = align_s / max(waiting.rows - 1, 0.5)
+            lower = ", or filter.update_interval lower" * (self.model.update_interval > align_s / ENOUGH)
             return (
-                f"{name}: an alignment of {align_s:g} s has fewer than three updates, which are {apart:.4g} s apart; "
-                f"set filter.align to {3 * apart:.4g} s or more, or filter.update_interval lower"
+                f"{name}: an alignment of {align_s:g} s has {waiting.rows} updates at most, {ENOUGH} are needed; set "
+                f"filter.align to {ENOUGH * apart:.4g} s or more{lower}"
             )
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
@@ -287,6 +288,7 @@ class FirstRest:
     def __init__(self, plan: RunSetup) -> None:
         self.plan = plan
         self.alignment: Alignment | None = None
+        self.rows = 0  # of the longest stretch that was looked at
         self._parts: list[Chunk] = []
 
     @property
@@ -315,7 +317,8 @@ class FirstRest:
         """Return True if the unit was at rest; then it is aligned."""
         model = self.plan.model
         measured = np.sum(window["tau"]) >= model.align / 2  # a gap is no rest
-        if not (measured and len(window) > 2 and model.still(window)):
+        self.rows = max(self.rows, len(window))
+        if not (measured and len(window) >= ENOUGH and model.still(window)):
             return False
         model.check(window, self.plan.site)
         self.alignment = self.plan.aligned(window)

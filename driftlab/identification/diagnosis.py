@@ -231,6 +231,7 @@ SLOW = 120.0  # s: a residual over means of that length spoils a coast
 MATTERS = 0.5  # of the error on left-out parts
 BEYOND = 2.0  # of the declared mean square: from there on most of what is left is neither declared noise nor walk
 PREDICTABLE = 0.5  # of what is left: where more than that follows from what was before, it is no noise
+MIN_POWERS = 50  # frequencies of a spectrum: of fewer, the mean of logarithms is not Gaussian
 MAX_NATS = 700.0  # exp of minus that is nearly the least number of a computer
 
 
@@ -272,22 +273,27 @@ def structures(search: Search, error: Array) -> list[Structure]:
         text = f"what is left jumps within {duration(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
-    return [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
+    found = [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
+    return found or quick(white, evidence.interval, evidence.axes)
 
 
 def quick(white: Sequence[Array], interval: float, axes: Sequence[str]) -> list[Structure]:
     """Return the structure of innovations (n, d), `interval` s apart, of which most follows from those before.
 
     The share that does is 1 - exp(mean log S) / mean S, S the spectrum (Kolmogorov), of whose logarithm that of a
-    periodogram is less by Euler's constant in the mean. Noise has none; what repeats, as a tone or a vibration, has.
+    periodogram is less by Euler's constant in the mean. Noise has none, but for a deviation of the logarithm of
+    sqrt((pi^2 / 6 - 1) / K) over K frequencies; what repeats, as a tone or a vibration, has.
     """
+    from scipy.special import log_ndtr
+
     powers = [np.abs(np.fft.rfft(part - part.mean(axis=0), axis=0)[1:-1]) ** 2 / len(part) for part in white]
     power = np.concatenate([part for part in powers if len(part)])
-    if not len(power) or not np.all(np.mean(power, axis=0) > 0):
+    if len(power) < MIN_POWERS or not np.all(np.mean(power, axis=0) > 0):
         return []
-    flatness = np.exp(np.mean(np.log(power), axis=0) + np.euler_gamma) / np.mean(power, axis=0)
-    k = int(np.argmin(flatness))
-    nats, limit = -len(power) * float(np.log(flatness[k])), -float(np.log(SIGNIFICANT / len(axes)))
+    logs = np.mean(np.log(power), axis=0) + np.euler_gamma - np.log(np.mean(power, axis=0))
+    flatness, k = np.exp(logs), int(np.argmin(logs))
+    nats = -float(log_ndtr(logs[k] / np.sqrt((np.pi**2 / 6 - 1) / len(power))))
+    limit = -float(np.log(SIGNIFICANT / len(axes)))
     if nats <= limit or flatness[k] > 1 - PREDICTABLE:
         return []
     longest = max(powers, key=len)[:, k]

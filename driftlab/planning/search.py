@@ -26,6 +26,7 @@ CLASSIC = 5.0  # K, step of the staircase that others are compared with
 MIX = 10.0  # K, step of the levels after ramps
 MIN_COVERAGE = 0.97  # of the range, by a profile
 ALIKE = 1.05  # profiles whose sigma differs by less than this factor are as good
+SAME = 1e-6  # of the hours of a profile: rounding
 SLOWER = 1.25  # times as long as the quickest ramps, again and again: profiles that any more hours allow
 SHARES = (0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the hours, for the Pareto curve
 GRID = 121
@@ -201,7 +202,8 @@ class Ratings:
             while longer <= hours and (len(known) < 2 or known[-1].score < known[-2].score):
                 known += self.of(possible(ramps(self.chamber, longer, cycles)))
                 longer *= SLOWER
-        return [item for item in self.every if item.profile.hours <= hours and item.share >= MIN_COVERAGE]
+        within = hours * (1 + SAME)
+        return [item for item in self.every if item.profile.hours <= within and item.share >= MIN_COVERAGE]
 
     def best(self, point: Point) -> RatedProfile:
         """Return the best profile of up to the point's hours."""
@@ -229,7 +231,7 @@ class Ratings:
         low = 0.0
         while best is not None and best.profile.hours > 1.03 * low:
             longest = best.profile.hours
-            low = max((tried for tried in self.hours if tried < longest), default=longest / 8)
+            low = max((tried for tried in self.hours if tried < longest * (1 - SAME)), default=longest / 8)
             if longest > 1.03 * low:
                 self.point(float(np.sqrt(low * longest)))
                 best = reached(longest)
@@ -250,6 +252,7 @@ def search(
     say(f"profiles of {hours:g} h")
     ratings = Ratings(subject, chamber)
     tried = ratings.of(candidates(chamber, hours))
+    ratings.hours.append(hours)
     if max((item.share for item in tried), default=0.0) < MIN_COVERAGE:
         raise ConfigError(_too_short(chamber, hours, tried))
     points: list[Point] = []
@@ -264,9 +267,11 @@ def search(
     classic = next((item for item in tried if _is_classic(item)), None)
     finer = {item: judge(item.profile, subject, chamber, DRAWS) for item in {*order[:2], classic or order[0]}}
     order = ranked([finer.get(item, item) for item in order])
+    ratings.every = [finer.get(item, item) for item in ratings.every]
     classic = None if classic is None else finer[classic]
     points = [replace(p, best=order[0], classic=classic) if p.hours == hours else p for p in points]
-    pareto = tuple(replace(p, best=ratings.best(p)) for p in points)  # who has more hours may stop earlier
+    # who has more hours may stop earlier
+    pareto = tuple(p if p.hours == hours else replace(p, best=ratings.best(p)) for p in points)
     shortest = None if target is None else ratings.shortest(hours, target)
     return SearchResult(subject, chamber, hours, tuple(order), classic, pareto, target, shortest)
 

@@ -299,9 +299,10 @@ class _Command:
         known = family.get("acknowledged", {})
         if none := sorted(self.jobs.options.notes.keys() - known.keys()):
             alarmed = sorted({*family.get("open", ()), *known})
+            verb, notes = ("has", "its note is") if len(none) == 1 else ("have", "their notes are")
             raise ConfigError(
-                f"--acknowledge {quote(none[0])}: is neither odd nor out of control, so its note is not kept; all else "
-                f"is done; {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has an alarm'}"
+                f"--acknowledge: {some([quote(one) for one in none])} {verb} no alarm, so {notes} not kept (all else "
+                f"is done and written); {f'units with an alarm: {some(alarmed)}' if alarmed else 'no unit has one'}"
             )
 
     def to_database(self, database: Database, summary: Mapping[str, Any]) -> None:

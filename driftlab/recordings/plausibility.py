@@ -187,7 +187,7 @@ class Holds:
 
         Where all axes do, and evenly, the rows only come faster than the readings: that is a note.
         """
-        times, found = np.arange(BLOCK), {}
+        times, found, usual, even = np.arange(BLOCK), dict[str, tuple[float, float, int]](), [], True
         for k, axis in enumerate(self.axes):
             behind, runs = np.concatenate([*self.ends[k], np.empty(0)]), self.runs[k]
             m = float(np.median(behind / self.least[k])) ** 2 if len(behind) >= ENDS else 1.0
@@ -195,15 +195,22 @@ class Holds:
                 most = 2 * np.log(self.rows / CHANCE) / np.log1p(2 * np.pi * (m - 1))
                 share = float((times * runs)[times > most].sum()) / self.rows
                 if share >= SHARE:
-                    found[axis] = most, share, int(np.max(np.flatnonzero(runs))), float(times @ runs / np.sum(runs))
-        even = len(found) == len(self.axes) and all(longest <= 2 * mean for *_, longest, mean in found.values())
-        for axis, (most, share, longest, _) in found.items():
-            text = (
+                    half, most_rows = np.searchsorted(np.cumsum(times * runs) / (times @ runs), [0.5, 0.9])
+                    even &= bool(most_rows <= 2 * half)
+                    usual.append(half)
+                    found[axis] = most, share, int(np.max(np.flatnonzero(runs)))
+        if even and len(found) == len(self.axes):
+            faults.note(
+                f"{self.name} gives each reading about {1 + min(usual)} times: rows come faster than the sensor reads; "
+                "record each reading once, or declare the noise of such rows"
+            )
+            return
+        for axis, (most, share, longest) in found.items():
+            faults.doubt(
                 f"{axis_name(self.name, axis)} shows the very same reading up to {longest + 1} times in a row, in "
                 f"{share:.0%} of the rows, where its noise would not {most + 1:.0f} times: it {HELD}, as over a "
                 "link that loses samples; record each reading once, or correct the logger"
             )
-            (faults.note if even else faults.doubt)(text)
 
 
 def axes_in(sensor: Sensor | None, d: int) -> list[str]:

@@ -174,7 +174,8 @@ def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults:
     usual = np.median(ratios, axis=0)
     over = np.max(np.divide(ratios, usual, out=np.zeros_like(ratios), where=usual > 0), axis=1)
     loud = (over > LOUD) & (epochs >= ENOUGH)
-    held = any(HELD in text for text in faults.doubts)  # then noise is what comes when a hold ends
+    # noise is then what comes when a hold ends
+    held = any(HELD in text and text.startswith(sensor.channel) for text in faults.doubts)
     if np.sum(epochs[loud]) >= NOTED * np.sum(epochs) and not held:
         faults.doubt(
             f"{sensor.channel}: noise is {np.median(over[loud]):.2g} times the usual between {np.min(T[loud]):.3g} and "

@@ -25,25 +25,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.thermal.curve_error import CurveError
-from fusion_core.thermal.curve_uncertainty import KnownErrors, answered, curve_error
+from fusion_core.thermal.curve_uncertainty import LITTLE, KnownErrors, answered, curve_error
 from fusion_core.thermal.penalised import smooth_lines
 from fusion_core.thermal.soak_noise import MIN_BLOCKS, Contrasts, Smoother, blocks_of
 from fusion_core.threads import one_thread
 
 CELLS = 8, 40  # of temperature, fewest and most
 MEANS = 240  # in cells of all recordings, about
+LINE = 2  # means that a line passes through
 STRAIGHT = 1e-9  # of the largest eigenvalue of the penalty: a shape that bends less is a line
 TRIED = np.arange(-20.0, 5.0, 6.0)  # logarithms of rho^2, tau^2 and eta^2 by the blocks' variance, to begin from
 LEAST, MOST = -24.0, 8.0
 NOTHING = 1e-30  # SI, of a channel that is zero
-LITTLE = 1e-9  # of the noise: no combination of blocks is without
 
 
 class WanderNoise(NamedTuple):
@@ -75,7 +75,7 @@ def fitted_jointly(
 ) -> FittedMap:
     """Return the map of samples T (N,) and bias (N, d) less what they have wandered, if that was found.
 
-    Its residual is that of the samples as they are.
+    Its residual is that of the samples as they are; its error is worked out anew, from the noise that was found.
     """
     fitted = settings.fit(T, bias if found is None else bias - found.taken, about)
     if found is None:
@@ -147,8 +147,8 @@ class WanderDesign:
 
     @property
     def separates(self) -> bool:
-        """True where there are blocks enough to separate walk from white noise."""
-        return len(self.blocks.T) - len(self.contrasts.knots) - self.R >= MIN_BLOCKS
+        """True where there are blocks enough to separate walk from white noise, and means that bend."""
+        return len(self.means) > LINE and len(self.blocks.T) - len(self.contrasts.knots) - self.R >= MIN_BLOCKS
 
     def noise(self, y: Array) -> WanderNoise:
         """Return the variances in blocks y (K,)."""
@@ -170,7 +170,10 @@ class WanderDesign:
         paused = float(np.clip(np.log(max(found.walk, 1e-300) / self.R / scale), LEAST, MOST - 1))
         begin: Array = np.array(min(((r, max(t, paused), g) for r in TRIED for t in TRIED for g in TRIED), key=cost))
         bounds = [(LEAST, MOST), (paused, MOST), (LEAST, MOST)]
-        logs = minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options={"xatol": 0.05, "fatol": 0.01}).x
+        inwards = np.where(begin + 1 < MOST, 1.0, -1.0)  # scipy's own simplex is flat at a bound below zero
+        simplex = np.vstack([begin, begin + np.diag(inwards)])
+        how: Any = {"xatol": 0.05, "fatol": 0.01, "initial_simplex": simplex}
+        logs = minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=how).x
         return WanderNoise(found.walk, found.white, *(scale * np.exp(logs)).tolist())
 
     def left(self, noise: WanderNoise) -> tuple[Array, Array]:

@@ -40,7 +40,7 @@ MIN_VARIANCE = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
 HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
 TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
-LEAST = 1e-9  # of the mean variance of blocks: no combination of them is without noise
+LITTLE = 1e-9  # of the mean variance of blocks: no combination of them is without noise
 NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 SURE = 2.0  # deviations of the place of a misfit, of which chance is excluded by all places together
@@ -60,7 +60,7 @@ class KnownErrors:
     def noise(self, contrasts: Contrasts, blocks: Blocks, axis: int) -> BlockNoise:
         """Return them as the noise of an axis of these blocks, of which a curve leaves `blocks.y` (K, d)."""
         S, white = self.roots[axis] @ self.roots[axis].T, self.white[axis]
-        S[np.diag_indices(len(S))] += max(LEAST * np.trace(S) / len(S), np.finfo(float).tiny)
+        S[np.diag_indices(len(S))] += max(LITTLE * np.trace(S) / len(S), np.finfo(float).tiny)
         return contrasts.known(S, blocks.y[:, axis], 0.0, white)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.soak.blocks import CELLS, OFF, SoakRows, SoakSummary, means, runs
-from fusion_core.chunk import Array, Flags, Integers
+from fusion_core.chunk import Array, Flags, Integers, locked
 from fusion_core.thermal.soak_noise import Complement, basis_of
 from fusion_core.wandering import gauss_markov
 
@@ -79,9 +79,10 @@ def _laws(t: bytes, span: bytes, recording: bytes) -> tuple[Array, list[Array], 
     Once for all units of a line that are soaked for the same times.
     """
     blocks = SoakRows(np.frombuffer(t), np.empty(0), np.empty(0), np.frombuffer(span), {})
-    root = np.sqrt(blocks.span / np.mean(blocks.span))[:, None]
-    laws = [root * C * root.T for C in laws_of(blocks, np.frombuffer(recording, np.int64))]
-    return root, laws, np.linalg.eigh(laws[0])
+    root = locked(np.sqrt(blocks.span / np.mean(blocks.span))[:, None])
+    laws = [locked(root * C * root.T) for C in laws_of(blocks, np.frombuffer(recording, np.int64))]
+    own, V = map(locked, np.linalg.eigh(laws[0]))
+    return root, laws, (own, V)
 
 
 def laws_of(blocks: SoakRows, recording: Integers) -> list[Array]:

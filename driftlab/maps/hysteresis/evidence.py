@@ -261,9 +261,8 @@ class ShapeEvidence:
                 t = (low + high) / 2
                 t2 = t**2 * alike[:, :, axis]
                 factors = [weight @ (1 + np.exp(g / (1 + g) * t2 / 2) / np.sqrt(1 + g)) for g in SIZES]
-                reached = np.exp((d - 1) * still) @ factors >= 2 * len(SIZES) * np.exp(
-                    SEEN
-                )  # beside pairs of even odds
+                least = 2 * len(SIZES) * np.exp(SEEN)  # beside pairs of even odds
+                reached = np.exp((d - 1) * still) @ factors >= least
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
             needed[:, axis] = np.where(low > 0.99 * MAX_T, np.inf, high)
         spread = np.sum(

@@ -14,6 +14,7 @@ from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEv
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.maps.hysteresis.tones import tone_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
+from driftlab.units import duration
 from fusion_core.chunk import Array, Flags
 from fusion_core.threads import one_thread
 
@@ -45,7 +46,7 @@ WHY = {
     "remembers more is not known; let it settle before the soak, or leave the first hours out with PATH::START:STOP",
     "jump": "up and down differ as where the bias jumped after {hours:.3g} h: whether it remembers is not known; go up "
     "and down again, by the same steps",
-    "tone": "a period of {period:.0f} s in time explains as much of what is between up and down: whether it remembers "
+    "tone": "a period of {period} in time explains as much of what is between up and down: whether it remembers "
     "is not known; keep what has that period away from the sensor, or go up and down again, at another pace",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
@@ -162,11 +163,6 @@ def _beside_tones(soak: SoakSummary, shapes: MemoryShapes, lines: Array | None, 
     return replace(beside, answer="undecided", none_larger_than=np.full(d, np.inf), why=verdict.why)
 
 
-def _reason(key: str, shapes: MemoryShapes, **about: Any) -> str:
-    """Return a reason of WHY with what it names, and which effects could not be tried."""
-    return "; ".join([WHY[key].format(**about), *(f"could not be tried: {text}" for text in shapes.broken)])
-
-
 def _unseen(soak: SoakSummary) -> str:
     """Return the reason why no soak like this shows a memory, a key of WHY; empty where it may."""
     warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
@@ -237,7 +233,8 @@ class _MemoryTest:
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
-        reason = _reason(why, self.shapes, **about)
+        named = about | {"period": duration(period)} if (period := about.get("period")) else about
+        reason = "; ".join([WHY[why].format(**named), *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         over = float(np.ptp(self.contrasts.soak.domain)) * (2 * BESIDE + 1) / CELLS
         return MemoryVerdict(

@@ -43,6 +43,7 @@ def tone_of(contrasts: SoakContrasts) -> tuple[float, float, Array]:
         each = evidence_of(contrasts, cycles, n)
         k = int(np.argmax(each))
         near = cycles[k] + n * STEP * np.linspace(-1, 1, CLOSER + 1)[1:-1]
+        near = np.clip(near, cycles[0], most)
         near = near[_apart(near, own)]
         closer = evidence_of(contrasts, near, n)
         share = np.log(2 * n * STEP / (most - LEAST))

@@ -201,7 +201,7 @@ def test_never_at_rest_is_an_error():
 def test_an_alignment_of_too_few_updates_says_so():
     made = config()
     short = made.filter.model_copy(update={"align": 5.0, "update_interval": 5.0})
-    with pytest.raises(NotAtRest, match=r"fewer than three updates, which are 5 s apart; set filter.align to 15 s or"):
+    with pytest.raises(NotAtRest, match=r"has 2 updates at most, 3 are needed; set filter.align to 15 s or more, or"):
         go(made.model_copy(update={"filter": short}), unit_at_rest(seconds=200))
 
 

@@ -131,3 +131,36 @@ def test_an_axis_without_noise_is_fitted_as_it_is():
 def test_recordings_too_short_are_fitted_together_as_they_are():
     T = np.linspace(0.0, 10.0, 24)
     assert wander_of(T, np.random.default_rng(0).normal(size=(24, 1)), [0, 12]) is None
+
+
+def test_soaks_at_two_temperatures_alone_are_left_to_the_kind_of_map():
+    T = np.repeat([10.0, 40.0], 600) + np.random.default_rng(0).normal(size=1200) * 1e-3
+    assert wander_of(T, np.random.default_rng(1).normal(size=(1200, 1)), [0, 600]) is None
+
+
+def test_the_variances_are_those_of_the_largest_likelihood():
+    """Of twice and half of each, by determinants written out, none is likelier by more than the search resolves."""
+    for seed in range(4):
+        profiles = [ramps(2.0) + 0.3 * k for k in range(6)]
+        T, starts = np.concatenate(profiles), np.cumsum([0, *map(len, profiles)])[:-1].tolist()
+        bias = drawn(profiles, seed, turn_on=8.0)[:, :1]
+        design = WanderDesign(T, bias - bias.mean(axis=0), starts)
+        A, y, noise = design.means, design.blocks.y[:, 0], design.noise(design.blocks.y[:, 0])
+        X = A @ design.line
+
+        def likelihood(sizes, A=A, y=y, X=X, noise=noise, design=design):
+            white = np.diag(noise.white * design.contrasts.white)
+            own = sum(size * C for size, C in zip(sizes, design.kinds, strict=True))
+            V = A @ (noise.walk * design.contrasts.covariance + white + own) @ A.T
+            inside = X.T @ np.linalg.solve(V, X)
+            left = A @ y - X @ np.linalg.solve(inside, X.T @ np.linalg.solve(V, A @ y))
+            logs = np.linalg.slogdet(V)[1] + np.linalg.slogdet(inside)[1]
+            return -0.5 * (logs + left @ np.linalg.solve(V, left))
+
+        sizes = np.array([noise.bends, noise.levels, noise.shapes])
+        best = likelihood(sizes)
+        for k in range(3):
+            for times in (0.5, 2.0):
+                other = sizes * np.where(np.arange(3) == k, times, 1.0)
+                least = noise.walk / design.R if k == 1 else 0.0  # what the walk makes in a recording
+                assert other[k] < least or likelihood(other) < best + 0.02

@@ -78,7 +78,7 @@ def test_where_a_period_explains_as_much_it_is_named():
     rng = np.random.default_rng(3)
     found = judged(6 * sine(900, rng), rng)
     assert found.answer == "undecided"
-    assert found.why.startswith("a period of 900 s in time explains as much")
+    assert found.why.startswith("a period of 15 min in time explains as much")
     assert not found.kinds
     assert np.nanmax(np.abs(found.difference)) < 6  # beside the tone
 
