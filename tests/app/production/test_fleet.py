@@ -452,7 +452,7 @@ def test_a_note_on_an_alarm_stays_until_the_alarm_is_another(fleet):
     moved(known, 1.0)
     first, _ = fleet(out="new", family=known)
     assert first.summary["family"]["open"] == ["0000", "0001", "0002"]
-    with pytest.raises(ConfigError, match=r"0003: is neither odd .*; units with an alarm: 0000, 0001, 0002$"):
+    with pytest.raises(ConfigError, match=r"0003 has no alarm.*; units with an alarm: 0000, 0001, 0002$"):
         fleet(out="new", family=known, acknowledge={"0001": nasty, "0003": "none"}, operator="anna")
     noted, asked = fleet(out="new", family=known, operator="anna")  # the note on the other one is kept
     fleet(out="new", family=known, acknowledge={"0001": nasty}, operator="anna")  # the same note again is no other
