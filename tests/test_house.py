@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4108
+    assert 0 < count <= 4109
 
 
 def imports():
@@ -257,25 +257,25 @@ def test_tests_mirror_the_tree():
 
 BUDGET = {
     "driftlab": 634,
-    "driftlab/commands": 3818,
+    "driftlab/commands": 3821,
     "driftlab/evaluation": 1610,
     "driftlab/family": 3410,
-    "driftlab/filtering": 1310,
-    "driftlab/identification": 2337,
+    "driftlab/filtering": 1312,
+    "driftlab/identification": 2341,
     "driftlab/live": 844,
-    "driftlab/maps": 2085,
+    "driftlab/maps": 2086,
     "driftlab/noise": 1544,
-    "driftlab/planning": 1259,
-    "driftlab/production": 3221,
+    "driftlab/planning": 1261,
+    "driftlab/production": 3222,
     "driftlab/products": 6,
-    "driftlab/recordings": 736,
+    "driftlab/recordings": 743,
     "driftlab/reports": 3561,
-    "driftlab/soak": 885,
-    "driftlab/spc": 1679,
+    "driftlab/soak": 888,
+    "driftlab/spc": 1686,
     "driftlab/starter": 927,
     "driftlab/storage": 1275,
     "driftlab/triad": 717,
-    "fusion_core": 1977,
+    "fusion_core": 1978,
     "fusion_core/contracts": 1993,
     "fusion_core/fast": 861,
     "fusion_core/host": 745,
@@ -288,7 +288,7 @@ BUDGET = {
     "plugins/exporters": 1720,
     "plugins/framings": 625,
     "plugins/measurement_models": 748,
-    "plugins/sources": 5478,
+    "plugins/sources": 5477,
     "plugins/stimuli": 298,
     "plugins/thermal_maps": 889,
 }
