@@ -263,7 +263,7 @@ BUDGET = {
     "driftlab/filtering": 1312,
     "driftlab/identification": 2341,
     "driftlab/live": 844,
-    "driftlab/maps": 2086,
+    "driftlab/maps": 2087,
     "driftlab/noise": 1544,
     "driftlab/planning": 1261,
     "driftlab/production": 3222,

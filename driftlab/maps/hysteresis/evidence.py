@@ -39,7 +39,6 @@ TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods
 FORM = 0.02  # of a size: what the true form may have more or less than the shapes of a grid
 FORMED = 0.08  # the same of inputs, of whose grid every other is tried; their curves' own covariance apart
 COARSE = 4  # every so many of the shapes of a kind make pairs
-CLOSER = 30  # instants of a jump beside the likeliest
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
 
@@ -327,32 +326,6 @@ class Pairs:
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
         return cls(which, total[order], mean[order], covariance[order], evidence)
-
-
-def of_a_jump(contrasts: SoakContrasts) -> tuple[float, float]:
-    """Return the log evidence of one jump of the bias, at an instant as likely as any other, and which is likeliest, s.
-
-    It is looked for before every other block, and beside the likeliest of these before slots: a block in which the bias
-    jumps is like none.
-    """
-    soak, places = contrasts.soak, contrasts.starts[1::2]
-    each = _jumps(contrasts, places)
-    k = int(np.argmax(each))
-    start, stop = places[max(k - 1, 0)], places[min(k + 1, len(places) - 1)]
-    near = np.arange(start, stop + 1, max(1, (stop - start) // CLOSER))
-    closer = _jumps(contrasts, near)
-    share = np.log((stop - start) / len(soak.T))
-    evidence = np.logaddexp(float(log_mean(each)), float(log_mean(closer)) + share)
-    return float(evidence), float(soak.t[near[int(np.argmax(closer))]])
-
-
-def _jumps(contrasts: SoakContrasts, slots: Integers) -> Array:
-    """Return the log evidence (J,) of jumps of the bias at the beginnings of slots (J,)."""
-    recording, d = contrasts.soak.recording, contrasts.u.shape[1]
-    after = (np.arange(len(recording))[:, None] >= slots) & (recording[:, None] == recording[slots])
-    z = np.repeat(contrasts.of(after.astype(np.float64))[:, :, None], d, axis=2)
-    none = np.empty((2, len(contrasts.Q[::THIN]), 0, d))
-    return ShapeEvidence(contrasts, z, ("jump",) * len(slots), none).of_shapes
 
 
 def shares(x: Array) -> Array:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence, of_a_jump
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
+from driftlab.maps.hysteresis.rivals import of_a_jump, tone_of
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
-from driftlab.maps.hysteresis.tones import tone_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.units import duration
 from fusion_core.chunk import Array, Flags

@@ -1,4 +1,6 @@
-"""Tones of a bias in time, as of an air conditioning, a pump or a heater's limit cycle: rivals of a memory.
+"""Rivals of a memory: what a bias does in time may be taken for what it remembers of temperature.
+
+It may jump once, or have a tone, as of an air conditioning, a pump or a heater's limit cycle.
 
 A tone of c cycles in the soak, whose amplitude and phase wander, is taken as so many lines side by side::
 
@@ -18,8 +20,9 @@ from __future__ import annotations
 import numpy as np
 
 from driftlab.maps.hysteresis.contrasts import RANK, RATIOS, THIN, TINY, SoakContrasts, log_mean
+from driftlab.maps.hysteresis.evidence import ShapeEvidence
 from driftlab.soak.blocks import SoakSummary
-from fusion_core.chunk import Array, Flags
+from fusion_core.chunk import Array, Flags, Integers
 
 LEAST = 2.0  # cycles of a soak: less is a slow noise
 TURNS = 40.0  # cycles of the temperature, at most
@@ -27,8 +30,35 @@ LINES = (1, 2, 4, 8)  # side by side
 BROAD = 0.5  # of a frequency
 STEP = 0.5  # cycles, of each line
 CLOSER = 8  # frequencies beside the likeliest
+INSTANTS = 30  # of a jump, beside the likeliest
 OWN = 0.5  # of the temperature's variance: a line of its own
 STRENGTHS = 4.0 * 25.0 ** np.arange(5)  # g
+
+
+def of_a_jump(contrasts: SoakContrasts) -> tuple[float, float]:
+    """Return the log evidence of one jump of the bias, at an instant as likely as any other, and which is likeliest, s.
+
+    It is looked for before every other block, and beside the likeliest of these before slots: a block in which the bias
+    jumps is like none.
+    """
+    soak, places = contrasts.soak, contrasts.starts[1::2]
+    each = _jumps(contrasts, places)
+    k = int(np.argmax(each))
+    start, stop = places[max(k - 1, 0)], places[min(k + 1, len(places) - 1)]
+    near = np.arange(start, stop + 1, max(1, (stop - start) // INSTANTS))
+    closer = _jumps(contrasts, near)
+    share = np.log((stop - start) / len(soak.T))
+    evidence = np.logaddexp(float(log_mean(each)), float(log_mean(closer)) + share)
+    return float(evidence), float(soak.t[near[int(np.argmax(closer))]])
+
+
+def _jumps(contrasts: SoakContrasts, slots: Integers) -> Array:
+    """Return the log evidence (J,) of jumps of the bias at the beginnings of slots (J,)."""
+    recording, d = contrasts.soak.recording, contrasts.u.shape[1]
+    after = (np.arange(len(recording))[:, None] >= slots) & (recording[:, None] == recording[slots])
+    z = np.repeat(contrasts.of(after.astype(np.float64))[:, :, None], d, axis=2)
+    none = np.empty((2, len(contrasts.Q[::THIN]), 0, d))
+    return ShapeEvidence(contrasts, z, ("jump",) * len(slots), none).of_shapes
 
 
 def tone_of(contrasts: SoakContrasts) -> tuple[float, float, Array]:

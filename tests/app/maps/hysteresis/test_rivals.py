@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from driftlab.maps.hysteresis.contrasts import RATIOS, THIN, SoakContrasts, log_mean
 from driftlab.maps.hysteresis.memory import memory_of
-from driftlab.maps.hysteresis.tones import STRENGTHS, evidence_of, lines_of, tone_of
+from driftlab.maps.hysteresis.rivals import STRENGTHS, evidence_of, lines_of, tone_of
 from driftlab.soak.blocks import brief
 
 N = 10_800  # samples, of 1 s
