@@ -21,7 +21,7 @@ from driftlab.identification.least_squares import Term, without_term
 from driftlab.identification.records import Evidence, Progress
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.identification.trials import as_good, contains, is_copy, tried, with_uncertain_map
-from driftlab.noise.local_level import LocalLevel, whitened
+from driftlab.noise.local_level import LocalLevel, one_step, whitened
 from driftlab.units import duration
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -256,10 +256,9 @@ def structures(search: Search, error: Array) -> list[Structure]:
     columns, evidence = search.columns, search.evidence
     left = np.stack(search.residuals(search.model), axis=1)
     parts = [part * columns.scale[columns.y] for part in evidence.split(left)]
-    white = _white(search, evidence.split(left))
     if not _slow(evidence.interval, parts, error):
-        return quick(white, evidence.interval, evidence.axes)
-    scales = list(_sums(white))
+        return quick(_predicted(search, evidence.split(left)), evidence.interval, evidence.axes)
+    scales = list(_sums(_white(search, evidence.split(left))))
     limit = -float(np.log(SIGNIFICANT / len(scales)))
     unit, stays = evidence.unit, _stays(evidence.interval, parts)
     size = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * unit.factor
@@ -274,11 +273,11 @@ def structures(search: Search, error: Array) -> list[Structure]:
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
     found = [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
-    return found or quick(white, evidence.interval, evidence.axes)
+    return found or quick(_predicted(search, evidence.split(left)), evidence.interval, evidence.axes)
 
 
 def quick(white: Sequence[Array], interval: float, axes: Sequence[str]) -> list[Structure]:
-    """Return the structure of innovations (n, d), `interval` s apart, of which most follows from those before.
+    """Return the structure of prediction errors (n, d), `interval` s apart, of which most follows from those before.
 
     The share that does is 1 - exp(mean log S) / mean S, S the spectrum (Kolmogorov), of whose logarithm that of a
     periodogram is less by Euler's constant in the mean. Noise has none, but for a deviation of the logarithm of
@@ -327,6 +326,14 @@ def beyond_declared(evidence: Evidence, parts: Sequence[Array]) -> list[Structur
             if nats > limit:
                 found.append((float(square), Structure("time", length, text, min(nats, MAX_NATS), limit)))
     return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _predicted(search: Search, parts: list[Array]) -> list[Array]:
+    """Return the errors (n - 1, d) of predicting the residual (n, d) of each recording from its past, by its noise."""
+    pairs = [
+        [(np.ascontiguousarray(e), noise.gain) for e, noise in zip(x.T, search.noises, strict=True)] for x in parts
+    ]
+    return [np.column_stack([one_step([e], gain)[0] for e, gain in own]) for own in pairs]
 
 
 def _white(search: Search, parts: list[Array]) -> list[Array]:

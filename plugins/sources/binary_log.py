@@ -198,6 +198,7 @@ class Stamps:
         if self.counter.tick is not None:
             anew |= steps > modulo // 2
         steps = np.where(anew, self.step, steps)
+        steps[0] *= before is not None  # the first sample is at zero
         self._add(RESTARTS, anew.astype(np.int64), steps)
         lost = np.maximum(np.rint(steps / self.step) - 1, 0).astype(np.int64)
         self._add(LOST, lost, steps)
