@@ -263,7 +263,7 @@ BUDGET = {
     "driftlab/filtering": 1312,
     "driftlab/identification": 2345,
     "driftlab/live": 844,
-    "driftlab/maps": 2087,
+    "driftlab/maps": 2085,
     "driftlab/noise": 1544,
     "driftlab/planning": 1261,
     "driftlab/production": 3222,

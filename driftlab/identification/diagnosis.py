@@ -251,14 +251,18 @@ def structures(search: Search, error: Array) -> list[Structure]:
 
     `error` (d,) is that of the model on left-out parts, SI.
     """
+    columns, evidence = search.columns, search.evidence
+    left = evidence.split(np.stack(search.residuals(search.model), axis=1))
+    parts = [part * columns.scale[columns.y] for part in left]
+    found = _lasting(search, left, parts) if _slow(evidence.interval, parts, error) else []
+    return found or quick(_predicted(search, left), evidence.interval, evidence.axes)
+
+
+def _lasting(search: Search, left: list[Array], parts: list[Array]) -> list[Structure]:
+    """Return the structures of a slow residual, of each recording (n, d) in the columns' scale and in SI."""
     from scipy.special import log_ndtr
 
-    columns, evidence = search.columns, search.evidence
-    left = np.stack(search.residuals(search.model), axis=1)
-    parts = [part * columns.scale[columns.y] for part in evidence.split(left)]
-    if not _slow(evidence.interval, parts, error):
-        return quick(_predicted(search, evidence.split(left)), evidence.interval, evidence.axes)
-    scales = list(_sums(_white(search, evidence.split(left))))
+    evidence, scales = search.evidence, list(_sums(_white(search, left)))
     limit = -float(np.log(SIGNIFICANT / len(scales)))
     unit, stays = evidence.unit, _stays(evidence.interval, parts)
     size = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * unit.factor
@@ -272,8 +276,7 @@ def structures(search: Search, error: Array) -> list[Structure]:
         text = f"what is left jumps within {duration(length)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", length, text, min(-p, MAX_NATS), limit))
     worst = [max(each, key=lambda s: s.log_likelihood_gain) for each in (varying, outlying)]
-    found = [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
-    return found or quick(_predicted(search, evidence.split(left)), evidence.interval, evidence.axes)
+    return [s for s in worst if s.log_likelihood_gain > s.threshold] + beyond_declared(evidence, parts)[:1]
 
 
 def quick(white: Sequence[Array], interval: float, axes: Sequence[str]) -> list[Structure]:

@@ -195,6 +195,11 @@ class SoakContrasts:
         return np.concatenate([np.sum(np.log(self.weights(own)), axis=1) / 2 for own, _ in self.laws])
 
     @cached_property
+    def thin(self) -> Integers:
+        """Every THIN-th ratio of each law (R',), by its number among the noises."""
+        return np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
+
+    @cached_property
     def Q(self) -> Array:
         """Squares (R, d) of the bias under each noise."""
         return np.concatenate([self.weights(own) @ (V.T @ self.u) ** 2 for own, V in self.laws])
@@ -390,8 +395,7 @@ class SoakContrasts:
         determinant of coefficients beside noise.
         """
         left = np.maximum(Q - explained, 1e-9 * Q + TINY)
-        thin = np.arange(len(self.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-        log_w = self.log_w[thin, None]
+        log_w = self.log_w[self.thin, None]
         return np.asarray((log_w - log_size / 2)[..., None] - len(self.u) / 2 * np.log(left))
 
 

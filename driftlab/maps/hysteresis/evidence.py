@@ -28,7 +28,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, TINY, SoakContrasts, log_mean
+from driftlab.maps.hysteresis.contrasts import SIZES, THIN, TINY, SoakContrasts, log_mean
 from fusion_core.chunk import Array, Integers
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
@@ -101,11 +101,6 @@ class ShapeEvidence:
         return int(self.z.shape[1] - self.followed.shape[2])
 
     @cached_property
-    def _thin(self) -> Integers:
-        """Noises (R',) under which there are pairs."""
-        return np.arange(len(self.Q)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-
-    @cached_property
     def _both(self) -> Integers:
         """Shapes (2, P) of which there are pairs."""
         names = np.array(self.kinds)
@@ -123,7 +118,7 @@ class ShapeEvidence:
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
         each = self._of(slice(None), self.t2, 1)
-        either = log_mean(log_mean(self.followed)) - log_mean(self.contrasts.without[self._thin])
+        either = log_mean(log_mean(self.followed)) - log_mean(self.contrasts.without[self.contrasts.thin])
         either = np.sum(np.logaddexp(0.0, either) - np.log(2), axis=1)
         each[self.added :] = np.logaddexp(each[self.added :], either) - np.log(2)
         return each
@@ -131,13 +126,13 @@ class ShapeEvidence:
     @cached_property
     def pairs(self) -> tuple[Array, Array]:
         """t^2 of each pair of shapes (R', P, d), and their log evidence (P,), its prior apart."""
-        (i, k), (A, B) = self._both, (values[self._thin] for values in self._sums)
-        single, a, b, c = self.t2[self._thin], A[:, i], A[:, k], self._gram
+        (i, k), (A, B) = self._both, (values[self.contrasts.thin] for values in self._sums)
+        single, a, b, c = self.t2[self.contrasts.thin], A[:, i], A[:, k], self._gram
         det = a * b - c**2
         apart = det > LEFT * a * b
         t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
         t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
-        return t2, self._of(self._thin, t2, 2)
+        return t2, self._of(self.contrasts.thin, t2, 2)
 
     @property
     def A(self) -> Array:
@@ -205,7 +200,7 @@ class ShapeEvidence:
             return 0.0
         left, none = self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], self.contrasts.without
         each = log_mean(self.contrasts.likelihood(left)) - log_mean(none)
-        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(none[self._thin])
+        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(none[self.contrasts.thin])
         return float(np.max(np.sum(np.maximum(each, whole), axis=1)))
 
     def alone(self, which: NDArray[np.bool_]) -> float:
@@ -225,7 +220,7 @@ class ShapeEvidence:
         if not len(each) or np.max(each) <= np.max(self.of_shapes):
             return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
         squares = np.full_like(self.Q, np.nan)
-        squares[self._thin] = np.maximum(self.Q[self._thin] - t2[:, int(np.argmax(each))], TINY)
+        squares[self.contrasts.thin] = np.maximum(self.Q[self.contrasts.thin] - t2[:, int(np.argmax(each))], TINY)
         return squares
 
     @cached_property

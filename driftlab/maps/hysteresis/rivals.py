@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import RANK, RATIOS, THIN, TINY, SoakContrasts, log_mean
+from driftlab.maps.hysteresis.contrasts import RANK, THIN, TINY, SoakContrasts, log_mean
 from driftlab.maps.hysteresis.evidence import ShapeEvidence
 from driftlab.soak.blocks import SoakSummary
 from fusion_core.chunk import Array, Flags, Integers
@@ -117,11 +117,10 @@ def evidence_of(contrasts: SoakContrasts, cycles: Array, n: int) -> Array:
     gram, B, Q = contrasts.products(contrasts.u[:, None], z)  # (R', F, q, q), (R', F, q, d), (R', 1, d)
     size = np.einsum("rfqq->rf", gram)[..., None, None]
     t2 = np.sum(B * np.linalg.solve(gram + (RANK * size + TINY) * np.eye(q), B), axis=2)
-    thin = np.arange(len(contrasts.log_w)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-    without = log_mean(contrasts.without[thin])
+    without, log_w = log_mean(contrasts.without[contrasts.thin]), contrasts.log_w[contrasts.thin, None, None]
     each = []
     for g in STRENGTHS:
         left = np.maximum(Q - g / (1 + g) * t2, 1e-9 * Q + TINY)
-        each.append(log_mean(contrasts.log_w[thin, None, None] - m / 2 * np.log(left)) - q / 2 * np.log1p(g))
+        each.append(log_mean(log_w - m / 2 * np.log(left)) - q / 2 * np.log1p(g))
     axes = np.logaddexp(0.0, log_mean(np.array(each)) - without) - np.log(2)
     return np.asarray(axes.sum(axis=1))
