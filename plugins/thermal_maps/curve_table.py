@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from fusion_core.chunk import Array, extremes
+from fusion_core.chunk import Array, extremes, read_only
 from fusion_core.fast import compiled
 
 INTERVALS = 2048
@@ -55,7 +55,8 @@ class CurveTable:
 
     def at(self, T: Array) -> Array:
         """Return the curve (N, d) at temperatures (N,) within the domain."""
-        return np.asarray(_at(T, self.low, INTERVALS / (self.high - self.low), self.coefficients))
+        # what a map is given cannot be written to: of that kind alone is a loop compiled
+        return np.asarray(_at(read_only(T), self.low, INTERVALS / (self.high - self.low), self.coefficients))
 
 
 @compiled
