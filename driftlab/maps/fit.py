@@ -32,7 +32,6 @@ from fusion_core.faults import Faults
 from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import did_you_mean
-from fusion_core.thermal.curve_error import nested
 from fusion_core.thermal.penalised import penalised, smooth_lines
 from fusion_core.thermal.thermometer import NO_STEPS, Steps
 
@@ -120,7 +119,7 @@ def _with_spread(fitted: FittedMap, memory: MemoryVerdict) -> FittedMap:
     if error is None:
         return fitted
     half = np.stack([np.interp(error.T, memory.T[some], column / 2) for column in memory.spread[some].T], axis=1)
-    return fitted.noting(error=error.model_copy(update={"modes": (*nested((half * memory.apart)[None]), *error.modes)}))
+    return fitted.noting(error=error.beside((half * memory.apart)[None]))
 
 
 def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:

@@ -22,7 +22,6 @@ import numpy as np
 from driftlab.soak.blocks import CELLS, scatter
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
-from fusion_core.thermal.curve_error import nested
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, sawtooth, steps_of
 
 WALKS = (5e-5, 2e-4, 1e-3, 5e-3)  # K/s/sqrt(s), of the rate
@@ -139,7 +138,6 @@ def of_thermometer(
     grid = np.asarray(error.T)
     sawteeth = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
     depth = np.stack([grid[0] + steps.size - grid, grid - grid[-1] + steps.size]) / steps.size
-    modes = (*nested(np.maximum(depth, 0.0)[:, :, None] * sawteeth), *error.modes)
     misfits = []
     for m in error.misfits:
         near = np.zeros(0) if T is None or off is None else off[np.abs(T - m.T) <= steps.size / 2]
@@ -147,7 +145,8 @@ def of_thermometer(
         noise = float(np.hypot(m.noise, fitted.slope(np.array([m.T]))[0, m.axis] * np.sqrt(hidden)))
         if m.left > CLEAR * noise:
             misfits.append(m.model_copy(update={"noise": noise}))
-    return fitted.noting(error=error.model_copy(update={"modes": modes, "misfits": tuple(misfits)}))
+    modes = np.maximum(depth, 0.0)[:, :, None] * sawteeth
+    return fitted.noting(error=error.beside(modes, misfits=tuple(misfits)))
 
 
 def _offset(T: Array, size: float) -> float:

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, PlainSerializer, PlainValidator, model_validator
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, locked
 from fusion_core.settings import Frozen
 
 
@@ -43,17 +43,20 @@ class Misfit(Frozen):
     noise: Annotated[FiniteFloat, Field(ge=0)]
 
 
-Modes = tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
+def _finite(values: Any) -> Array:
+    """Return numbers, nested as they may be, as an array that cannot be written to."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("numbers were expected, as many in each row") from None
+    if not np.all(np.isfinite(array)):
+        raise ValueError("a number is not finite")
+    return locked(array)
 
 
-def nested(modes: Array) -> Modes:
-    """Return modes (r, G, d) as a record holds them."""
-    return tuple(tuple(map(tuple, mode)) for mode in modes.tolist())
-
-
-def six_digits(modes: Array) -> Modes:
-    """Return modes (r, G, d) as a record holds them, to six digits: a fleet has a map of each unit."""
-    return tuple(tuple(tuple(float(f"{v:.6g}") for v in row) for row in mode) for mode in modes.tolist())
+def six_digits(modes: Array) -> Array:
+    """Return modes (r, G, d) to six digits: a fleet has a map of each unit."""
+    return np.array([float(f"{v:.6g}") for v in modes.ravel().tolist()]).reshape(modes.shape)
 
 
 def modes_of_axes(per_axis: Sequence[Array]) -> Array:
@@ -71,8 +74,8 @@ class CurveError(Frozen):
     ----------
     T : (G,) floats
         Inputs of the grid, rising.
-    modes : (r, G, d) floats
-        In the unit of the curve.
+    modes : (r, G, d) array
+        In the unit of the curve; read-only.
     bend : (d,) floats
         Second derivative to reckon with beyond the grid, in the unit of the curve per squared unit of the input.
     holes : tuple of pairs
@@ -82,7 +85,7 @@ class CurveError(Frozen):
     """
 
     T: tuple[FiniteFloat, ...]
-    modes: Modes
+    modes: Annotated[Array, PlainValidator(_finite), PlainSerializer(np.ndarray.tolist)]
     bend: tuple[FiniteFloat, ...]
     holes: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
     misfits: tuple[Misfit, ...] = ()
@@ -91,17 +94,25 @@ class CurveError(Frozen):
     def _whole(self) -> Self:
         if len(self.T) < 2 or np.any(np.diff(self.T) <= 0):
             raise ValueError("the grid T does not rise")
-        shape = self._arrays[1].shape
-        if self.modes and shape[1:] != (len(self.T), len(self.bend)):
+        shape = self.modes.shape
+        if len(self.modes) and shape[1:] != (len(self.T), len(self.bend)):
             raise ValueError(f"modes have the shape {shape}, not (r, {len(self.T)}, {len(self.bend)})")
         if any(misfit.axis >= len(self.bend) for misfit in self.misfits):
             raise ValueError(f"a misfit is of axis {max(misfit.axis for misfit in self.misfits)} of {len(self.bend)}")
         return self
 
+    def beside(self, modes: Array, **fields: Any) -> Self:
+        """Return the error with further modes (r, G, d) before its own, independent of them, and with other fields."""
+        own = self.modes.reshape(-1, len(self.T), len(self.bend))
+        return self.model_copy(update={"modes": locked(np.concatenate([modes, own])), **fields})
+
     @cached_property
-    def _arrays(self) -> tuple[Array, Array]:
-        """The grid (G,) and the modes (r, G, d): what is asked for often is made of tuples once."""
-        return np.asarray(self.T, dtype=np.float64), np.asarray(self.modes, dtype=np.float64)
+    def _grid(self) -> Array:
+        return np.array(self.T)
+
+    def __eq__(self, other: object) -> bool:
+        """Return True if all numbers are the same."""
+        return isinstance(other, CurveError) and self.model_dump() == other.model_dump()
 
     def variance(self, T: ArrayLike, T_0: float | None = None) -> Array:
         """Return the variance (N, d) of the error at T (N,), or of its difference from that at T_0."""
@@ -118,10 +129,9 @@ class CurveError(Frozen):
 
     def _modes(self, T: Array) -> Array:
         """Return the modes (r, N, d) at T (N,)."""
-        d = len(self.bend)
-        if not self.modes:
-            return np.zeros((0, len(T), d))
-        grid, values = self._arrays
+        grid, values = self._grid, self.modes
+        if not len(values):
+            return np.zeros((0, len(T), len(self.bend)))
         k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
         share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
         return np.asarray(values[:, k] + (values[:, k + 1] - values[:, k]) * share)

@@ -17,7 +17,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.errors import SingularFit
-from fusion_core.thermal.curve_error import CurveError, Misfit, modes_of_axes, nested
+from fusion_core.thermal.curve_error import CurveError, Misfit, modes_of_axes
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.ripple import Ripple, ripple_modes, ripples
 from fusion_core.thermal.soak_noise import (
@@ -110,8 +110,9 @@ def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: S
     if error is None:
         return fitted
     more = _answers(blocks, np.asarray(error.T), smoother, errors)
-    kept = error.modes if error.misfits else error.modes[len(error.modes) - len(error.holes) :]
-    return fitted.noting(error=error.model_copy(update={"modes": (*kept, *nested(modes_of_axes(more)))}))
+    if not error.misfits:
+        error = error.model_copy(update={"modes": error.modes[len(error.modes) - len(error.holes) :]})
+    return fitted.noting(error=error.beside(modes_of_axes(more)))
 
 
 def answered(T: Array, blocks: Blocks, errors: Sequence[Array], smoother: Smoother) -> CurveError:
@@ -187,7 +188,7 @@ def _joined(
 ) -> CurveError:
     """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
     hidden = [np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend) for low, high in holes]
-    modes = nested(np.concatenate([modes_of_axes(per_axis), np.reshape(hidden, (-1, len(grid), len(bend)))]))
+    modes = np.concatenate([modes_of_axes(per_axis), np.reshape(hidden, (-1, len(grid), len(bend)))])
     return CurveError(T=tuple(grid.tolist()), modes=modes, bend=tuple(bend.tolist()), holes=holes, misfits=misfits)
 
 
