@@ -18,6 +18,7 @@ from driftlab.config import Config
 from driftlab.filtering.extrapolation import beyond, with_domain
 from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import (
+    ENOUGH,
     RunSetup,
     calibrations_of,
     check_channels,
@@ -25,6 +26,7 @@ from driftlab.filtering.setup import (
     followed_map,
     needed_channels,
     prior_at,
+    too_few_updates,
 )
 from driftlab.filtering.tracker import Filtered, Segments, Tracker
 from driftlab.recordings.epochs import epochs
@@ -40,8 +42,6 @@ from fusion_core.faults import Faults
 from fusion_core.kalman import SHORT
 from fusion_core.thermal.rate_estimators import RateMemory, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
-
-ENOUGH = 3  # updates of an alignment
 
 
 class Moment(NamedTuple):
@@ -238,12 +238,7 @@ class Run:
         left_out = "".join(f"; {line}" for line in self.journal.faults.lines(notes=False))
         left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
         if 0 < waiting.rows < ENOUGH:
-            apart = align_s / max(waiting.rows - 1, 0.5)
-            lower = ", or filter.update_interval lower" * (self.model.update_interval > align_s / ENOUGH)
-            return (
-                f"{name}: an alignment of {align_s:g} s has {waiting.rows} updates at most, {ENOUGH} are needed; set "
-                f"filter.align to {ENOUGH * apart:.4g} s or more{lower}"
-            )
+            return f"{name}: {too_few_updates(self.model, waiting.rows, align_s / max(waiting.rows - 1, 0.5))}"
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
             f"looked at{left_out}); use a longer recording, set filter.align lower, or check "

@@ -33,6 +33,7 @@ from fusion_core.settings import nearest
 FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
 CHANCE = 1e-3  # probability that noise as it is declared is said to be another
+ENOUGH = 3  # updates of an alignment
 OFF = 5.0  # factor between measured and declared noise: more may be a wrong unit or path
 
 
@@ -40,6 +41,16 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
     """Return True if a unit lies in another way, by the input of a sensor."""
     a, b = one.inputs[channel], other.inputs[channel]
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
+
+
+def too_few_updates(model: MeasurementModel, updates: int, apart: float) -> str:
+    """Return in a sentence that an alignment has so few updates, fewer than ENOUGH and `apart` s, and what to set."""
+    lower = ", or filter.update_interval lower" * (model.update_interval > model.align / ENOUGH)
+    have = f"{updates} update{'s' * (updates != 1)}"
+    return (
+        f"an alignment of {model.align:g} s has {have} at most, {ENOUGH} are needed; set filter.align to "
+        f"{ENOUGH * apart:.4g} s or more{lower}, or correct the unit of time"
+    )
 
 
 def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0, updates: float = np.inf) -> list[str]:

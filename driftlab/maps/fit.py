@@ -14,6 +14,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
+from driftlab.filtering.setup import ENOUGH, too_few_updates
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
@@ -418,11 +419,12 @@ def _samples(
     used.read(faults, before)
     if not stretches:
         name = config.source.name if config.source else "the recording"
+        if config.filter and used.most < ENOUGH:
+            raise EmptyRecording(f"{name}: {too_few_updates(config.filter, used.most, used.seconds / used.moving)}")
         section = config.filter.tracked.section if config.filter else "filter.gyro"
-        seconds = interval * (used.moving + used.epochs)
         raise EmptyRecording(
-            f"{name}: is nowhere at rest in {seconds:.3g} s; record a soak of hours, or check {section}.noise and the "
-            "channels' units"
+            f"{name}: is nowhere at rest in {used.seconds:.3g} s; record a soak of hours, or check {section}.noise and "
+            "the channels' units"
         )
     # the median over the windows knows of no gap
     ends, sizes = np.array([rest.t for rest in stretches]), np.array([len(rest.T) for rest in stretches])

@@ -26,7 +26,7 @@ from driftlab.recordings.screening import read
 from driftlab.units import axis_name, default_unit, unit_of, with_uncertainty
 from fusion_core.chunk import Array, Chunk, Flags, Integers, concatenate
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor
-from fusion_core.errors import DataError
+from fusion_core.errors import ConfigError, DataError
 from fusion_core.faults import Faults
 from fusion_core.host.provenance import Participant, participants
 
@@ -319,7 +319,13 @@ def _load(config: Config, faults: Faults, progress: Callable[[float, int], None]
         count += len(chunk)
         if progress is not None:
             progress(faults.since(float(chunk.t[-1])), count)
-    return concatenate(parts), np.concatenate(T) if len(T) == len(parts) else None
+    whole = concatenate(parts)
+    if not whole.channels:
+        raise ConfigError(
+            f"source: the recording has no channel {' or '.join(wanted)}; name that of another sensor by a filter, as "
+            "in filter: {kind: held, channel: pressure, ...}"
+        )
+    return whole, np.concatenate(T) if len(T) == len(parts) else None
 
 
 def _rest(config: Config, whole: Chunk) -> RestWindows | None:

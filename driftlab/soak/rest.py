@@ -62,11 +62,14 @@ class RestStretch(NamedTuple):
 class Used:
     """Count of the epochs of soaks that were at rest and used, and of those taken for motion.
 
-    `low`, `high` are the temperatures of all epochs, degC; `axes` those that showed the motion, by epochs.
+    `low`, `high` are the temperatures of all epochs, degC, which lasted `seconds`, at most `most` of them in a window;
+    `axes` are those that showed the motion, by epochs.
     """
 
     epochs: int = 0
     moving: int = 0
+    seconds: float = 0.0
+    most: int = 0
     first: str = ""
     low: float = np.inf
     high: float = -np.inf
@@ -114,9 +117,11 @@ class Used:
             _, what, fault = max(left_out)
             self.why = f"{what.replace(', left out', '')}, first {fault.first}"
 
-    def note(self, T: Array) -> None:
-        """Take the temperatures (N,) of epochs, whether they are used or not."""
+    def note(self, window: Chunk) -> None:
+        """Take the epochs of a window, whether they are used or not."""
+        T = window["temperature"]
         self.low, self.high = min(self.low, float(T.min())), max(self.high, float(T.max()))
+        self.seconds, self.most = self.seconds + float(np.sum(window["tau"])), max(self.most, len(window))
 
 
 def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used | None = None) -> Iterator[RestStretch]:
@@ -136,7 +141,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
     for window in _windows(stream, model.align):
         if not noise:  # a recording has the same channels from its beginning to its end
             check_channels(model, window)
-        used.note(window["temperature"])
+        used.note(window)
         refused = len(window)
         for part in cutting.parts(window):
             refused -= len(part)
