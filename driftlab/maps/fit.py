@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from driftlab.filtering.setup import ENOUGH, too_few_updates
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
+from driftlab.recordings.overlap import SMALL, recording_content
 from driftlab.recordings.screening import read
 from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
@@ -354,10 +355,14 @@ def gather(
 
 
 def _compare(config: Config, parts: Sequence[_Samples], names: Sequence[str], faults: Faults) -> None:
-    """Note doubts about recordings that contradict the others."""
-    if config.filter is None or len(names) < len(parts):
+    """Note doubts about recordings that contradict the others; raises ConfigError where two have samples in common."""
+    if config.filter is None or not 1 < len(parts) <= len(names):
         return
     tracked = config.filter.tracked
+    contents = [recording_content([Chunk(part.t, {"bias": part.bias})], "bias") for part in parts]
+    for j, k in combinations(range(len(contents)), 2):
+        if contents[j].share(contents[k]) > SMALL:
+            raise ConfigError(f"{names[k]}: has samples in common with {names[j]}, and would count twice; name it once")
     T, bias = [part.T for part in parts], [part.bias for part in parts]
     for text in contradictions(T, bias, names, tracked.channel, tracked.axes):
         faults.doubt(text)
