@@ -17,7 +17,7 @@ from driftlab.commands.console import say_lines
 from driftlab.commands.fit_map import FitMapResult
 from driftlab.commands.inputs import ConfigLike, Place, config_of, is_file
 from driftlab.config import Config, understood
-from driftlab.filtering.setup import loaded_map
+from driftlab.filtering.setup import loaded_map, shown_by_soak
 from driftlab.maps.fit import axes_of
 from driftlab.noise.innovations import SensorReadings, inflation
 from driftlab.noise.local_level import walk_of
@@ -27,6 +27,7 @@ from driftlab.storage.json import plain, write_json
 from driftlab.storage.map_file import read_map
 from driftlab.storage.ownership import document, foreign, sign
 from driftlab.triad.model import GRAVITY
+from driftlab.units import BiasUnit
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array, Flags
 from fusion_core.contracts import (
@@ -201,7 +202,8 @@ def _write(exporter: Exporter, what: Export, path: Path, force: bool, read: Coll
             if exporter.folder:
                 written.mkdir()
             loss = exporter.export(what, written)
-            loss = replace(loss, left_out=(*loss.left_out, *_sensitivities(exporter.kind, what)))
+            left_out = *loss.left_out, *_sensitivities(exporter.kind, what)
+            loss = replace(loss, left_out=left_out, notes=(*loss.notes, *_shown_by_soaks(what)))
             files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
             if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
@@ -229,6 +231,14 @@ def _sensitivities(kind: str, what: Export) -> Iterator[str]:
         if held is not None:
             G = np.max(np.abs(held.terms(np.linspace(held.T[0], held.T[-1], 100)))) * sensor.factor * GRAVITY
             yield f"{sensor.channel}: g-sensitivity, up to {G:.3g} {sensor.shown}/g; {kind} leaves it out"
+
+
+def _shown_by_soaks(what: Export) -> Iterator[str]:
+    """Yield what the soaks of maps showed, and neither curve nor sigma has."""
+    for sensor in what.sensors:
+        unit = BiasUnit(sensor.unit, sensor.shown)
+        if sensor.map is not None and (text := shown_by_soak(sensor.map, sensor.axes, unit)):
+            yield f"{sensor.channel}: the soak of its map {text}, which neither curve nor sigma has"
 
 
 def key_of(path: Path) -> str:

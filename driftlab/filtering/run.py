@@ -26,6 +26,7 @@ from driftlab.filtering.setup import (
     followed_map,
     needed_channels,
     prior_at,
+    shown_by_soak,
     too_few_updates,
 )
 from driftlab.filtering.tracker import Filtered, Segments, Tracker
@@ -248,22 +249,14 @@ class Run:
 
 def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
     """Note that the soak of a sensor's map showed a memory which no effect of its bias has."""
-    memory = fitted.record.memory
-    if memory is None or memory.get("answer") != "seen":
-        return
+    memory = fitted.record.memory or {}
     effects = sensor.bias.effects if isinstance(sensor.bias, ThermalBias) else ()
-    if {effect.kind for effect in effects} & {*memory.get("kinds", ())}:
-        return
-    size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
-    if not np.any(np.isfinite(size)):
-        return
-    axis, unit = int(np.nanargmax(size)), unit_of(sensor)
-    kinds = " or ".join(memory.get("kinds") or ["memory"])
-    faults.note(
-        f"the soak of the {sensor.channel}'s map showed a {kinds}: up and down differ by up to "
-        f"{size[axis] * unit.factor:.3g} {unit.shown}, {sensor.axes[axis]}, which no effect of the config follows and "
-        "no sigma has in it; `driftlab explain` finds it"
-    )
+    followed = {effect.kind for effect in effects} & {*memory.get("kinds", ())} or memory.get("answer") != "seen"
+    if text := shown_by_soak(fitted, sensor.axes, unit_of(sensor)) if not (effects and followed) else "":
+        faults.note(
+            f"the soak of the {sensor.channel}'s map {text}, which no effect of the config follows and no sigma has in "
+            "it; `driftlab explain` finds it"
+        )
 
 
 def _last_two_joined(chunks: Iterable[Chunk]) -> Generator[Chunk]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.units import axis_name
+from driftlab.units import BiasUnit, axis_name
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import (
     Alignment,
@@ -34,6 +34,7 @@ FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
 CHANCE = 1e-3  # probability that noise as it is declared is said to be another
 ENOUGH = 3  # updates of an alignment
+SEEN = np.log(100.0)  # of the evidence of a difference between up and down, whatever its cause
 OFF = 5.0  # factor between measured and declared noise: more may be a wrong unit or path
 
 
@@ -41,6 +42,21 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
     """Return True if a unit lies in another way, by the input of a sensor."""
     a, b = one.inputs[channel], other.inputs[channel]
     return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
+
+
+def shown_by_soak(fitted: FittedMap, axes: Sequence[str], unit: BiasUnit) -> str:
+    """Return what the soak of a map showed and no sigma of its curve has, as the end of a sentence; empty: nothing."""
+    memory = fitted.record.memory or {}
+    size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
+    likely = memory.get("answer") == "undecided" and (memory.get("log_evidence") or 0.0) > SEEN
+    if not (likely or memory.get("answer") == "seen") or np.all(np.isnan(size)):
+        return ""
+    axis = int(np.nanargmax(size))
+    apart = f"up and down differ by up to {size[axis] * unit.factor:.3g} {unit.shown}, {axes[axis]}"
+    if not likely:
+        return f"showed a {' or '.join(memory.get('kinds') or ['memory'])}: {apart}"
+    why = str(memory.get("why")).partition(";")[0].partition(": whether")[0]
+    return f"showed that {apart} ({why.removeprefix('up and down differ ')})"
 
 
 def too_few_updates(model: MeasurementModel, updates: int, apart: float) -> str:

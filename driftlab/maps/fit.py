@@ -14,7 +14,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
-from driftlab.filtering.setup import ENOUGH, too_few_updates
+from driftlab.filtering.setup import ENOUGH, shown_by_soak, too_few_updates
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
@@ -211,6 +211,8 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     if record.sensitivity is not None:
         known = sum(record.sensitivity.told)
         lines.append(f"map {record.kind}: with g-sensitivity, {known} terms of G(T), taken off where accel is recorded")
+    if text := shown_by_soak(fitted, axes_of(fitted), unit):
+        lines.append(f"map {record.kind}: its soak {text}, which its sigma does not have")
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"

@@ -1,6 +1,8 @@
 import numpy as np
+import pytest
 
-from driftlab.filtering.setup import subtracted
+from driftlab.filtering.setup import shown_by_soak, subtracted
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import CurveError, MatrixCurve, ThermalMap
 from fusion_core.host.registry import registry
@@ -27,3 +29,23 @@ def test_the_strain_of_a_gyro_goes_by_accelerometers_that_are_right():
         np.testing.assert_allclose(part, bias + force @ G.T, rtol=0, atol=1e-14)
     alone = Chunk(chunk.t, {name: chunk[name] for name in ("gyro", "temperature")})
     np.testing.assert_array_equal(subtracted(alone, {"gyro": gyro})["gyro"], gyro.bias(T))
+
+
+SETTLES = "up and down differ as where the bias settles: whether it remembers is not known; go again"
+CURVE = LINE.fit(T, np.outer(T, [1e-5, 2e-5, 3e-5]), {})
+DEG_H = np.deg2rad(1) / 3600
+
+
+@pytest.mark.parametrize(("answer", "evidence", "said"), [
+    ("seen", 50.0, "showed a hysteresis: up and down differ by up to 8 deg/h, y"),
+    ("undecided", 50.0, "showed that up and down differ by up to 8 deg/h, y (as where the bias settles)"),
+    ("undecided", 2.0, ""),  # no more than noise makes now and then
+    ("undecided", None, ""),  # it was not looked for
+    ("none", -2.0, ""),
+])  # fmt: skip
+def test_what_a_soak_showed_is_said_where_no_sigma_has_it(answer, evidence, said):
+    size = None if evidence is None else [3 * DEG_H, -8 * DEG_H, None]
+    memory = {"answer": answer, "log_evidence": evidence, "size": size, "kinds": ["hysteresis"], "why": SETTLES}
+    unit = BiasUnit("rad/s", "deg/h")
+    assert shown_by_soak(CURVE.noting(memory=memory), "xyz", unit) == said
+    assert shown_by_soak(CURVE, "xyz", unit) == ""
