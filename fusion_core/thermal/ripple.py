@@ -1,7 +1,8 @@
 """A ripple of a bias over temperature that is narrower than what a curve can follow.
 
-What the curve leaves is averaged over narrow cells of temperature, of the ways up and of the ways down each. Of three
-neighbouring cells, u is how far the middle one is off the mean of the others on the ways up, v on the ways down::
+What the curve leaves is averaged over narrow cells of temperature, of each pass up or down by itself: between two
+passes a bias walks. Of three neighbouring cells, u is how far the middle one is off the mean of the others on the ways
+up, in the mean of those that went through all three, v on the ways down::
 
     E(u v) = 1.5 r^2,    r the rms of what repeats from cell to cell
 
@@ -81,15 +82,24 @@ def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Arra
     And their deviations (2, M) for white noise of 1 a sample, and the middle cells (M,).
     """
     count = int(cell.max()) + 1
+    run = np.cumsum(np.diff(way, prepend=way[:1]) != 0)
     apart, noise, there = [], [], np.ones(max(count - 2, 0), dtype=np.bool_)
     for sign in (1, -1):
         own = way == sign
-        n = np.bincount(cell[own], minlength=count)
-        there &= (n[:-2] > 0) & (n[1:-1] > 0) & (n[2:] > 0)
-        share = 1 / np.maximum(n, 1)
-        means = np.stack([np.bincount(cell[own], column, count) for column in left[own].T], axis=1) * share[:, None]
-        apart.append(means[1:-1] - (means[:-2] + means[2:]) / 2)
-        noise.append(np.sqrt(share[1:-1] + (share[:-2] + share[2:]) / 4))
+        _, passes = np.unique(run[own], return_inverse=True)
+        place, shape = passes * count + cell[own], (int(passes.max(initial=-1)) + 1, count)
+        n = np.bincount(place, minlength=shape[0] * count).reshape(shape).astype(np.float64)
+        with np.errstate(divide="ignore"):
+            weight = 1 / (1 / n[:, 1:-1] + (1 / n[:, :-2] + 1 / n[:, 2:]) / 4)  # none where one of the three is empty
+        total = weight.sum(axis=0)
+        there &= total > 0
+        u = []
+        for column in left[own].T:
+            means = np.bincount(place, column, shape[0] * count).reshape(shape) / np.maximum(n, 1)
+            u.append(np.sum(weight * (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2), axis=0))
+        total = np.where(total > 0, total, 1.0)
+        apart.append(np.stack(u, axis=1) / total[:, None])
+        noise.append(1 / np.sqrt(total))
     return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64) + 1
 
 

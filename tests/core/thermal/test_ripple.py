@@ -43,6 +43,18 @@ def test_noise_walks_loops_and_coarse_thermometers_have_none():
     assert false <= 1  # of 180, each by a chance of 1e-3
 
 
+def test_rare_samples_that_meet_at_the_same_temperatures_have_none():
+    """One each minute, three times up and down: a cell may have samples of one pass alone, and between two passes a
+    bias walks."""
+    false, rows = 0, np.arange(1440)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        T = -10 + 60 * np.abs((rows / 240 + 1) % 2 - 1) + 0.005 * rng.normal(size=len(rows))
+        left = rng.normal(size=(len(rows), 3)) / 4 + np.cumsum(0.15 * rng.normal(size=(len(rows), 3)), axis=0)
+        false += sum(ripple is not None for ripple in ripples(T, left, WIDTH))
+    assert false <= 1  # of 120
+
+
 def test_one_way_alone_cannot_tell():
     rng = np.random.default_rng(2)
     T = np.linspace(-20, 60, N)
