@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from math import ulp
 from types import MappingProxyType
 from typing import Any
 
@@ -64,7 +64,7 @@ class Chunk:
                 f"channel '{name}' is needed and the recording has {have}; name it under source.channels"
             ) from None
 
-    @cached_property
+    @property
     def dt(self) -> Array:
         """Duration of the step to each sample in s: a 0-d array where all are the same, else (N,).
 
@@ -74,16 +74,21 @@ class Chunk:
         Law: cut anywhere, a recording with regular time stamps has the same steps to the bit. Where its step is
         neither one over a whole number nor a short decimal, or it has gaps, they may differ by the rounding of t.
         """
-        if "dt" in self.channels:
-            return constant(self.channels["dt"])
+        known: Array | None = self.__dict__.get("_dt")  # no `cached_property`: its lock takes longer than the rest
+        if known is None:
+            known = self.__dict__["_dt"] = constant(self.channels["dt"] if "dt" in self.channels else self._steps())
+        return known
+
+    def _steps(self) -> Array:
+        """Return the duration (N,) of the step to each sample in s, from the time stamps."""
         before = self.t[:1] if self.previous is None else self.previous.t[-1:]
         steps = self.t - (before if len(self.t) == 1 else np.concatenate([before, self.t[:-1]]))
         begins = 1 if self.previous is None and len(self) > 1 else 0
         if len(self) > begins:
-            usual = nominal(steps[begins:], float(max(abs(self.t[0]), abs(self.t[-1]))))
+            usual = nominal(steps[begins:], max(abs(float(self.t[0])), abs(float(self.t[-1]))))
             if usual is not None:
                 steps[begins:] = usual
-        return constant(steps)
+        return steps
 
     @property
     def each_dt(self) -> Array:
@@ -114,8 +119,8 @@ class Chunk:
         known: Any = self.channels  # a proxy: to be unpacked it takes six times as long as its dict
         whole = known | {name: read_only(values) for name, values in channels.items()}
         same = made(self.t, whole, self.previous, self.sensors)
-        if "dt" in self.__dict__ and "dt" not in channels:
-            same.__dict__["dt"] = self.dt
+        if "dt" not in channels and "_dt" in self.__dict__:
+            same.__dict__["_dt"] = self.dt
         return same
 
     def where(self, keep: Flags) -> Chunk:
@@ -147,6 +152,11 @@ def read_only(values: Array) -> Array:
     return view
 
 
+def every(flags: Flags) -> bool:
+    """Return True if all flags are true; of few sooner than NumPy does, of many as soon."""
+    return b"\0" not in flags.tobytes()
+
+
 def constant(values: Array) -> Array:
     """Return values (N,) as a 0-d array where all are the same."""
     return values[:1].reshape(()) if len(values) == 1 or (len(values) and np.all(values == values[0])) else values
@@ -165,7 +175,7 @@ def nominal(steps: Array, t: float) -> float | None:
     Of what the rounding leaves open, it is one over a whole number of samples a second, or else the shortest decimal:
     the same whatever part of a recording is looked at.
     """
-    rounding = 2 * float(np.spacing(t))  # of two time stamps, each read or multiplied
+    rounding = 2 * ulp(t)  # of two time stamps, each read or multiplied
     least, most = extremes(steps)
     low, high = most - rounding, least + rounding
     middle = (low + high) / 2

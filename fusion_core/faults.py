@@ -131,13 +131,13 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = None  # all
-    if not _all_usable(chunk.t, -LARGEST, LARGEST):
+    if not all_within(chunk.t, -LARGEST, LARGEST):
         keep = np.abs(chunk.t) <= LARGEST  # neither NaN
         lost = len(keep) - int(np.count_nonzero(keep))
         faults.add("rows with a time stamp that is not a number, left out", lost, _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
         low, high, unit = RANGES.get(channel, (-LARGEST, LARGEST, ""))
-        if channel != "valid" and _all_usable(values, low, high):
+        if channel != "valid" and all_within(values, low, high):
             continue
         good = (values >= low) & (values <= high)  # neither NaN
         if channel == "valid":
@@ -157,7 +157,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     return Chunk(rows.t, {name: values for name, values in rows.channels.items() if name != "valid"}, chunk.previous)
 
 
-def _all_usable(values: Array, low: float, high: float) -> bool:
+def all_within(values: Array, low: float, high: float) -> bool:
     """Return True if no value is NaN or beyond the range."""
     if values.size < FEW and values.dtype.kind == "f" and float(np.vdot(values, values)) < min(high, -low) ** 2:
         return True  # of few nearly always, and quickly

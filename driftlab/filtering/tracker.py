@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from math import isfinite
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from driftlab.filtering.segment import RunLog, RunSegment, runs
 from driftlab.filtering.setup import RunSetup, bias_steps, prior_again, subtracted
 from driftlab.units import axis_name
 from fusion_core.checks import FEW, NotFinite, TooWide, all_finite
-from fusion_core.chunk import Array, Chunk, Flags, concatenate, extremes, locked
+from fusion_core.chunk import Array, Chunk, Flags, concatenate, every, extremes, locked
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.errors import BadValue
 from fusion_core.kalman import estimate
@@ -155,14 +156,17 @@ class Tracker:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
         for regular in regular_pieces(chunk, self.first.dt):
             at = int(np.searchsorted(regular.t, self.first.t, side="right")) if self.aligning else 0
-            for epochs in (regular.part(*ends) for ends in ((0, at), (at, len(regular))) if ends[0] < ends[1]):
+            parts = [regular] if at == 0 else [regular.part(0, at), regular.part(at, len(regular))]
+            for epochs in parts:
+                if len(epochs) == 0:
+                    continue
                 if self.aligning and epochs.t[0] > self.first.t:
                     self._depart(epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
                 less = subtracted(epochs, self.plan.calibrations, self.plan.followed)
-                parts = {channel: locked(epochs[channel] - part) for channel, part in less.items()}
-                corrected = epochs.having(**parts) if parts else epochs
+                lesser = {channel: locked(epochs[channel] - part) for channel, part in less.items()}
+                corrected = epochs.having(**lesser) if lesser else epochs
                 tracked = self.model.tracked
                 # of no calibration a row of zeros that stands for all
                 none = np.ndarray((len(epochs), len(tracked.axes)), np.float64, NOTHING, strides=(0, 0))
@@ -241,9 +245,10 @@ class Segments:
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
     dt, tau = chunk.dt, chunk["tau"]
-    ends = *extremes(dt.reshape(-1)), *extremes(tau)
-    if all(abs(end / usual - 1) < REGULAR for end in ends):  # nearly always
-        lasting = locked(np.full(len(tau), usual))
+    (least, most), (shortest, longest) = extremes(dt.reshape(-1)), extremes(tau)
+    low, high = min(least, shortest) / usual - 1, max(most, longest) / usual - 1
+    if abs(low) < REGULAR and abs(high) < REGULAR:  # nearly always
+        lasting = _lasting(len(tau), usual)
         yield chunk.having(dt=lasting, tau=lasting)
         return
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
@@ -251,6 +256,11 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
+
+
+@lru_cache(maxsize=4)
+def _lasting(N: int, usual: float) -> Array:
+    return locked(np.full(N, usual))
 
 
 class RestMonitor:
@@ -266,6 +276,9 @@ class RestMonitor:
     def look(self, done: Chunk, estimates: Estimates) -> Flags:
         """Return the epochs at which the unit stood still (N,)."""
         still, out, self.memory = self.detector.look(done, self.memory)
+        if every(still) and every(estimates.used):  # nearly always
+            self.journal.moving.open = self.journal.refused.open = False
+            return still
         self.journal.moving.note(done.t, ~still, out, self.axes)
         refused = still & ~estimates.used
         causes = np.zeros(estimates.white.shape, dtype=np.bool_)
@@ -285,6 +298,8 @@ class Realigning:
 
     def due(self, part: Chunk, used: Flags) -> int:
         """Return up to which epoch to go: the first by which enough are refused in a row, or all."""
+        if every(used):  # nearly always
+            return len(part)
         for start, stop in runs(~used):
             since = self.refused.t[0] if start == 0 and self.refused is not None else part.t[start]
             long_enough = part.t[start:stop] - since >= self.patience

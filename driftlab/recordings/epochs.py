@@ -80,7 +80,7 @@ def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
             yield chunk
             continue
         seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
-        yield chunk.having(**dict(zip(READINGS, map(locked, seen), strict=True)))
+        yield chunk.having(**{READINGS[0]: locked(seen[0]), READINGS[1]: locked(seen[1])})
 
 
 # what compiled functions return takes ten times as long to hand over as what they are given to write to
@@ -139,26 +139,25 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = np.empty(N)
     _owned(rows.t, before, pace, dt)
-    ones = np.ones(N)
-    tau, counts = dt, ones
-    last: slice | Integers = slice(None)
+    tau, t = dt, rows.t
     if K < N:
         tau, ends = np.add.reduceat(dt, starts), np.append(starts[1:], N)
-        counts, last = (ends - starts).astype(np.float64), ends - 1
-    lasting = np.count_nonzero(tau > 0) == K
+        last, t = ends - 1, locked(t[ends - 1])
+        by_number = np.ones(N), (ends - starts).astype(np.float64)
+    lasting = np.count_nonzero(tau) == K
     by_time = dt, tau if lasting else np.where(tau > 0, tau, 1.0)
-    by_number = ones, counts
     channels = {"tau": tau}
     for name, values in rows.channels.items():
-        if name in READINGS:
-            channels[name] = locked(values[last])
+        lasts = name in rows.sensors
+        if not lasts and (K == N or name in READINGS):
+            channels[name] = values if K == N else locked(values[last])
             continue
-        weights, total = by_time if name in rows.sensors else by_number
+        weights, total = by_time if lasts else by_number
         means = np.empty((K, *values.shape[1:]))
         _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
         channels[name] = locked(means)
     locked(tau)  # only now: of what is locked, compiled functions have a version of its own
-    done = made(locked(rows.t[last]), channels, previous, rows.sensors)
+    done = made(t, channels, previous, rows.sensors)
     done = done if lasting else done.where(tau > 0)
     if previous is not None or not len(done):
         return done

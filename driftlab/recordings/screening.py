@@ -63,8 +63,7 @@ class _Screen:
     """A look at all samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
 
     def __init__(self, faults: Faults, sensors: Mapping[str, Sensor], *, few: bool) -> None:
-        self.faults, self.sensors = faults, sensors
-        self.look = getattr(_suspect, "py_func", _suspect) if few else _suspect
+        self.faults, self.sensors, self.few = faults, sensors, few
         self.copies, self.thermometer = Copies(faults), Thermometer(faults)
         self.runs: dict[str, Array] = {}  # length of the repetition of each axis
         self.rails: dict[str, Rails] = {}
@@ -75,8 +74,11 @@ class _Screen:
         keep = None
         if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
             self.thermometer.look(chunk)
-        for name in (name for name in chunk.channels if name in chunk.sensors):
-            sensor, d = self.sensors.get(name), chunk[name].shape[1]
+        suspect = getattr(_suspect, "py_func", _suspect) if self.few else _suspect
+        for name, values in chunk.channels.items():
+            if name not in chunk.sensors:
+                continue
+            sensor, d = self.sensors.get(name), values.shape[1]
             self.copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             if name not in self.runs:
@@ -85,10 +87,10 @@ class _Screen:
             self.roundings[name].look(chunk)
             before, self.runs[name], table = self.runs[name], np.empty(d), self.rails[name].table
             last = read_only(_value_before(chunk, name))
-            if not self.look(chunk[name], last, before, self.runs[name], limit, table):
+            if not suspect(values, last, before, self.runs[name], limit, table):
                 continue
             repeats = _repeats(chunk, name, before)
-            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(values) >= limit)):
                 good = ~_report(chunk, name, sensor, what, bad, self.faults)
                 keep = good if keep is None else keep & good
         return keep
@@ -125,17 +127,18 @@ class Gaps:
 
     def look(self, t: Array) -> None:
         """Look at the times (N,) of the next rows."""
-        if np.isnan(self.last):
+        if self.last != self.last:  # NaN
             self.first = t = np.append(self.first, t)
             if len(t) < FIRST:
                 return
             self.last, self.least = float(t[0]), max(LONG, RARE * float(np.median(np.diff(t[:FIRST]))))
-        if t[-1] - self.last > self.least:  # a gap is no longer than all of it
+        last = float(t[-1])
+        if last - self.last > self.least:  # a gap is no longer than all of it
             steps = np.diff(t, prepend=self.last)
             long = steps > self.least
             if np.any(long):
                 self._add((t - steps)[long], steps[long])
-        self.last = float(t[-1])
+        self.last = last
 
     def _add(self, begins: Array, lengths: Array) -> None:
         what = f"gaps of more than {self.least:.4g} s, predicted across"

@@ -188,12 +188,12 @@ def _ordinary(step: Transition, n: int, N: int) -> bool:
     """Return True if steps are sound and as nearly all are, which is seen quickly: F and Q constant, Q diagonal."""
     if type(step) is not Transition or step.C is not None:
         return False
-    arrays = []
-    for array, shapes in ((step.F, ((n, n),)), (step.Q, ((n, n),)), (step.u, ((n,), (N, n)))):
-        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes:
-            return False
-        arrays.append(array if array.flags.carray else array.copy())
-    F, Q, u = arrays
+    F, Q, u = step.F, step.Q, step.u
+    if not (type(F) is type(Q) is type(u) is np.ndarray and F.dtype is Q.dtype is u.dtype is FLOAT):
+        return False
+    if not (F.shape == Q.shape == (n, n) and u.shape in ((n,), (N, n))):
+        return False
+    F, Q, u = (a if a.flags.carray else a.copy() for a in (F, Q, u))
     return bool(_sound(F, Q, u.reshape(-1)))
 
 
@@ -408,7 +408,7 @@ def _lock(memory: Memory, depth: int = 8) -> None:
         memory.setflags(write=False)
     elif depth and isinstance(memory, (tuple, list, dict)):
         for item in memory.values() if isinstance(memory, dict) else memory:
-            if item is not None:
+            if isinstance(item, (np.ndarray, tuple, list, dict)):
                 _lock(item, depth - 1)
 
 

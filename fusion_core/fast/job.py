@@ -16,7 +16,7 @@ import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import FLOAT, covariance
-from fusion_core.chunk import Array, Flags
+from fusion_core.chunk import Array, Flags, every
 from fusion_core.fast import compiled, inlined, loop
 from fusion_core.fast.groups import IndependentGroups, Lanes, Size, find_groups
 from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
@@ -59,20 +59,23 @@ def alone(
     That is where it is not ordinary (`fusion_core.fast.loop.single`), or an array is not as `fusion_core.checks` would
     leave it. Checks one by one, groups and a job cost four times as much as the sample.
     """
-    x, P, z, used = state.x, state.P, measurement.z, measurement.used
-    given = z, x, P, transition.F, transition.Q, transition.u, measurement.H, measurement.R
-    n, m = np.size(x), np.size(z)
-    shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
-    for array, shape in zip(given, shapes, strict=True):
-        if type(array) is np.ndarray and array.shape == (1, *shape):
-            array = array[0]
-        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape != shape:
+    z, used, x, given = measurement.z, measurement.used, state.x, []
+    if not (type(z) is type(x) is type(used) is np.ndarray and z.ndim == 2 and len(z) == x.ndim == 1):
+        return None
+    n, m = len(x), z.shape[1]
+    if transition.C is not None or used.dtype != np.bool_ or used.shape not in ((1,), (1, m)) or not every(used):
+        return None
+    square = (n, n), (1, n, n)
+    for array, shapes in (
+        (z, ((1, m),)), (x, ((n,),)), (state.P, square[:1]), (transition.F, square), (transition.Q, square),
+        (transition.u, ((1, n), (n,))), (measurement.H, ((m, n), (1, m, n))), (measurement.R, ((m, m), (1, m, m))),
+    ):  # fmt: skip
+        if type(array) is not np.ndarray or array.shape not in shapes or array.dtype is not FLOAT:
             return None
-        arrays.append(array if array.flags.carray else array.copy())
-    measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and all(used.flat)
+        array = array if array.shape == shapes[0] else array.reshape(shapes[0])
+        given.append(array if array.flags.carray else array.copy())
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
-    sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None
-    if not (sound and loop.single(*arrays, gate, of_x, of_z, sums)):
+    if not (n and m and loop.single(*given, gate, of_x, of_z, sums)):
         return None
     after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])
     kept = after.P[None].copy() if keep_P else None

@@ -165,7 +165,7 @@ class ThermalDerivative(ThermalBias):
         """Return F, Q = walk^2 dt, the known drift u and the output C."""
         d, n = len(self.axes), len(self.labels)
         before = _Memory.start(len(self.effects)) if memory is None else _Memory(*memory)
-        shifted, inputs = self._map_input(chunk, before.inputs)
+        shifted, inputs = self._map_input(chunk, before.inputs) if self.effects else (chunk, [])
         g, S, signatures = self._effects(chunk, before.signatures)
         level = g
         if self.fitted is not None and (self.form == "difference" or self.repeatability is not None):
