@@ -76,19 +76,23 @@ class Chunk:
         """
         known: Array | None = self.__dict__.get("_dt")  # no `cached_property`: its lock takes longer than the rest
         if known is None:
-            known = self.__dict__["_dt"] = constant(self.channels["dt"] if "dt" in self.channels else self._steps())
+            known = self.__dict__["_dt"] = constant(self.channels["dt"]) if "dt" in self.channels else self._steps()
         return known
 
     def _steps(self) -> Array:
-        """Return the duration (N,) of the step to each sample in s, from the time stamps."""
-        before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        steps = self.t - (before if len(self.t) == 1 else np.concatenate([before, self.t[:-1]]))
-        begins = 1 if self.previous is None and len(self) > 1 else 0
-        if len(self) > begins:
-            usual = nominal(steps[begins:], max(abs(float(self.t[0])), abs(float(self.t[-1]))))
+        """Return the duration of the step to each sample in s from the time stamps: 0-d, or (N,)."""
+        before, t = self.t[:1] if self.previous is None else self.previous.t[-1:], self.t
+        if len(t) == 1:
+            step, last = float(t[0]) - float(before[0]), float(t[0])
+            usual = nominal(step, step, abs(last))
+            return np.array(step if usual is None else usual)
+        steps = t - np.concatenate([before, t[:-1]])
+        begins = 1 if self.previous is None else 0
+        if len(t) > begins:
+            usual = nominal(*extremes(steps[begins:]), max(abs(float(t[0])), abs(float(t[-1]))))
             if usual is not None:
                 steps[begins:] = usual
-        return steps
+        return constant(steps)
 
     @property
     def each_dt(self) -> Array:
@@ -169,14 +173,13 @@ def extremes(values: Array) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def nominal(steps: Array, t: float) -> float | None:
-    """Return the one step that steps (N,) of time stamps up to t in s are but for rounding, or None.
+def nominal(least: float, most: float, t: float) -> float | None:
+    """Return the one step that steps from `least` to `most` of time stamps up to t in s are but for rounding, or None.
 
     Of what the rounding leaves open, it is one over a whole number of samples a second, or else the shortest decimal:
     the same whatever part of a recording is looked at.
     """
     rounding = 2 * ulp(t)  # of two time stamps, each read or multiplied
-    least, most = extremes(steps)
     low, high = most - rounding, least + rounding
     middle = (low + high) / 2
     if not low <= high or middle <= rounding:

@@ -96,7 +96,7 @@ class Faults:
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:
-    """Pass on the rows that can be used, each chunk with the sample before it as `previous`.
+    """Pass on the rows that can be used.
 
     A channel named `valid` says with zero that a row must not be used; it is not passed on. `start` is how many seconds
     after the first row of its file the first chunk begins; it counts where the source does not say when that row was.
@@ -108,7 +108,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
     EmptyRecording
         If no row is left.
     """
-    previous: Chunk | None = None
+    last: float | None = None  # time of the row before
     faults.first_row = None  # of the recording before
     for chunk in chunks:
         if len(chunk) == 0:  # a live source that has nothing to say
@@ -116,12 +116,11 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         faults.rows += len(chunk)
         if faults.first_row is None and len(finite := chunk.t[np.abs(chunk.t) <= LARGEST]):  # neither NaN
             faults.first_row = float(finite[0]) - start
-        rows = _forward(_finite(chunk, faults), previous, faults, name)
-        if len(rows) == 0:
-            continue
-        yield rows.following(previous)
-        previous = rows.last()
-    if previous is None:
+        rows = _forward(_finite(chunk, faults), last, faults, name)
+        if len(rows):
+            last = float(rows.t[-1])
+            yield rows
+    if last is None:
         wrong = faults.lines(notes=False)
         why = f" ({'; '.join(wrong)})" if wrong else ""
         raise EmptyRecording(
@@ -191,10 +190,10 @@ def advice_backwards(steps: Array, k: int) -> str:
     return "sort the rows"
 
 
-def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
+def _forward(chunk: Chunk, last: float | None, faults: Faults, name: str) -> Chunk:
     if len(chunk) == 0 or faults.first_row is None:
         return chunk
-    t, before = chunk.t, chunk.t[0] - 1 if previous is None else previous.t[-1]
+    t, before = chunk.t, float(chunk.t[0]) - 1 if last is None else last
     if t[0] > before and (len(t) == 1 or np.all(t[1:] > t[:-1])):
         return chunk
     step = np.diff(t, prepend=before)

@@ -61,12 +61,12 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         carry = chunk.part(starts[-1], len(chunk))
         done = []
         for rows, begins in pieces:
-            part = _integrate(rows, begins, pace, previous)
+            part = _integrate(rows, begins, pace, done[-1].last() if done else previous)
             if len(part):
                 done.append(part)
-                previous = part.last()
         if done:
-            yield concatenate(done)
+            yield (whole := concatenate(done))
+            previous = whole.last()
     if carry is not None:
         done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
         if len(done[0]):

@@ -42,13 +42,13 @@ def read(
             taken = min(DERIVED & set(chunk.channels))
             raise ConfigError(f"channel '{taken}': the program uses this name itself; rename it under source.channels")
         chunk = _with_sensors(chunk, sensors, previous)
-        previous = chunk.last()
         keep = screen.keep(chunk)
         kept = chunk if keep is None else chunk.where(keep)
         if len(kept):
             empty = False
             faults.usable += len(kept)
             yield kept
+        previous = chunk.last()
     screen.thermometer.flush()
     for looks in (screen.rails, screen.roundings):
         for look in looks.values():

@@ -182,8 +182,8 @@ class ThermalDerivative(ThermalBias):
             u[:, :d] += self.fitted.slope(shifted["temperature"], chunk.t) * rate[:, None]
         Q = self._density * chunk.dt[..., None, None]
         F, fadings, left = self._transition_matrix(chunk, before)
-        after = _Memory(g[-1], inputs, signatures, fadings, left, level[-1])
-        return Transition(F, Q, u, self._output(S, len(chunk))), tuple(after)
+        after = g[-1], inputs, signatures, fadings, left, level[-1]
+        return Transition(F, Q, u, self._output(S, len(chunk))), after
 
     def _output(self, S: list[Array], N: int) -> Array | None:
         """Return C: None where the states are the bias, (d, n), or (N, d, n) with the signatures S (N, d, p)."""
