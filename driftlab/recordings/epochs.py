@@ -15,7 +15,7 @@ from itertools import chain, islice
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, Integers, concatenate, locked, made
+from fusion_core.chunk import Array, Chunk, Integers, concatenate, locked, made, read_only
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, readings, started
 
@@ -44,7 +44,8 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     previous: Chunk | None = None
     carry: Chunk | None = None  # the rows of the epoch that is not over
     last = -np.inf  # its number
-    for chunk in _with_readings(chain([first], stream)):
+    thermometer = started()
+    for chunk in chain([first], stream):
         starts = np.empty(len(chunk), dtype=np.int64)
         count, last = _starts(chunk.t, t_0, interval, last, starts)
         starts = starts[:count]
@@ -61,26 +62,16 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         carry = chunk.part(starts[-1], len(chunk))
         done = []
         for rows, begins in pieces:
-            part = _integrate(rows, begins, pace, done[-1].last() if done else previous)
+            part = _integrate(rows, begins, pace, thermometer, done[-1].last() if done else previous)
             if len(part):
                 done.append(part)
         if done:
             yield (whole := concatenate(done))
             previous = whole.last()
     if carry is not None:
-        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
+        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, thermometer, previous)]
         if len(done[0]):
             yield done[0]
-
-
-def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    memory = started()
-    for chunk in chunks:
-        if "temperature" not in chunk.channels:
-            yield chunk
-            continue
-        seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
-        yield chunk.having(**{READINGS[0]: locked(seen[0]), READINGS[1]: locked(seen[1])})
 
 
 # what compiled functions return takes ten times as long to hand over as what they are given to write to
@@ -132,14 +123,14 @@ def _means(values: Array, weights: Array, starts: Integers, total: Array, means:
             means[k, j] = sum / total[k]
 
 
-def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | None) -> Chunk:
+def _integrate(rows: Chunk, starts: Integers, pace: Array, thermometer: Array, previous: Chunk | None) -> Chunk:
     N, K = len(rows), len(starts)
     if N == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = np.empty(N)
     _owned(rows.t, before, pace, dt)
-    tau, t = dt, rows.t
+    tau, t, last = dt, rows.t, None
     if K < N:
         tau, ends = np.add.reduceat(dt, starts), np.append(starts[1:], N)
         last, t = ends - 1, locked(t[ends - 1])
@@ -149,13 +140,16 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
     channels = {"tau": tau}
     for name, values in rows.channels.items():
         lasts = name in rows.sensors
-        if not lasts and (K == N or name in READINGS):
-            channels[name] = values if K == N else locked(values[last])
+        if K == N and not lasts:
+            channels[name] = read_only(np.ascontiguousarray(values, dtype=np.float64))
             continue
         weights, total = by_time if lasts else by_number
         means = np.empty((K, *values.shape[1:]))
         _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
         channels[name] = locked(means)
+    if "temperature" in rows.channels:
+        seen = readings(np.ascontiguousarray(rows["temperature"], dtype=np.float64), thermometer)
+        channels |= {name: locked(a if last is None else a[last]) for name, a in zip(READINGS, seen, strict=True)}
     locked(tau)  # only now: of what is locked, compiled functions have a version of its own
     done = made(t, channels, previous, rows.sensors)
     done = done if lasting else done.where(tau > 0)
