@@ -246,7 +246,9 @@ class Thermometer:
 
     def look(self, chunk: Chunk) -> None:
         """Take the next temperatures (N,), in degC, and look at them once there are enough."""
-        t, T, begin = chunk.t, chunk["temperature"], self._stop
+        t, T, begin = chunk.t, chunk.channels.get("temperature"), self._stop
+        if T is None or T.ndim != 1:
+            return
         since = self._held[0, 0] if begin else t[0]
         if self._rows + len(t) >= ENOUGH or t[-1] - since > LASTING:
             self._look(np.append(self._held[0, :begin], t), np.append(self._held[1, :begin], T), self._rows + len(t))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -24,7 +24,7 @@ STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not r
 
 def read(
     config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None, *, few: bool = False
-) -> Iterator[Chunk]:
+) -> Generator[Chunk]:
     """Yield the samples of the config's source (or of `stream`, in its place) that can be used.
 
     Of a `few` that are all that is wanted, nothing is compiled: loading the compiler would take longer.
@@ -44,11 +44,14 @@ def read(
         chunk = _with_sensors(chunk, sensors, previous)
         keep = screen.keep(chunk)
         kept = chunk if keep is None else chunk.where(keep)
-        if len(kept):
-            empty = False
-            faults.usable += len(kept)
-            yield kept
-        previous = chunk.last()
+        try:
+            if len(kept):
+                empty = False
+                faults.usable += len(kept)
+                yield kept
+        finally:  # also where no more is asked for; until then nobody waits for it
+            previous = chunk.last()
+            screen.thermometer.look(chunk)
     screen.thermometer.flush()
     for looks in (screen.rails, screen.roundings):
         for look in looks.values():
@@ -60,7 +63,7 @@ def read(
 
 
 class _Screen:
-    """A look at all samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
+    """A look at the sensors' samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
 
     def __init__(self, faults: Faults, sensors: Mapping[str, Sensor], *, few: bool) -> None:
         self.faults, self.sensors, self.few = faults, sensors, few
@@ -72,8 +75,6 @@ class _Screen:
     def keep(self, chunk: Chunk) -> Flags | None:
         """Return the rows (N,) that can be used; None where all can."""
         keep = None
-        if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
-            self.thermometer.look(chunk)
         suspect = getattr(_suspect, "py_func", _suspect) if self.few else _suspect
         for name, values in chunk.channels.items():
             if name not in chunk.sensors:
@@ -223,6 +224,7 @@ def head(config: Config) -> tuple[Chunk | None, list[str]]:
     first = next(rows)
     while len(first) < FIRST and (more := next(rows, None)) is not None:
         first = concatenate([first, more])
+    rows.close()
     for name in first.sensors:
         look = Rounding(name, None, first[name].shape[1])
         look.look(first)
