@@ -137,7 +137,8 @@ def made(t: Array, channels: Mapping[str, Array], previous: Chunk | None, sensor
     """Return a chunk of arrays that are locked already: they are not looked at again."""
     proxy = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
     chunk = object.__new__(Chunk)
-    chunk.__dict__.update(t=t, channels=proxy, previous=previous, sensors=sensors)
+    own = chunk.__dict__
+    own["t"], own["channels"], own["previous"], own["sensors"] = t, proxy, previous, sensors
     return chunk
 
 

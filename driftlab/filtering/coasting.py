@@ -162,7 +162,7 @@ class Uncertainty:
         squares = tilts[0] ** 2, tilts[1] ** 2
         if self.fitted is None or T is None or error is None:
             return np.sqrt(variances[0] + squares[0]), np.sqrt(variances[1] + squares[1])
-        sigmas = np.empty_like(variances[1]), np.empty_like(variances[1])
+        sigmas = np.empty(variances[1].shape), np.empty(variances[1].shape)
         tables = self.low, self.step, self.slope, self.modes, self._between
         memory = self.following, self.departing, self.learnt
         of_states = map(np.ascontiguousarray, variances)

@@ -99,8 +99,10 @@ class ThermometerError:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
         # a quarter of an octave is near enough; the least and the largest mostly say it of all
         (finest, coarsest), (least, most) = extremes(steps), extremes(variance)
-        quarters = float(np.rint(4 * np.log2(max(least, NOTHING)))) if coarsest > 0 else 0.0
-        if finest == coarsest and (coarsest == 0 or least == most or quarters == np.rint(4 * np.log2(max(most, NOTHING)))):
+        if coarsest == 0:
+            return np.zeros((1, HARMONICS)), np.zeros(len(steps), dtype=np.int64)
+        quarters = float(np.rint(4 * np.log2(max(least, NOTHING))))
+        if finest == coarsest and (least == most or quarters == np.rint(4 * np.log2(max(most, NOTHING)))):
             return _sawtooth(finest, quarters, self.known)[None], np.zeros(len(steps), dtype=np.int64)
         rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])

@@ -59,21 +59,17 @@ def alone(
     That is where it is not ordinary (`fusion_core.fast.loop.single`), or an array is not as `fusion_core.checks` would
     leave it. Checks one by one, groups and a job cost four times as much as the sample.
     """
-    z, used, x, given = measurement.z, measurement.used, state.x, []
-    if not (type(z) is type(x) is type(used) is np.ndarray and z.ndim == 2 and len(z) == x.ndim == 1):
+    x, P, z, used, u = state.x, state.P, measurement.z, measurement.used, transition.u
+    over = transition.F, transition.Q, measurement.H, measurement.R
+    if set(map(type, (x, P, z, used, u, *over))) != {np.ndarray} or transition.C is not None:
         return None
-    n, m = len(x), z.shape[1]
-    if transition.C is not None or used.dtype != np.bool_ or used.shape not in ((1,), (1, m)) or not every(used):
+    F, Q, H, R = [a[0] if a.ndim == 3 and len(a) == 1 else a for a in over]
+    arrays, n, m = (z, x, P, F, Q, u if u.ndim == 2 else u[None], H, R), x.size, z.size
+    if [a.shape for a in arrays] != [(1, m), (n,), (n, n), (n, n), (n, n), (1, n), (m, n), (m, m)]:
         return None
-    square = (n, n), (1, n, n)
-    for array, shapes in (
-        (z, ((1, m),)), (x, ((n,),)), (state.P, square[:1]), (transition.F, square), (transition.Q, square),
-        (transition.u, ((1, n), (n,))), (measurement.H, ((m, n), (1, m, n))), (measurement.R, ((m, m), (1, m, m))),
-    ):  # fmt: skip
-        if type(array) is not np.ndarray or array.shape not in shapes or array.dtype is not FLOAT:
-            return None
-        array = array if array.shape == shapes[0] else array.reshape(shapes[0])
-        given.append(array if array.flags.carray else array.copy())
+    given = [a if a.flags.carray else a.copy() for a in arrays if a.dtype is FLOAT]
+    if len(given) < 8 or used.dtype != np.bool_ or used.shape not in ((1,), (1, m)) or not every(used):
+        return None
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
     if not (n and m and loop.single(*given, gate, of_x, of_z, sums)):
         return None
