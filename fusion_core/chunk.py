@@ -46,8 +46,7 @@ class Chunk:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", read_only(self.t))
-        channels = {name: read_only(values) for name, values in self.channels.items()}
-        object.__setattr__(self, "channels", MappingProxyType(channels))
+        object.__setattr__(self, "channels", MappingProxyType({k: read_only(a) for k, a in self.channels.items()}))
 
     def __reduce__(self) -> tuple[type[Chunk], tuple[Array, dict[str, Array], Chunk | None]]:
         return Chunk, (self.t, dict(self.channels), self.previous)
@@ -82,12 +81,8 @@ class Chunk:
     def _steps(self) -> Array:
         """Return the duration of the step to each sample in s from the time stamps: 0-d, or (N,)."""
         before, t = self.t[:1] if self.previous is None else self.previous.t[-1:], self.t
-        if len(t) == 1:
-            step, last = float(t[0]) - float(before[0]), float(t[0])
-            usual = nominal(step, step, abs(last))
-            return np.array(step if usual is None else usual)
-        steps = t - np.concatenate([before, t[:-1]])
-        begins = 1 if self.previous is None else 0
+        steps = t - (before if len(t) == 1 else np.concatenate([before, t[:-1]]))
+        begins = 1 if self.previous is None and len(t) > 1 else 0
         if len(t) > begins:
             usual = nominal(*extremes(steps[begins:]), max(abs(float(t[0])), abs(float(t[-1]))))
             if usual is not None:
@@ -115,14 +110,13 @@ class Chunk:
         return made(self.t, self.channels, previous, self.sensors if sensors is None else sensors)
 
     def _rows(self, rows: slice, previous: Chunk | None) -> Chunk:
-        channels = {key: a[rows] for key, a in self.channels.items()}  # parts of what is locked are locked
-        return made(self.t[rows], channels, previous, self.sensors)
+        # parts of what is locked are locked
+        return made(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
         known: Any = self.channels  # a proxy: to be unpacked it takes six times as long as its dict
-        whole = known | {name: read_only(values) for name, values in channels.items()}
-        same = made(self.t, whole, self.previous, self.sensors)
+        same = made(self.t, known | {k: read_only(a) for k, a in channels.items()}, self.previous, self.sensors)
         if "dt" not in channels and "_dt" in self.__dict__:
             same.__dict__["_dt"] = self.dt
         return same
@@ -135,10 +129,10 @@ class Chunk:
 
 def made(t: Array, channels: Mapping[str, Array], previous: Chunk | None, sensors: frozenset[str]) -> Chunk:
     """Return a chunk of arrays that are locked already: they are not looked at again."""
-    proxy = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
     chunk = object.__new__(Chunk)
     own = chunk.__dict__
-    own["t"], own["channels"], own["previous"], own["sensors"] = t, proxy, previous, sensors
+    own["t"], own["previous"], own["sensors"] = t, previous, sensors
+    own["channels"] = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
     return chunk
 
 

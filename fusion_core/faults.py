@@ -121,8 +121,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
             last = float(rows.t[-1])
             yield rows
     if last is None:
-        wrong = faults.lines(notes=False)
-        why = f" ({'; '.join(wrong)})" if wrong else ""
+        why = f" ({'; '.join(wrong)})" if (wrong := faults.lines(notes=False)) else ""
         raise EmptyRecording(
             f"{name}: has no usable row{why}; check the channels' paths and units, and the START:STOP range"
         )

@@ -31,7 +31,7 @@ from driftlab.filtering.extrapolation import Extrapolation
 from driftlab.filtering.setup import RunSetup
 from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
 from fusion_core import recursions
-from fusion_core.chunk import Array, Chunk, every
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
 from fusion_core.fast import compiled, inlined
 from fusion_core.model import Estimates
@@ -352,9 +352,7 @@ class Prediction:
             coast = ahead = np.full(variance.shape, np.nan)
         else:
             coast, ahead = self.coast.advance(len(done), step)
-        weight, tilts = done["tau"], (tilt, self.first.unsure)
-        if not every(estimates.used):
-            weight = weight * estimates.used
+        weight, tilts = done["tau"] * estimates.used, (tilt, self.first.unsure)
         sigma, coast_sigma = self.uncertainty.deviations((variance, ahead), weight, T, error, tilts)
         sigma = sigma if left is None else np.hypot(sigma, left)
         if self.extrapolation.effects and (x is not None or np.count_nonzero(self.departed)):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 from math import isfinite
 from typing import Any, NamedTuple
@@ -156,10 +155,7 @@ class Tracker:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
         for regular in regular_pieces(chunk, self.first.dt):
             at = int(np.searchsorted(regular.t, self.first.t, side="right")) if self.aligning else 0
-            parts = [regular] if at == 0 else [regular.part(0, at), regular.part(at, len(regular))]
-            for epochs in parts:
-                if len(epochs) == 0:
-                    continue
+            for epochs in filter(len, [regular.part(0, at), regular.part(at, len(regular))] if at else [regular]):
                 if self.aligning and epochs.t[0] > self.first.t:
                     self._depart(epochs)
                 before = self.memories
@@ -175,8 +171,7 @@ class Tracker:
     def _filter(self, part: Chunk, transition: Transition, measurement: Measurement, *, keep_P: bool) -> Estimates:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
         gate = self.plan.gate * self.alignment.gate_scale
-        N = len(part)
-        steps, measured = transition, measurement
+        N, steps, measured = len(part), transition, measurement
         while True:
             try:
                 estimates = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
@@ -245,10 +240,9 @@ class Segments:
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
     dt, tau = chunk.dt, chunk["tau"]
-    (least, most), (shortest, longest) = extremes(dt.reshape(-1)), extremes(tau)
-    low, high = min(least, shortest) / usual - 1, max(most, longest) / usual - 1
-    if abs(low) < REGULAR and abs(high) < REGULAR:  # nearly always
-        lasting = _lasting(len(tau), usual)
+    ends = *extremes(dt.reshape(-1)), *extremes(tau)
+    if abs(min(ends) / usual - 1) < REGULAR and abs(max(ends) / usual - 1) < REGULAR:  # nearly always
+        lasting = locked(np.full(len(tau), usual))
         yield chunk.having(dt=lasting, tau=lasting)
         return
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
@@ -256,11 +250,6 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
-
-
-@lru_cache(maxsize=4)
-def _lasting(N: int, usual: float) -> Array:
-    return locked(np.full(N, usual))
 
 
 class RestMonitor:
@@ -282,9 +271,8 @@ class RestMonitor:
         self.journal.moving.note(done.t, ~still, out, self.axes)
         refused = still & ~estimates.used
         causes = np.zeros(estimates.white.shape, dtype=np.bool_)
-        if np.count_nonzero(refused):
-            size = estimates.white[refused] ** 2
-            causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
+        size = estimates.white[refused] ** 2
+        causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
         self.journal.refused.note(done.t, refused, causes, self.components)
         return still
 
@@ -298,8 +286,6 @@ class Realigning:
 
     def due(self, part: Chunk, used: Flags) -> int:
         """Return up to which epoch to go: the first by which enough are refused in a row, or all."""
-        if every(used):  # nearly always
-            return len(part)
         for start, stop in runs(~used):
             since = self.refused.t[0] if start == 0 and self.refused is not None else part.t[start]
             long_enough = part.t[start:stop] - since >= self.patience

@@ -43,8 +43,7 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     pace = np.array([float(np.median(np.diff(first.t[:HEAD]))) if len(first) > 1 else 0.0, 0.0, 0.0])
     previous: Chunk | None = None
     carry: Chunk | None = None  # the rows of the epoch that is not over
-    last = -np.inf  # its number
-    thermometer = started()
+    last, thermometer = -np.inf, started()  # its number, and what the thermometer's samples so far show
     for chunk in chain([first], stream):
         starts = np.empty(len(chunk), dtype=np.int64)
         count, last = _starts(chunk.t, t_0, interval, last, starts)

@@ -76,9 +76,7 @@ class _Screen:
         """Return the rows (N,) that can be used; None where all can."""
         keep = None
         suspect = getattr(_suspect, "py_func", _suspect) if self.few else _suspect
-        for name, values in chunk.channels.items():
-            if name not in chunk.sensors:
-                continue
+        for name, values in ((name, a) for name, a in chunk.channels.items() if name in chunk.sensors):
             sensor, d = self.sensors.get(name), values.shape[1]
             self.copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)

@@ -108,9 +108,5 @@ class ZeroVelocity:
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
-        return self._white(constant(chunk["tau"]))
-
-    def _white(self, tau: Array) -> Array:
         density = self.space.vector({triad.integral: triad.sensor.noise**2 for triad in self.triads})
-        white: Array = tau[..., None, None] * np.diag(density)
-        return white
+        return np.asarray(constant(chunk["tau"])[..., None, None] * np.diag(density))
