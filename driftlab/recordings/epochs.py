@@ -59,7 +59,7 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         if count > 1:
             pieces.append((chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0]))
         carry = chunk.part(starts[-1], len(chunk))
-        done = []
+        done: list[Chunk] = []
         for rows, begins in pieces:
             part = _integrate(rows, begins, pace, thermometer, done[-1].last() if done else previous)
             if len(part):
