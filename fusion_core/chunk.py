@@ -81,8 +81,12 @@ class Chunk:
     def _steps(self) -> Array:
         """Return the duration of the step to each sample in s from the time stamps: 0-d, or (N,)."""
         before, t = self.t[:1] if self.previous is None else self.previous.t[-1:], self.t
-        steps = t - (before if len(t) == 1 else np.concatenate([before, t[:-1]]))
-        begins = 1 if self.previous is None and len(t) > 1 else 0
+        if len(t) == 1:
+            step = float(t[0]) - float(before[0])
+            usual = nominal(step, step, abs(float(t[0])))
+            return np.array(step if usual is None else usual)
+        steps = t - np.concatenate([before, t[:-1]])
+        begins = 1 if self.previous is None else 0
         if len(t) > begins:
             usual = nominal(*extremes(steps[begins:]), max(abs(float(t[0])), abs(float(t[-1]))))
             if usual is not None:
@@ -144,11 +148,7 @@ def locked(values: Array) -> Array:
 
 def read_only(values: Array) -> Array:
     """Return the same values as an array that cannot be written to."""
-    if not values.flags.writeable:
-        return values
-    view = values.view()
-    view.setflags(write=False)
-    return view
+    return locked(values.view()) if values.flags.writeable else values
 
 
 def every(flags: Flags) -> bool:

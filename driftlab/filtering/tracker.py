@@ -242,7 +242,7 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     dt, tau = chunk.dt, chunk["tau"]
     ends = *extremes(dt.reshape(-1)), *extremes(tau)
     if abs(min(ends) / usual - 1) < REGULAR and abs(max(ends) / usual - 1) < REGULAR:  # nearly always
-        lasting = locked(np.full(len(tau), usual))
+        lasting = locked(np.array([usual]).repeat(len(tau)))
         yield chunk.having(dt=lasting, tau=lasting)
         return
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
