@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from math import ulp
 from types import MappingProxyType
 from typing import Any
 
@@ -46,8 +46,7 @@ class Chunk:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", read_only(self.t))
-        channels = {name: read_only(values) for name, values in self.channels.items()}
-        object.__setattr__(self, "channels", MappingProxyType(channels))
+        object.__setattr__(self, "channels", MappingProxyType({k: read_only(a) for k, a in self.channels.items()}))
 
     def __reduce__(self) -> tuple[type[Chunk], tuple[Array, dict[str, Array], Chunk | None]]:
         return Chunk, (self.t, dict(self.channels), self.previous)
@@ -64,7 +63,7 @@ class Chunk:
                 f"channel '{name}' is needed and the recording has {have}; name it under source.channels"
             ) from None
 
-    @cached_property
+    @property
     def dt(self) -> Array:
         """Duration of the step to each sample in s: a 0-d array where all are the same, else (N,).
 
@@ -74,13 +73,22 @@ class Chunk:
         Law: cut anywhere, a recording with regular time stamps has the same steps to the bit. Where its step is
         neither one over a whole number nor a short decimal, or it has gaps, they may differ by the rounding of t.
         """
-        if "dt" in self.channels:
-            return constant(self.channels["dt"])
-        before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        steps = self.t - (before if len(self.t) == 1 else np.concatenate([before, self.t[:-1]]))
-        begins = 1 if self.previous is None and len(self) > 1 else 0
-        if len(self) > begins:
-            usual = nominal(steps[begins:], float(max(abs(self.t[0]), abs(self.t[-1]))))
+        known: Array | None = self.__dict__.get("_dt")  # no `cached_property`: its lock takes longer than the rest
+        if known is None:
+            known = self.__dict__["_dt"] = constant(self.channels["dt"]) if "dt" in self.channels else self._steps()
+        return known
+
+    def _steps(self) -> Array:
+        """Return the duration of the step to each sample in s from the time stamps: 0-d, or (N,)."""
+        before, t = self.t[:1] if self.previous is None else self.previous.t[-1:], self.t
+        if len(t) == 1:
+            step = float(t[0]) - float(before[0])
+            usual = nominal(step, step, abs(float(t[0])))
+            return np.array(step if usual is None else usual)
+        steps = t - np.concatenate([before, t[:-1]])
+        begins = 1 if self.previous is None else 0
+        if len(t) > begins:
+            usual = nominal(*extremes(steps[begins:]), max(abs(float(t[0])), abs(float(t[-1]))))
             if usual is not None:
                 steps[begins:] = usual
         return constant(steps)
@@ -106,16 +114,15 @@ class Chunk:
         return made(self.t, self.channels, previous, self.sensors if sensors is None else sensors)
 
     def _rows(self, rows: slice, previous: Chunk | None) -> Chunk:
-        channels = {key: a[rows] for key, a in self.channels.items()}  # parts of what is locked are locked
-        return made(self.t[rows], channels, previous, self.sensors)
+        # parts of what is locked are locked
+        return made(self.t[rows], {key: a[rows] for key, a in self.channels.items()}, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
         known: Any = self.channels  # a proxy: to be unpacked it takes six times as long as its dict
-        whole = known | {name: read_only(values) for name, values in channels.items()}
-        same = made(self.t, whole, self.previous, self.sensors)
-        if "dt" in self.__dict__ and "dt" not in channels:
-            same.__dict__["dt"] = self.dt
+        same = made(self.t, known | {k: read_only(a) for k, a in channels.items()}, self.previous, self.sensors)
+        if "dt" not in channels and "_dt" in self.__dict__:
+            same.__dict__["_dt"] = self.dt
         return same
 
     def where(self, keep: Flags) -> Chunk:
@@ -126,9 +133,10 @@ class Chunk:
 
 def made(t: Array, channels: Mapping[str, Array], previous: Chunk | None, sensors: frozenset[str]) -> Chunk:
     """Return a chunk of arrays that are locked already: they are not looked at again."""
-    proxy = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
     chunk = object.__new__(Chunk)
-    chunk.__dict__.update(t=t, channels=proxy, previous=previous, sensors=sensors)
+    own = chunk.__dict__
+    own["t"], own["previous"], own["sensors"] = t, previous, sensors
+    own["channels"] = channels if type(channels) is MappingProxyType else MappingProxyType(channels)
     return chunk
 
 
@@ -140,11 +148,12 @@ def locked(values: Array) -> Array:
 
 def read_only(values: Array) -> Array:
     """Return the same values as an array that cannot be written to."""
-    if not values.flags.writeable:
-        return values
-    view = values.view()
-    view.setflags(write=False)
-    return view
+    return locked(values.view()) if values.flags.writeable else values
+
+
+def every(flags: Flags) -> bool:
+    """Return True if all flags are true; of few sooner than NumPy does, of many as soon."""
+    return b"\0" not in flags.tobytes()
 
 
 def constant(values: Array) -> Array:
@@ -159,14 +168,13 @@ def extremes(values: Array) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def nominal(steps: Array, t: float) -> float | None:
-    """Return the one step that steps (N,) of time stamps up to t in s are but for rounding, or None.
+def nominal(least: float, most: float, t: float) -> float | None:
+    """Return the one step that steps from `least` to `most` of time stamps up to t in s are but for rounding, or None.
 
     Of what the rounding leaves open, it is one over a whole number of samples a second, or else the shortest decimal:
     the same whatever part of a recording is looked at.
     """
-    rounding = 2 * float(np.spacing(t))  # of two time stamps, each read or multiplied
-    least, most = extremes(steps)
+    rounding = 2 * ulp(t)  # of two time stamps, each read or multiplied
     low, high = most - rounding, least + rounding
     middle = (low + high) / 2
     if not low <= high or middle <= rounding:

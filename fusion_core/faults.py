@@ -96,7 +96,7 @@ class Faults:
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:
-    """Pass on the rows that can be used, each chunk with the sample before it as `previous`.
+    """Pass on the rows that can be used.
 
     A channel named `valid` says with zero that a row must not be used; it is not passed on. `start` is how many seconds
     after the first row of its file the first chunk begins; it counts where the source does not say when that row was.
@@ -108,7 +108,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
     EmptyRecording
         If no row is left.
     """
-    previous: Chunk | None = None
+    last: float | None = None  # time of the row before
     faults.first_row = None  # of the recording before
     for chunk in chunks:
         if len(chunk) == 0:  # a live source that has nothing to say
@@ -116,14 +116,12 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         faults.rows += len(chunk)
         if faults.first_row is None and len(finite := chunk.t[np.abs(chunk.t) <= LARGEST]):  # neither NaN
             faults.first_row = float(finite[0]) - start
-        rows = _forward(_finite(chunk, faults), previous, faults, name)
-        if len(rows) == 0:
-            continue
-        yield rows.following(previous)
-        previous = rows.last()
-    if previous is None:
-        wrong = faults.lines(notes=False)
-        why = f" ({'; '.join(wrong)})" if wrong else ""
+        rows = _forward(_finite(chunk, faults), last, faults, name)
+        if len(rows):
+            last = float(rows.t[-1])
+            yield rows
+    if last is None:
+        why = f" ({'; '.join(wrong)})" if (wrong := faults.lines(notes=False)) else ""
         raise EmptyRecording(
             f"{name}: has no usable row{why}; check the channels' paths and units, and the START:STOP range"
         )
@@ -131,13 +129,13 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = None  # all
-    if not _all_usable(chunk.t, -LARGEST, LARGEST):
+    if not all_within(chunk.t, -LARGEST, LARGEST):
         keep = np.abs(chunk.t) <= LARGEST  # neither NaN
         lost = len(keep) - int(np.count_nonzero(keep))
         faults.add("rows with a time stamp that is not a number, left out", lost, _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
         low, high, unit = RANGES.get(channel, (-LARGEST, LARGEST, ""))
-        if channel != "valid" and _all_usable(values, low, high):
+        if channel != "valid" and all_within(values, low, high):
             continue
         good = (values >= low) & (values <= high)  # neither NaN
         if channel == "valid":
@@ -157,7 +155,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     return Chunk(rows.t, {name: values for name, values in rows.channels.items() if name != "valid"}, chunk.previous)
 
 
-def _all_usable(values: Array, low: float, high: float) -> bool:
+def all_within(values: Array, low: float, high: float) -> bool:
     """Return True if no value is NaN or beyond the range."""
     if values.size < FEW and values.dtype.kind == "f" and float(np.vdot(values, values)) < min(high, -low) ** 2:
         return True  # of few nearly always, and quickly
@@ -191,10 +189,10 @@ def advice_backwards(steps: Array, k: int) -> str:
     return "sort the rows"
 
 
-def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
+def _forward(chunk: Chunk, last: float | None, faults: Faults, name: str) -> Chunk:
     if len(chunk) == 0 or faults.first_row is None:
         return chunk
-    t, before = chunk.t, chunk.t[0] - 1 if previous is None else previous.t[-1]
+    t, before = chunk.t, float(chunk.t[0]) - 1 if last is None else last
     if t[0] > before and (len(t) == 1 or np.all(t[1:] > t[:-1])):
         return chunk
     step = np.diff(t, prepend=before)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -85,8 +86,7 @@ class Measurement:
         return Measurement(self.z[rows], H, R, self.used[rows])
 
 
-@dataclass(frozen=True)
-class Estimates:
+class Estimates(NamedTuple):
     """The results of the filter for N samples.
 
     Attributes
@@ -135,7 +135,7 @@ def join(parts: Iterable[Estimates]) -> Estimates:
     if len(parts) == 1:
         return parts[0]
 
-    names = [field.name for field in fields(Estimates) if field.name not in ("state", "P")]
+    names = [name for name in Estimates._fields if name not in ("state", "P")]
     names += [] if parts[0].P is None else ["P"]
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return Estimates(**arrays, state=parts[-1].state)

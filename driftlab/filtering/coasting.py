@@ -162,7 +162,7 @@ class Uncertainty:
         squares = tilts[0] ** 2, tilts[1] ** 2
         if self.fitted is None or T is None or error is None:
             return np.sqrt(variances[0] + squares[0]), np.sqrt(variances[1] + squares[1])
-        sigmas = np.empty_like(variances[1]), np.empty_like(variances[1])
+        sigmas = np.empty(variances[1].shape), np.empty(variances[1].shape)
         tables = self.low, self.step, self.slope, self.modes, self._between
         memory = self.following, self.departing, self.learnt
         of_states = map(np.ascontiguousarray, variances)
@@ -355,7 +355,7 @@ class Prediction:
         weight, tilts = done["tau"] * estimates.used, (tilt, self.first.unsure)
         sigma, coast_sigma = self.uncertainty.deviations((variance, ahead), weight, T, error, tilts)
         sigma = sigma if left is None else np.hypot(sigma, left)
-        if x is not None or np.count_nonzero(self.departed):
+        if self.extrapolation.effects and (x is not None or np.count_nonzero(self.departed)):
             coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
         known = np.ascontiguousarray(calibration if calibration.strides[0] else calibration[:1])
         drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)

@@ -70,7 +70,7 @@ class Extrapolation:
 
         None where that is zero.
         """
-        if x is None and not np.count_nonzero(self.lagged):
+        if not self.effects or (x is None and not np.count_nonzero(self.lagged)):
             return None
         x = np.zeros_like(P) if x is None else x
         self.lagged, left = self.lagged.copy(), np.empty_like(P)

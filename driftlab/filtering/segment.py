@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ from fusion_core.model import Estimates, Measurement, State
 TEMPERATURES = ("temperature", "temperature_rate", "temperature_raw")  # the last one does not lag behind
 
 
-@dataclass(frozen=True)
-class RunSegment:
+class RunSegment(NamedTuple):
     """Estimates over consecutive epochs.
 
     Attributes

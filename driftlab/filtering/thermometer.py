@@ -82,23 +82,23 @@ class ThermometerError:
 
     def look(self, chunk: Chunk) -> ReadingError:
         """Return the error of the temperature over N epochs."""
-        T = chunk["temperature"]
+        T, windows = chunk["temperature"], chunk.channels.get("temperature_window")
         raw = chunk.channels.get("temperature_raw", T)
         known = READINGS[0] in chunk.channels
         step, variance = [chunk[name] for name in READINGS] if known else readings(raw, self.rows)
         steps = np.maximum(step, self.known.size)
         table, which = self._sawteeth(steps, variance)
         error = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
-        dt = chunk.each_dt
-        windows = chunk.channels.get("temperature_window")
         windows = np.full(T.shape, self.window) if windows is None else windows
-        _look(T, raw, dt, steps, table, which, windows, self.memory, *error)
+        _look(T, raw, chunk.each_dt, steps, table, which, windows, self.memory, *error)
         return error
 
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Integers]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
         # a quarter of an octave is near enough; the least and the largest mostly say it of all
         (finest, coarsest), (least, most) = extremes(steps), extremes(variance)
+        if coarsest == 0:
+            return np.zeros((1, HARMONICS)), np.zeros(len(steps), dtype=np.int64)
         quarters = float(np.rint(4 * np.log2(max(least, NOTHING))))
         if finest == coarsest and (least == most or quarters == np.rint(4 * np.log2(max(most, NOTHING)))):
             return _sawtooth(finest, quarters, self.known)[None], np.zeros(len(steps), dtype=np.int64)

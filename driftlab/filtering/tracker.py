@@ -20,7 +20,7 @@ from driftlab.filtering.segment import RunLog, RunSegment, runs
 from driftlab.filtering.setup import RunSetup, bias_steps, prior_again, subtracted
 from driftlab.units import axis_name
 from fusion_core.checks import FEW, NotFinite, TooWide, all_finite
-from fusion_core.chunk import Array, Chunk, Flags, concatenate, extremes, locked
+from fusion_core.chunk import Array, Chunk, Flags, concatenate, every, extremes, locked
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.errors import BadValue
 from fusion_core.kalman import estimate
@@ -155,14 +155,14 @@ class Tracker:
         """Yield epochs that last alike, up to the end of the alignment and from there on, and their steps."""
         for regular in regular_pieces(chunk, self.first.dt):
             at = int(np.searchsorted(regular.t, self.first.t, side="right")) if self.aligning else 0
-            for epochs in (regular.part(*ends) for ends in ((0, at), (at, len(regular))) if ends[0] < ends[1]):
+            for epochs in filter(len, [regular.part(0, at), regular.part(at, len(regular))] if at else [regular]):
                 if self.aligning and epochs.t[0] > self.first.t:
                     self._depart(epochs)
                 before = self.memories
                 steps, self.memories = bias_steps(self.model, epochs, before)
                 less = subtracted(epochs, self.plan.calibrations, self.plan.followed)
-                parts = {channel: locked(epochs[channel] - part) for channel, part in less.items()}
-                corrected = epochs.having(**parts) if parts else epochs
+                lesser = {channel: locked(epochs[channel] - part) for channel, part in less.items()}
+                corrected = epochs.having(**lesser) if lesser else epochs
                 tracked = self.model.tracked
                 # of no calibration a row of zeros that stands for all
                 none = np.ndarray((len(epochs), len(tracked.axes)), np.float64, NOTHING, strides=(0, 0))
@@ -171,8 +171,7 @@ class Tracker:
     def _filter(self, part: Chunk, transition: Transition, measurement: Measurement, *, keep_P: bool) -> Estimates:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
         gate = self.plan.gate * self.alignment.gate_scale
-        N = len(part)
-        steps, measured = transition, measurement
+        N, steps, measured = len(part), transition, measurement
         while True:
             try:
                 estimates = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
@@ -242,8 +241,8 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
     dt, tau = chunk.dt, chunk["tau"]
     ends = *extremes(dt.reshape(-1)), *extremes(tau)
-    if all(abs(end / usual - 1) < REGULAR for end in ends):  # nearly always
-        lasting = locked(np.full(len(tau), usual))
+    if abs(min(ends) / usual - 1) < REGULAR and abs(max(ends) / usual - 1) < REGULAR:  # nearly always
+        lasting = locked(np.array([usual]).repeat(len(tau)))
         yield chunk.having(dt=lasting, tau=lasting)
         return
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
@@ -266,12 +265,14 @@ class RestMonitor:
     def look(self, done: Chunk, estimates: Estimates) -> Flags:
         """Return the epochs at which the unit stood still (N,)."""
         still, out, self.memory = self.detector.look(done, self.memory)
+        if every(still) and every(estimates.used):  # nearly always
+            self.journal.moving.open = self.journal.refused.open = False
+            return still
         self.journal.moving.note(done.t, ~still, out, self.axes)
         refused = still & ~estimates.used
         causes = np.zeros(estimates.white.shape, dtype=np.bool_)
-        if np.count_nonzero(refused):
-            size = estimates.white[refused] ** 2
-            causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
+        size = estimates.white[refused] ** 2
+        causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
         self.journal.refused.note(done.t, refused, causes, self.components)
         return still
 

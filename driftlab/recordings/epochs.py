@@ -15,7 +15,7 @@ from itertools import chain, islice
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk, Integers, concatenate, locked, made
+from fusion_core.chunk import Array, Chunk, Integers, concatenate, locked, made, read_only
 from fusion_core.fast import compiled
 from fusion_core.thermal.thermometer import READINGS, readings, started
 
@@ -43,8 +43,8 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     pace = np.array([float(np.median(np.diff(first.t[:HEAD]))) if len(first) > 1 else 0.0, 0.0, 0.0])
     previous: Chunk | None = None
     carry: Chunk | None = None  # the rows of the epoch that is not over
-    last = -np.inf  # its number
-    for chunk in _with_readings(chain([first], stream)):
+    last, thermometer = -np.inf, started()  # its number, and what the thermometer's samples so far show
+    for chunk in chain([first], stream):
         starts = np.empty(len(chunk), dtype=np.int64)
         count, last = _starts(chunk.t, t_0, interval, last, starts)
         starts = starts[:count]
@@ -59,28 +59,18 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
         if count > 1:
             pieces.append((chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0]))
         carry = chunk.part(starts[-1], len(chunk))
-        done = []
+        done: list[Chunk] = []
         for rows, begins in pieces:
-            part = _integrate(rows, begins, pace, previous)
+            part = _integrate(rows, begins, pace, thermometer, done[-1].last() if done else previous)
             if len(part):
                 done.append(part)
-                previous = part.last()
         if done:
-            yield concatenate(done)
+            yield (whole := concatenate(done))
+            previous = whole.last()
     if carry is not None:
-        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
+        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, thermometer, previous)]
         if len(done[0]):
             yield done[0]
-
-
-def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    memory = started()
-    for chunk in chunks:
-        if "temperature" not in chunk.channels:
-            yield chunk
-            continue
-        seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
-        yield chunk.having(**dict(zip(READINGS, map(locked, seen), strict=True)))
 
 
 # what compiled functions return takes ten times as long to hand over as what they are given to write to
@@ -132,33 +122,35 @@ def _means(values: Array, weights: Array, starts: Integers, total: Array, means:
             means[k, j] = sum / total[k]
 
 
-def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | None) -> Chunk:
+def _integrate(rows: Chunk, starts: Integers, pace: Array, thermometer: Array, previous: Chunk | None) -> Chunk:
     N, K = len(rows), len(starts)
     if N == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = np.empty(N)
     _owned(rows.t, before, pace, dt)
-    ones = np.ones(N)
-    tau, counts = dt, ones
-    last: slice | Integers = slice(None)
+    tau, t, last = dt, rows.t, None
     if K < N:
         tau, ends = np.add.reduceat(dt, starts), np.append(starts[1:], N)
-        counts, last = (ends - starts).astype(np.float64), ends - 1
-    lasting = np.count_nonzero(tau > 0) == K
+        last, t = ends - 1, locked(t[ends - 1])
+        by_number = np.ones(N), (ends - starts).astype(np.float64)
+    lasting = np.count_nonzero(tau) == K
     by_time = dt, tau if lasting else np.where(tau > 0, tau, 1.0)
-    by_number = ones, counts
     channels = {"tau": tau}
     for name, values in rows.channels.items():
-        if name in READINGS:
-            channels[name] = locked(values[last])
+        lasts = name in rows.sensors
+        if K == N and not lasts:
+            channels[name] = read_only(np.ascontiguousarray(values, dtype=np.float64))
             continue
-        weights, total = by_time if name in rows.sensors else by_number
+        weights, total = by_time if lasts else by_number
         means = np.empty((K, *values.shape[1:]))
         _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
         channels[name] = locked(means)
+    if "temperature" in rows.channels:
+        seen = readings(np.ascontiguousarray(rows["temperature"], dtype=np.float64), thermometer)
+        channels |= {name: locked(a if last is None else a[last]) for name, a in zip(READINGS, seen, strict=True)}
     locked(tau)  # only now: of what is locked, compiled functions have a version of its own
-    done = made(locked(rows.t[last]), channels, previous, rows.sensors)
+    done = made(t, channels, previous, rows.sensors)
     done = done if lasting else done.where(tau > 0)
     if previous is not None or not len(done):
         return done

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Sensor
-from fusion_core.faults import RANGES, Faults
+from fusion_core.faults import RANGES, Faults, all_within
 from fusion_core.thermal.thermometer import noise_before
 
 LIVELY = 100  # changes of a reading that show its habit
@@ -236,8 +236,8 @@ class Thermometer:
         """Pass the rows of a source on, and look for readings below absolute zero that change as readings do."""
         for chunk in chunks:
             T = chunk.channels.get("temperature")
-            if T is not None and len(self.impossible) < LIVELY and np.any(below := T < ZERO):
-                self.impossible |= set(np.unique(T[below]).tolist())
+            if T is not None and len(self.impossible) < LIVELY and not all_within(T, *RANGES["temperature"][:2]):
+                self.impossible |= set(np.unique(T[T < ZERO]).tolist())
                 if len(self.impossible) >= LIVELY:
                     self.faults.doubt(
                         "temperature changes below absolute zero; correct path or unit of source.channels.temperature"
@@ -246,7 +246,9 @@ class Thermometer:
 
     def look(self, chunk: Chunk) -> None:
         """Take the next temperatures (N,), in degC, and look at them once there are enough."""
-        t, T, begin = chunk.t, chunk["temperature"], self._stop
+        t, T, begin = chunk.t, chunk.channels.get("temperature"), self._stop
+        if T is None or T.ndim != 1:
+            return
         since = self._held[0, 0] if begin else t[0]
         if self._rows + len(t) >= ENOUGH or t[-1] - since > LASTING:
             self._look(np.append(self._held[0, :begin], t), np.append(self._held[1, :begin], T), self._rows + len(t))

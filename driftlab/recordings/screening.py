@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -24,7 +24,7 @@ STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not r
 
 def read(
     config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None, *, few: bool = False
-) -> Iterator[Chunk]:
+) -> Generator[Chunk]:
     """Yield the samples of the config's source (or of `stream`, in its place) that can be used.
 
     Of a `few` that are all that is wanted, nothing is compiled: loading the compiler would take longer.
@@ -42,13 +42,16 @@ def read(
             taken = min(DERIVED & set(chunk.channels))
             raise ConfigError(f"channel '{taken}': the program uses this name itself; rename it under source.channels")
         chunk = _with_sensors(chunk, sensors, previous)
-        previous = chunk.last()
         keep = screen.keep(chunk)
         kept = chunk if keep is None else chunk.where(keep)
-        if len(kept):
-            empty = False
-            faults.usable += len(kept)
-            yield kept
+        try:
+            if len(kept):
+                empty = False
+                faults.usable += len(kept)
+                yield kept
+        finally:  # also where no more is asked for; until then nobody waits for it
+            previous = chunk.last()
+            screen.thermometer.look(chunk)
     screen.thermometer.flush()
     for looks in (screen.rails, screen.roundings):
         for look in looks.values():
@@ -60,11 +63,10 @@ def read(
 
 
 class _Screen:
-    """A look at all samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
+    """A look at the sensors' samples: stuck and saturated ones are left out, what no sensor gives is a doubt."""
 
     def __init__(self, faults: Faults, sensors: Mapping[str, Sensor], *, few: bool) -> None:
-        self.faults, self.sensors = faults, sensors
-        self.look = getattr(_suspect, "py_func", _suspect) if few else _suspect
+        self.faults, self.sensors, self.few = faults, sensors, few
         self.copies, self.thermometer = Copies(faults), Thermometer(faults)
         self.runs: dict[str, Array] = {}  # length of the repetition of each axis
         self.rails: dict[str, Rails] = {}
@@ -73,10 +75,9 @@ class _Screen:
     def keep(self, chunk: Chunk) -> Flags | None:
         """Return the rows (N,) that can be used; None where all can."""
         keep = None
-        if "temperature" in chunk.channels and chunk["temperature"].ndim == 1:
-            self.thermometer.look(chunk)
-        for name in (name for name in chunk.channels if name in chunk.sensors):
-            sensor, d = self.sensors.get(name), chunk[name].shape[1]
+        suspect = getattr(_suspect, "py_func", _suspect) if self.few else _suspect
+        for name, values in ((name, a) for name, a in chunk.channels.items() if name in chunk.sensors):
+            sensor, d = self.sensors.get(name), values.shape[1]
             self.copies.look(chunk, name, sensor)
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             if name not in self.runs:
@@ -85,10 +86,10 @@ class _Screen:
             self.roundings[name].look(chunk)
             before, self.runs[name], table = self.runs[name], np.empty(d), self.rails[name].table
             last = read_only(_value_before(chunk, name))
-            if not self.look(chunk[name], last, before, self.runs[name], limit, table):
+            if not suspect(values, last, before, self.runs[name], limit, table):
                 continue
             repeats = _repeats(chunk, name, before)
-            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(values) >= limit)):
                 good = ~_report(chunk, name, sensor, what, bad, self.faults)
                 keep = good if keep is None else keep & good
         return keep
@@ -125,17 +126,18 @@ class Gaps:
 
     def look(self, t: Array) -> None:
         """Look at the times (N,) of the next rows."""
-        if np.isnan(self.last):
+        if self.last != self.last:  # NaN
             self.first = t = np.append(self.first, t)
             if len(t) < FIRST:
                 return
             self.last, self.least = float(t[0]), max(LONG, RARE * float(np.median(np.diff(t[:FIRST]))))
-        if t[-1] - self.last > self.least:  # a gap is no longer than all of it
+        last = float(t[-1])
+        if last - self.last > self.least:  # a gap is no longer than all of it
             steps = np.diff(t, prepend=self.last)
             long = steps > self.least
             if np.any(long):
                 self._add((t - steps)[long], steps[long])
-        self.last = float(t[-1])
+        self.last = last
 
     def _add(self, begins: Array, lengths: Array) -> None:
         what = f"gaps of more than {self.least:.4g} s, predicted across"
@@ -220,6 +222,7 @@ def head(config: Config) -> tuple[Chunk | None, list[str]]:
     first = next(rows)
     while len(first) < FIRST and (more := next(rows, None)) is not None:
         first = concatenate([first, more])
+    rows.close()
     for name in first.sensors:
         look = Rounding(name, None, first[name].shape[1])
         look.look(first)

@@ -85,7 +85,7 @@ def with_memory(name: str, check: Check) -> Check:
 
     def check_both(plugin: Any, answer: Any, *arguments: Any, **named: Any) -> tuple[Any, Memory]:
         first, memory = _pair(plugin, name, answer, "what was asked and the memory")
-        _lock(memory)
+        _lock((memory,))
         return check(plugin, first, *arguments, **named), memory
 
     return check_both
@@ -188,12 +188,12 @@ def _ordinary(step: Transition, n: int, N: int) -> bool:
     """Return True if steps are sound and as nearly all are, which is seen quickly: F and Q constant, Q diagonal."""
     if type(step) is not Transition or step.C is not None:
         return False
-    arrays = []
-    for array, shapes in ((step.F, ((n, n),)), (step.Q, ((n, n),)), (step.u, ((n,), (N, n)))):
-        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape not in shapes:
-            return False
-        arrays.append(array if array.flags.carray else array.copy())
-    F, Q, u = arrays
+    F, Q, u = step.F, step.Q, step.u
+    if not (type(F) is type(Q) is type(u) is np.ndarray and F.dtype is Q.dtype is u.dtype is FLOAT):
+        return False
+    if not (F.shape == Q.shape == (n, n) and u.shape in ((n,), (N, n))):
+        return False
+    F, Q, u = [a if a.flags.carray else a.copy() for a in (F, Q, u)]
     return bool(_sound(F, Q, u.reshape(-1)))
 
 
@@ -295,7 +295,7 @@ def look(detector: Detector, answer: Any, chunk: Chunk, memory: Memory) -> tuple
     N, D = len(chunk), len(detector.axes)
     expect_array(detector, "still of its detector", answer[0], ((N,),), kinds="b")
     expect_array(detector, "what stands out of its detector", answer[1], ((N, D),), kinds="b")
-    _lock(answer[2])
+    _lock(answer[2:])
     return answer
 
 
@@ -402,14 +402,13 @@ def _pair(plugin: Any, name: str, answer: Any, what: str) -> tuple[Any, Any]:
     return answer
 
 
-def _lock(memory: Memory, depth: int = 8) -> None:
-    """Lock the arrays of a memory, in containers within one another up to a depth."""
-    if isinstance(memory, np.ndarray):
-        memory.setflags(write=False)
-    elif depth and isinstance(memory, (tuple, list, dict)):
-        for item in memory.values() if isinstance(memory, dict) else memory:
-            if item is not None:
-                _lock(item, depth - 1)
+def _lock(items: Iterable[Memory], depth: int = 8) -> None:
+    """Lock the arrays among memories, and those in containers within one another up to a depth."""
+    for item in items:
+        if isinstance(item, np.ndarray):
+            item.setflags(write=False)
+        elif item and depth and isinstance(item, (tuple, list, dict)):
+            _lock(item.values() if isinstance(item, dict) else item, depth - 1)
 
 
 def expect_array(

@@ -16,7 +16,7 @@ import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import FLOAT, covariance
-from fusion_core.chunk import Array, Flags
+from fusion_core.chunk import Array, Flags, every
 from fusion_core.fast import compiled, inlined, loop
 from fusion_core.fast.groups import IndependentGroups, Lanes, Size, find_groups
 from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
@@ -59,20 +59,19 @@ def alone(
     That is where it is not ordinary (`fusion_core.fast.loop.single`), or an array is not as `fusion_core.checks` would
     leave it. Checks one by one, groups and a job cost four times as much as the sample.
     """
-    x, P, z, used = state.x, state.P, measurement.z, measurement.used
-    given = z, x, P, transition.F, transition.Q, transition.u, measurement.H, measurement.R
-    n, m = np.size(x), np.size(z)
-    shapes, arrays = ((m,), (n,), (n, n), (n, n), (n, n), (n,), (m, n), (m, m)), []
-    for array, shape in zip(given, shapes, strict=True):
-        if type(array) is np.ndarray and array.shape == (1, *shape):
-            array = array[0]
-        if type(array) is not np.ndarray or array.dtype != FLOAT or array.shape != shape:
-            return None
-        arrays.append(array if array.flags.carray else array.copy())
-    measured = type(used) is np.ndarray and used.dtype == np.bool_ and used.shape in ((1,), (1, m)) and all(used.flat)
+    x, P, z, used, u = state.x, state.P, measurement.z, measurement.used, transition.u
+    over = transition.F, transition.Q, measurement.H, measurement.R
+    if set(map(type, (x, P, z, used, u, *over))) != {np.ndarray} or transition.C is not None:
+        return None
+    F, Q, H, R = [a[0] if a.ndim == 3 and len(a) == 1 else a for a in over]
+    arrays, n, m = (z, x, P, F, Q, u if u.ndim == 2 else u[None], H, R), x.size, z.size
+    if [a.shape for a in arrays] != [(1, m), (n,), (n, n), (n, n), (n, n), (1, n), (m, n), (m, m)]:
+        return None
+    given = [a if a.flags.carray else a.copy() for a in arrays if a.dtype is FLOAT]
+    if len(given) < 8 or used.dtype != np.bool_ or used.shape not in ((1,), (1, m)) or not every(used):
+        return None
     of_x, of_z, sums = np.empty((n + 3, n)), np.empty((2, m)), np.empty(2)
-    sound = measured and n and m and (x.ndim, P.ndim, z.ndim) == (1, 2, 2) and transition.C is None
-    if not (sound and loop.single(*arrays, gate, of_x, of_z, sums)):
+    if not (n and m and loop.single(*given, gate, of_x, of_z, sums)):
         return None
     after, dof, all_used = State(of_x[2], of_x[3:]), np.array([m]), np.array([True])
     kept = after.P[None].copy() if keep_P else None

@@ -330,7 +330,7 @@ def single(
     z: Array, x: Array, P: Array, F: Array, Q: Array, u: Array, H: Array, R: Array, gate: float,
     of_x: Array, of_z: Array, sums: Array,
 ) -> bool:  # fmt: skip
-    """Do one sample of n states as one group; return whether it is an ordinary one, else nothing of it counts.
+    """Do one sample z (1, m) of n states as one group; return whether it is ordinary, else nothing of it counts.
 
     Ordinary are covariances P and Q, R diagonal, nothing refused, all finite. The results are x, sigma, x again and P
     after the sample in `of_x` (n + 3, n), y and white in `of_z` (2, m), nis and log_det in `sums` (2,).
@@ -342,14 +342,14 @@ def single(
     if not ordinary:
         return False
     w, x_, P_ = of_x[1], of_x[2], of_x[3:]
-    predict(x, x, P, F, F, Q, u, x_, P_, w, None)
+    predict(x, x, P, F, F, Q, u[0], x_, P_, w, None)
     for i in range(m):
-        of_z[0, i] = z[i]
+        of_z[0, i] = z[0, i]
         for j in range(n):
             of_z[0, i] -= H[i, j] * x_[j]
     sums[0] = sums[1] = 0.0
     for i in range(m):
-        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[i], w, of_x[0], None)
+        y, inverse = correct(x, x_, P_, H[i], R[i, i], z[0, i], w, of_x[0], None)
         of_z[1, i] = y * np.sqrt(inverse)
         sums[0] += of_z[1, i] ** 2
         sums[1] -= np.log(inverse)

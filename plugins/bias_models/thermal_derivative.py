@@ -165,7 +165,7 @@ class ThermalDerivative(ThermalBias):
         """Return F, Q = walk^2 dt, the known drift u and the output C."""
         d, n = len(self.axes), len(self.labels)
         before = _Memory.start(len(self.effects)) if memory is None else _Memory(*memory)
-        shifted, inputs = self._map_input(chunk, before.inputs)
+        shifted, inputs = self._map_input(chunk, before.inputs) if self.effects else (chunk, [])
         g, S, signatures = self._effects(chunk, before.signatures)
         level = g
         if self.fitted is not None and (self.form == "difference" or self.repeatability is not None):
@@ -182,8 +182,8 @@ class ThermalDerivative(ThermalBias):
             u[:, :d] += self.fitted.slope(shifted["temperature"], chunk.t) * rate[:, None]
         Q = self._density * chunk.dt[..., None, None]
         F, fadings, left = self._transition_matrix(chunk, before)
-        after = _Memory(g[-1], inputs, signatures, fadings, left, level[-1])
-        return Transition(F, Q, u, self._output(S, len(chunk))), tuple(after)
+        after = g[-1], inputs, signatures, fadings, left, level[-1]
+        return Transition(F, Q, u, self._output(S, len(chunk))), after
 
     def _output(self, S: list[Array], N: int) -> Array | None:
         """Return C: None where the states are the bias, (d, n), or (N, d, n) with the signatures S (N, d, p)."""

@@ -58,11 +58,14 @@ class ZeroVelocity:
         self.triads, self.space = triads, space
         self.m = sum(len(t.sensor.axes) for t in triads)
         self._H, self._R = np.eye(self.m, space.n), np.diag(np.concatenate([t.shake**2 for t in triads]))
+        self._still: Measurement | None = None  # the last of `measurement`
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 
     def measurement(self, N: int) -> Measurement:
         """Zero motion, N times."""
-        return Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
+        if self._still is None or len(self._still.z) != N:
+            self._still = Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
+        return self._still
 
     def transition(self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment) -> Transition:
         """Put the bias models' steps and the integrals of the epochs together."""
@@ -105,9 +108,5 @@ class ZeroVelocity:
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
-        return self._white(constant(chunk["tau"]))
-
-    def _white(self, tau: Array) -> Array:
         density = self.space.vector({triad.integral: triad.sensor.noise**2 for triad in self.triads})
-        white: Array = tau[..., None, None] * np.diag(density)
-        return white
+        return np.asarray(constant(chunk["tau"])[..., None, None] * np.diag(density))

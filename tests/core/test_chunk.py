@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusion_core.chunk import Chunk
+from fusion_core.chunk import Chunk, every
 
 
 @pytest.mark.parametrize("start", [0.0, 1e5, 1.7e9])
@@ -50,3 +50,9 @@ def test_a_channel_more_leaves_the_steps_as_they_are_unless_it_is_them():
     assert chunk.having(dt=np.full(2, 0.5)).dt == 0.5
     with pytest.raises(ValueError, match="read-only"):
         chunk.having(gyro=np.zeros(2))["gyro"][0] = 1.0
+
+
+@given(flags=st.lists(st.booleans(), max_size=9), step=st.sampled_from([1, 2, -1]))
+def test_every_flag_is_looked_at_in_any_layout(flags, step):
+    assert every(np.array(flags, dtype=bool)[::step]) == all(flags[::step])
+    assert every(np.array([flags, flags], dtype=bool).T[::step]) == all(flags[::step])

@@ -67,3 +67,19 @@ def test_epochs_do_not_depend_on_the_chunks(size, interval):
     np.testing.assert_array_equal(whole.dt, split.dt)
     for name in whole.channels:
         np.testing.assert_array_equal(whole[name], split[name])
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
+@pytest.mark.parametrize("interval", [0.01, 0.1])
+def test_channels_of_any_numbers_are_numbers_of_the_filter(kind, interval):
+    """Whether an epoch is a sample or many: compiled loops are of one kind of number, and of one layout."""
+    t = np.arange(0, 3, 0.01)
+    table = np.stack([np.arange(len(t)), np.arange(len(t))], axis=1).astype(kind)
+    got = concatenate(list(epochs(cut(t, 7, gyro=table, temperature=table[:, 0]), interval)))
+    for part in (got, *epochs(cut(t, 1, gyro=table, temperature=table[:, 0]), interval)):
+        for values in part.channels.values():
+            assert values.dtype == np.float64
+            assert values.flags.c_contiguous
+            assert not values.flags.writeable
+    np.testing.assert_allclose(got["temperature"], got["gyro"][:, 0], rtol=1e-12)
+    np.testing.assert_allclose(np.diff(got["temperature"])[:-1], interval / 0.01, rtol=1e-6)

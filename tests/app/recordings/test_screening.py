@@ -187,3 +187,18 @@ def test_long_gaps_are_noted_where_they_are(rows):
     seldom = config().model_copy(update={"source": Timed(t=tuple(np.arange(900.0) * 1200))})
     list(read(seldom, faults := Faults(), rows))
     assert faults.found == {}, "as far apart as all others"
+
+
+def test_a_thermometer_is_looked_at_once_its_rows_have_been_passed_on_also_where_no_more_are_asked_for():
+    class Kelvin(Made):
+        def chunks(self, size, faults):
+            for chunk in super().chunks(size, faults):
+                yield chunk.having(temperature=chunk["temperature"] + 300)
+
+    faults = Faults()
+    rows = read(config().model_copy(update={"source": Kelvin()}), faults)
+    assert len(next(rows)) > 1000
+    assert faults.doubts == []
+    rows.close()
+    (doubt,) = faults.doubts
+    assert "looks like kelvin" in doubt
