@@ -123,11 +123,11 @@ def _starts(t: Array, t_0: float, interval: float, last: float, starts: Integers
 def _means(values: Array, weights: Array, starts: Integers, total: Array, means: Array) -> None:
     """Write the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape
-    for k in range(len(starts)):
-        stop = starts[k + 1] if k + 1 < len(starts) else N
+    for k in range(len(starts)):  # of an index without a sign no one asks whether it counts from the end
+        first, stop = np.uint64(starts[k]), np.uint64(starts[k + 1] if k + 1 < len(starts) else N)
         for j in range(d):
-            sum = 0.0
-            for i in range(starts[k], stop):
+            sum = 0.0 + values[first, j] * weights[first]
+            for i in range(first + np.uint64(1), stop):
                 sum += values[i, j] * weights[i]
             means[k, j] = sum / total[k]
 
