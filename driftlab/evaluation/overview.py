@@ -153,7 +153,6 @@ class OverviewAccumulator:
         self._gather()  # what still waits has nothing after it
         model, found = self.model, self._envelope
         up = self.alignment.up if model.tracked.integral else None
-        counted = int(np.sum(found.sums[:, 0]))
         return Overview(
             count=self.count,
             used=self.used,
@@ -162,9 +161,9 @@ class OverviewAccumulator:
             first_row=self.start if first_row is None else first_row,
             bias=self._last["bias"][-1],
             sigma=self._last["bias_sigma"][-1],
-            deviations=(found.least, np.sqrt(found.squares / max(counted, 1))),
+            deviations=(found.least, np.sqrt(found.squares / max(np.sum(found.sums[:, 0]), 1))),
             yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
-            nis=nis_test_of(found.nis_total, counted, model.m),
+            nis=nis_test_of(found.nis_total, int(np.sum(found.sums[:, 0])), model.m),
             whiteness_p=self._whiteness.p(),
             slow=self._whiteness.slow(),
             curves=self._curves.curves(self._last),
@@ -256,8 +255,7 @@ class Envelope:
         self.at, self.length, K = 0, 1, 2 * STRETCHES
         self.low, self.high = np.full((K, 1 + 2 * d), np.inf), np.full((K, 1 + 2 * d), -np.inf)  # of t and the errors
         self.sums = np.zeros((K, 3))  # of the updates that count: their number, sum of t, sum of nis
-        self.nis_total = self.nis_highest = 0.0
-        self.least, self.squares = np.full(d, np.inf), np.zeros(d)
+        self.nis_total, self.nis_highest, self.least, self.squares = 0.0, 0.0, np.full(d, np.inf), np.zeros(d)
 
     def add(self, block: Mapping[str, Array], errors: Array, counts: Flags) -> None:
         """Take the next block with its errors (N, 3 d), NaN where not known; `counts` says whose nis counts."""
@@ -267,9 +265,8 @@ class Envelope:
                 (self.low, np.minimum, np.inf), (self.high, np.maximum, -np.inf), (self.sums, np.add, 0.0),
             ):  # fmt: skip
                 table[:STRETCHES], table[STRETCHES:] = merged(table[::2], table[1::2]), empty
-        columns = block["t"], errors, block["nis"], block["bias_sigma"], counts
-        tables = self.low, self.high, self.sums, self.least, self.squares
-        total, highest = _take(*columns, self.at, self.length, *tables)
+        tables = self.at, self.length, self.low, self.high, self.sums, self.least, self.squares
+        total, highest = _take(block["t"], errors, block["nis"], block["bias_sigma"], counts, *tables)
         self.nis_total, self.nis_highest = self.nis_total + total, max(self.nis_highest, highest)
         self.at += len(counts)
 
@@ -306,12 +303,10 @@ def _take(
                 high[row, j] = error
         if counts[k]:
             total, highest = total + nis[k], max(highest, nis[k])
-            sums[row, 0] += 1.0
-            sums[row, 1] += t[k]
-            sums[row, 2] += nis[k]
+            for j, value in enumerate((1.0, t[k], nis[k])):
+                sums[row, j] += value
             for j in range(len(least)):
-                least[j] = min(least[j], sigma[k, j])
-                squares[j] += sigma[k, j] ** 2
+                least[j], squares[j] = min(least[j], sigma[k, j]), squares[j] + sigma[k, j] ** 2
     squares += before
     return total, highest
 
@@ -460,5 +455,5 @@ def accumulator_of(run: Run, whiteness: Whiteness | None = None) -> OverviewAccu
 def scored(run: Run, rows: OverviewAccumulator | Mapping[str, Array]) -> ScoredRun:
     """Return a run with its overview, from its columns or from the accumulator that has seen them all."""
     gathered = rows if isinstance(rows, OverviewAccumulator) else accumulator_of(run).read(rows)
-    overview = gathered.overview(run.journal.faults.first_row)
-    return ScoredRun(run.config, run.model, run.journal, overview, gathered.averages)
+    first = run.journal.faults.first_row
+    return ScoredRun(run.config, run.model, run.journal, gathered.overview(first), gathered.averages)

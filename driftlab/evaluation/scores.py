@@ -274,8 +274,7 @@ def _integrate(
 def errors_of(estimates: Mapping[str, Array], reference: Array) -> Array:
     """Return errors (N, 3 d) of bias and prediction less the reference (N, d), and the prediction's deviation."""
     bias, coast, sigma = (np.asarray(estimates[n], dtype=np.float64) for n in ("bias", "coast", "coast_sigma"))
-    # column by column: rows of three are copied at a third of the pace
-    return np.column_stack([*(bias - reference).T, *(coast - reference).T, *sigma.T])
+    return np.hstack([bias - reference, coast - reference, sigma])
 
 
 def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Scores:

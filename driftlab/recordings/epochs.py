@@ -67,20 +67,17 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
                 previous = part.last()
         if done:
             yield concatenate(done)
-    if carry is not None:
-        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
-        if len(done[0]):
-            yield done[0]
+    if carry is not None and len(part := _integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)):
+        yield part
 
 
 def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
     memory = started()
     for chunk in chunks:
-        if "temperature" not in chunk.channels:
-            yield chunk
-            continue
-        seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
-        yield chunk.having(**dict(zip(READINGS, map(locked, seen), strict=True)))
+        if "temperature" in chunk.channels:
+            seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
+            chunk = chunk.having(**dict(zip(READINGS, map(locked, seen), strict=True)))
+        yield chunk
 
 
 # what compiled functions return takes ten times as long to hand over as what they are given to write to
@@ -137,9 +134,8 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
     if N == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
-    dt = np.empty(N)
+    dt, ones = np.empty(N), np.ones(N)
     _owned(rows.t, before, pace, dt)
-    ones = np.ones(N)
     tau, counts = dt, ones
     last: slice | Integers = slice(None)
     if K < N:
@@ -147,13 +143,12 @@ def _integrate(rows: Chunk, starts: Integers, pace: Array, previous: Chunk | Non
         counts, last = (ends - starts).astype(np.float64), ends - 1
     lasting = np.count_nonzero(tau > 0) == K
     by_time = dt, tau if lasting else np.where(tau > 0, tau, 1.0)
-    by_number = ones, counts
     channels = {"tau": tau}
     for name, values in rows.channels.items():
         if name in READINGS:
             channels[name] = locked(values[last])
             continue
-        weights, total = by_time if name in rows.sensors else by_number
+        weights, total = by_time if name in rows.sensors else (ones, counts)
         means = np.empty((K, *values.shape[1:]))
         _means(np.ascontiguousarray(values).reshape(N, -1), weights, starts, total, means.reshape(K, -1))
         channels[name] = locked(means)

@@ -264,11 +264,7 @@ class Thermometer:
         """Look at times and readings, of which the last `new` have not been looked at."""
         known, self._held[:, 0], self._rows, self._stop = len(t) - new, (t[-1], T[-1]), 0, 1
         steps = np.abs(np.diff(T))
-        if len(steps) and np.all(steps) and self.run <= STUCK * max(self.longest, 1):  # no reading comes twice
-            self.changes, self.longest = self.changes + len(steps), max(self.longest, self.run + 1 - known)
-            self.run, self.since = 1, float(t[-1])
-        else:
-            self._repeats(t, T, np.flatnonzero(steps) + 1, known)
+        self._repeats(t, T, np.flatnonzero(steps) + 1, known)
         if np.max(steps, initial=0.0) > JUMP:
             self._jumps(t, T, steps)
         self._range(t, T)

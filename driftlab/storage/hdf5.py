@@ -12,7 +12,7 @@ import errno
 import os
 import re
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -136,30 +136,30 @@ class GrowingFile:
 
     def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
         """Write rows up to `end`, from the beginning of the piece on that is not full; keep those of the last one."""
+        start, whole = written // PIECE * PIECE, end // PIECE * PIECE
         for name, data in self._data.items():
+            rows = [*self._begun.get(name, []), *(part[name] for part in parts)]  # from `start` on
+            begins, dtype = np.cumsum([0, *map(len, rows)]).tolist(), data.dtype
             data.id.set_extent((end, *data.shape[1:]))
-            at, settling, left = written // PIECE * PIECE, name in self._settling, None
-            for piece in _pieces([*self._begun.get(name, []), *(part[name] for part in parts)], data.dtype):
-                if at < end:  # a piece that is there in part keeps its place
-                    self._put(name, at, piece, settling=settling and at >= written)
-                at, left = at + PIECE, piece
-            if left is None or len(left) == PIECE:
-                self._begun[name] = []
-            else:
-                self._begun[name] = [left.copy() if left.strides[0] else left]
+            for at in range(start, end, PIECE):
+                piece = _joined(rows, begins, at - start, min(at + PIECE, end) - start, dtype)
+                self._put(name, at, piece, new=at >= written)  # a piece that is there in part keeps its place
+            left = _joined(rows, begins, whole - start, begins[-1], dtype)
+            self._begun[name] = [left.copy() if left.strides[0] else left]
 
-    def _put(self, name: str, at: int, piece: NDArray[Any], *, settling: bool) -> None:
-        data, place, full = self._data[name].id, (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
+    def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
+        data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
         if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if settling and full and _is_one_row(piece):
+        settled = new and full and name in self._settling
+        if settled and (piece.strides[0] == 0 or (np.all(piece[0] == piece[-1]) and np.all(piece[1:] == piece[:-1]))):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
                 self._packed[name] = row, packed
-            data.write_direct_chunk(place, packed)
+            data.id.write_direct_chunk(place, packed)
         else:  # as it is: rows that were safe before are written again, byte by byte the same
-            data.write_direct_chunk(place, np.ascontiguousarray(piece), AS_IT_IS if name in self._settling else 0)
+            data.id.write_direct_chunk(place, np.ascontiguousarray(piece), AS_IT_IS if name in self._settling else 0)
 
     def close(self) -> None:
         """Write the rest and close the file, which then reads like any other; without a row it is removed."""
@@ -200,35 +200,17 @@ class GrowingFile:
         self._file.swmr_mode = True
 
 
-def _pieces(parts: Iterable[NDArray[Any]], dtype: np.dtype[Any]) -> Iterator[NDArray[Any]]:
-    """Yield pieces of parts that follow one another; the last one is shorter, where they end within it.
+def _joined(parts: list[NDArray[Any]], begins: list[int], start: int, stop: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return rows of parts that follow one another, row by row in memory; where one stands for all, as one that does.
 
-    Rows of one part are not copied: most pieces are. Where one row stands for all, it does so in the piece.
+    Each part begins at a row of all. Rows of one part are not copied: most pieces are.
     """
-    held: list[NDArray[Any]] = []  # of the next piece
-    missing = PIECE
-    for part in parts:
-        for at in (0, *range(missing, len(part), PIECE)):
-            rows = part[at : at + missing]
-            held.append(rows)
-            missing -= len(rows)
-            if missing == 0:
-                yield _joined(held, dtype)
-                held, missing = [], PIECE
-    if missing < PIECE:
-        yield _joined(held, dtype)
-
-
-def _joined(parts: list[NDArray[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
-    if not any(part.strides[0] or np.any(part[:1] != parts[0][:1]) for part in parts):
-        row = parts[0][0].astype(dtype)
-        return np.broadcast_to(row, (sum(map(len, parts)), *row.shape))
-    return np.ascontiguousarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=dtype)
-
-
-def _is_one_row(piece: NDArray[Any]) -> bool:
-    """Return True if all rows are the same; those at the ends seldom are where others are not."""
-    return piece.strides[0] == 0 or bool(np.all(piece[0] == piece[-1]) and np.all(piece[1:] == piece[:-1]))
+    found = [part[max(start - at, 0) : max(stop - at, 0)] for part, at in zip(parts, begins, strict=False)]
+    found = [part for part in found if len(part)] or [parts[0][:0]]
+    if len(found[0]) and not any(part.strides[0] or np.any(part[0] != found[0][0]) for part in found):
+        row = found[0][0].astype(dtype)
+        return np.broadcast_to(row, (sum(map(len, found)), *row.shape))
+    return np.ascontiguousarray(found[0] if len(found) == 1 else np.concatenate(found), dtype=dtype)
 
 
 def beside(path: Path) -> Path:
@@ -238,8 +220,7 @@ def beside(path: Path) -> Path:
 
 def reason(error: BaseException) -> str:
     """Return the reason of an error of the system, or of HDF5, whose texts are long."""
-    number = getattr(error, "errno", None)
-    if number:
+    if number := getattr(error, "errno", None):
         return os.strerror(number)
     message = re.search(r"error message = '([^']*)'", str(error))
     return message[1] if message else str(error)

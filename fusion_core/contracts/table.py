@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core.budget import check_regular
-from fusion_core.checks import all_finite
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import UnitConflict, UnitError, UnreadableFile, quote
 from fusion_core.settings import Settings
@@ -100,7 +99,7 @@ class Window:
 
     def cut(self, t: Array) -> slice:
         """Return the rows of the next block that are within the range."""
-        finite = t if all_finite(t) else t[np.isfinite(t)]
+        finite = t if np.isfinite(t).all() else t[np.isfinite(t)]
         if len(finite):
             self.first = finite[0] if np.isnan(self.first) else self.first
             self.last = finite[-1]

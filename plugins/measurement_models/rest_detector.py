@@ -67,7 +67,7 @@ class RestDetector(Detector):
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
         """Return the epochs that are still (N,), the axes that stand out in each (N, D), and the memory."""
         triads, limit = self._constant
-        x = np.column_stack([axis for channel in triads for axis in chunk[channel].T])  # twice as quick as by rows
+        x = np.ascontiguousarray(np.concatenate([chunk[channel] for channel in triads], axis=1))
         (N, D), memory = x.shape, memory.copy()
         T = rate = np.zeros(N)
         if "temperature" in chunk.channels:
