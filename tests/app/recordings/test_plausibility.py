@@ -50,22 +50,6 @@ def test_an_ordinary_thermometer_is_in_no_doubt(T, size):
     assert doubts(T, size) == []
 
 
-@pytest.mark.parametrize("size", [1000, 1003, 7000])
-def test_the_habit_is_that_of_the_readings_one_by_one(size):
-    T = np.concatenate([NOISY[:9000], held(NOISY, 9990, 10_013)[9000:12_003], NOISY[12_003:20_000]])
-    changes, longest, run = 0, 0, 1
-    thermometer = Thermometer(Faults(first_row=0.0))
-    for k in range(len(T)):
-        if k and T[k] == T[k - 1]:
-            run += 1
-        elif k:
-            changes, longest, run = changes + 1, max(longest, run), 1
-        if (k + 1) % size == 0:
-            part = slice(k + 1 - size, k + 1)
-            thermometer.look(Chunk(np.arange(part.start, part.stop) * DT, {"temperature": T[part]}))
-            assert (thermometer.changes, thermometer.longest, thermometer.run) == (changes, longest, run)
-
-
 @pytest.mark.parametrize("size", [1, 7000, N])
 def test_a_stuck_one_is_named_where_it_begins(size):
     rows = 20_000 if size > 1 else 3_000
