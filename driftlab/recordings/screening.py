@@ -158,15 +158,19 @@ def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: flo
     """
     suspect = False
     for j in range(values.shape[1]):
-        run, value = carried[j], last[j]
+        run, before = carried[j], last[j]
+        low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
         for k in range(len(values)):
-            run = run + 1.0 if values[k, j] == value else 1.0
             value = values[k, j]
+            if value != before and low < value < high:  # nearly always
+                run, before = 1.0, value
+                continue
+            run, before = run + 1.0 if value == before else 1.0, value
             suspect |= run >= STUCK or abs(value) >= limit
             for side in range(2):
                 reading = value if side == 0 else -value
                 if reading < rails[side, j, 2]:
-                    continue  # nearly always
+                    continue
                 if reading > rails[side, j, 0]:
                     rails[side, j, 2], rails[side, j, 3] = rails[side, j, 0], rails[side, j, 1]
                     rails[side, j, 0], rails[side, j, 1] = reading, 1.0
@@ -176,6 +180,7 @@ def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: flo
                     rails[side, j, 2], rails[side, j, 3] = reading, 1.0
                 else:
                     rails[side, j, 3] += 1.0
+            low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
         runs[j] = run
     return suspect
 
