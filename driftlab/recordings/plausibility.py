@@ -254,7 +254,7 @@ class Thermometer:
     def flush(self) -> None:
         """Look at all that came."""
         if self._rows:
-            self._look(*self._held[:, : self._stop].copy(), self._rows)
+            self._look(self._held[0, : self._stop].copy(), self._held[1, : self._stop].copy(), self._rows)
 
     def _look(self, t: Array, T: Array, new: int) -> None:
         """Look at times and readings, of which the last `new` have not been looked at."""
