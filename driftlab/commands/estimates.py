@@ -208,7 +208,8 @@ class EstimatesWriter:
         """Add the estimates of a stretch, and return them as they are kept."""
         columns: Columns = stretch.columns()
         if self.whiteness is not None:
-            self.whiteness.add(columns["white"][counted(columns, self.journal.alignments[0])].astype(np.float32))
+            after = counted(columns, self.journal.alignments[0])
+            self.whiteness.add(columns["white"][slice(None) if after.all() else after].astype(np.float32))
         columns = at_file_precision(columns, detail=self.whiteness is None)
         self.add(columns)
         if self.spool is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
@@ -228,20 +228,18 @@ def run(
     with output_folder(Path(out), read=understood.files(), resume=resume, force=force) as folder:
         estimates = EstimatesWriter(folder, understood, journal, smooth=smooth, detail=detail)
         before = (estimates.load_checkpoint() or {}).get("run") if resume else None
+        hashed = beforehand(understood.source)
         running = Run(understood, journal, resume=before, settled=estimates.write_checkpoint, keep_model=smooth)
         estimates.open(running.model)
-        hashed: Callable[[], None] | None = None
         with closing(estimates), closing(_segments(running, journal, progress)) as segments, aside() as do:
             for segment in segments:
-                hashed = hashed or beforehand(understood.source)  # not of what has no rows: it may have no end
                 kept = estimates.append(segment)
                 if before is None and not smooth:  # else what the file has by its end is looked at
                     estimates.observed = estimates.observed or accumulator_of(running, estimates.whiteness)
                     do(estimates.observed.add, kept)
         if estimates.spool is not None:
             write_smoothed(folder / "estimates.h5", estimates.spool, running.model, progress)
-        if hashed is not None:
-            hashed()
+        hashed()
         return finish(estimates, running, Path(out), certificate=certificate)
 
 

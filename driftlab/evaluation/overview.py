@@ -98,7 +98,6 @@ class OverviewAccumulator:
         self.start, self._coldest, self._warmest = np.nan, np.inf, -np.inf
         self._scores, self._envelope = ScoreAccumulator(d), Envelope(d)
         self._whiteness = whiteness or Whiteness(model.m)
-        self._least, self._squares, self._counted = np.full(d, np.inf), np.zeros(d), 0
         self._curves, self._last = _Thinned(), Columns()
         self._parts: list[Mapping[str, Array]] = []  # of the next block
         self._waiting: list[Columns] = []  # blocks whose reference is not known yet
@@ -140,9 +139,6 @@ class OverviewAccumulator:
         self._last = _rows(block, len(used) - 1, None)
         errors = errors_of(block, block["reference"])
         self._scores.add(block, errors)
-        sigma = block["bias_sigma"][after]
-        self._least = np.minimum(self._least, np.min(sigma, axis=0, initial=np.inf))
-        self._squares, self._counted = self._squares + np.sum(sigma**2, axis=0), self._counted + len(sigma)
         if "white" in block:
             self._whiteness.add(block["white"][after])
         self._envelope.add(block, errors, after)
@@ -165,7 +161,7 @@ class OverviewAccumulator:
             first_row=self.start if first_row is None else first_row,
             bias=self._last["bias"][-1],
             sigma=self._last["bias_sigma"][-1],
-            deviations=(self._least, np.sqrt(self._squares / max(self._counted, 1))),
+            deviations=(found.least, np.sqrt(found.squares / max(np.sum(found.sums[:, 0]), 1))),
             yardsticks=self._scores.yardsticks(up, model.tracked.axes, model.align),
             nis=nis_test_of(found.nis_total, int(np.sum(found.sums[:, 0])), model.m),
             whiteness_p=self._whiteness.p(),
@@ -251,14 +247,15 @@ def _joined(parts: Sequence[Mapping[str, Array]], names: Iterable[str]) -> Colum
 class Envelope:
     """Smallest and largest error of estimate and prediction, and nis, of STRETCHES to twice as many stretches of rows.
 
-    All are as long; with one more than that, two and two become one.
+    All are as long; with one more than that, two and two become one. Of all rows whose nis counts, `least` and
+    `squares` (d,) are the least deviation of the bias and the sum of their squares.
     """
 
     def __init__(self, d: int) -> None:
         self.at, self.length, K = 0, 1, 2 * STRETCHES
         self.low, self.high = np.full((K, 1 + 2 * d), np.inf), np.full((K, 1 + 2 * d), -np.inf)  # of t and the errors
         self.sums = np.zeros((K, 3))  # of the updates that count: their number, sum of t, sum of nis
-        self.nis_total = self.nis_highest = 0.0
+        self.nis_total, self.nis_highest, self.least, self.squares = 0.0, 0.0, np.full(d, np.inf), np.zeros(d)
 
     def add(self, block: Mapping[str, Array], errors: Array, counts: Flags) -> None:
         """Take the next block with its errors (N, 3 d), NaN where not known; `counts` says whose nis counts."""
@@ -268,8 +265,8 @@ class Envelope:
                 (self.low, np.minimum, np.inf), (self.high, np.maximum, -np.inf), (self.sums, np.add, 0.0),
             ):  # fmt: skip
                 table[:STRETCHES], table[STRETCHES:] = merged(table[::2], table[1::2]), empty
-        tables = self.low, self.high, self.sums
-        total, highest = _take(block["t"], errors, block["nis"], counts, self.at, self.length, *tables)
+        tables = self.at, self.length, self.low, self.high, self.sums, self.least, self.squares
+        total, highest = _take(block["t"], errors, block["nis"], block["bias_sigma"], counts, *tables)
         self.nis_total, self.nis_highest = self.nis_total + total, max(self.nis_highest, highest)
         self.at += len(counts)
 
@@ -289,10 +286,12 @@ class Envelope:
 
 @compiled
 def _take(
-    t: Array, errors: Array, nis: Array, counts: Flags, at: int, length: int, low: Array, high: Array, sums: Array
-) -> tuple[float, float]:
+    t: Array, errors: Array, nis: Array, sigma: Array, counts: Flags, at: int, length: int, low: Array, high: Array,
+    sums: Array, least: Array, squares: Array,
+) -> tuple[float, float]:  # fmt: skip
     """Take rows into the tables of `Envelope`; return the sum and the largest of the nis that count."""
     total = highest = 0.0
+    before, squares[:] = squares.copy(), 0.0
     for k in range(len(t)):
         row = (at + k) // length
         low[row, 0], high[row, 0] = min(low[row, 0], t[k]), max(high[row, 0], t[k])
@@ -304,9 +303,11 @@ def _take(
                 high[row, j] = error
         if counts[k]:
             total, highest = total + nis[k], max(highest, nis[k])
-            sums[row, 0] += 1.0
-            sums[row, 1] += t[k]
-            sums[row, 2] += nis[k]
+            for j, value in enumerate((1.0, t[k], nis[k])):
+                sums[row, j] += value
+            for j in range(len(least)):
+                least[j], squares[j] = min(least[j], sigma[k, j]), squares[j] + sigma[k, j] ** 2
+    squares += before
     return total, highest
 
 
@@ -454,5 +455,5 @@ def accumulator_of(run: Run, whiteness: Whiteness | None = None) -> OverviewAccu
 def scored(run: Run, rows: OverviewAccumulator | Mapping[str, Array]) -> ScoredRun:
     """Return a run with its overview, from its columns or from the accumulator that has seen them all."""
     gathered = rows if isinstance(rows, OverviewAccumulator) else accumulator_of(run).read(rows)
-    overview = gathered.overview(run.journal.faults.first_row)
-    return ScoredRun(run.config, run.model, run.journal, overview, gathered.averages)
+    first = run.journal.faults.first_row
+    return ScoredRun(run.config, run.model, run.journal, gathered.overview(first), gathered.averages)

@@ -68,9 +68,9 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
             yield (whole := concatenate(done))
             previous = whole.last()
     if carry is not None:
-        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, thermometer, previous)]
-        if len(done[0]):
-            yield done[0]
+        part = _integrate(carry, np.zeros(1, dtype=np.int64), pace, thermometer, previous)
+        if len(part):
+            yield part
 
 
 # what compiled functions return takes ten times as long to hand over as what they are given to write to
@@ -113,11 +113,11 @@ def _starts(t: Array, t_0: float, interval: float, last: float, starts: Integers
 def _means(values: Array, weights: Array, starts: Integers, total: Array, means: Array) -> None:
     """Write the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape
-    for k in range(len(starts)):
-        stop = starts[k + 1] if k + 1 < len(starts) else N
+    for k in range(len(starts)):  # of an index without a sign no one asks whether it counts from the end
+        first, stop = np.uint64(starts[k]), np.uint64(starts[k + 1] if k + 1 < len(starts) else N)
         for j in range(d):
-            sum = 0.0
-            for i in range(starts[k], stop):
+            sum = 0.0 + values[first, j] * weights[first]
+            for i in range(first + np.uint64(1), stop):
                 sum += values[i, j] * weights[i]
             means[k, j] = sum / total[k]
 

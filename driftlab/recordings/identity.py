@@ -12,10 +12,12 @@ from typing import Any
 
 from driftlab.config import part_of
 from driftlab.storage.in_memory import InMemoryName
+from fusion_core.budget import COPIED, on_disk
 from fusion_core.contracts import FileSource, Source
 from fusion_core.errors import UnreadableFile
 
 STANDARD_INPUT = Path("-")
+HOLLOW = 100  # times what it takes on its disk: a larger file is little more than a hole
 
 
 def identity(name: str) -> dict[str, Any]:
@@ -51,15 +53,17 @@ def of_source(source: Source) -> dict[str, Any]:
 def beforehand(source: Source | None) -> Callable[[], None]:
     """Begin to hash the file of a source, beside other work; return the function that waits for the end.
 
-    A hash of a day at 1 kHz takes seconds, and the filter leaves a processor idle. What cannot be read is left to
-    whoever needs the hash.
+    A hash of a day at 1 kHz takes seconds, and the start and the filter leave a processor idle. What cannot be read,
+    or is little more than a hole, is left to whoever needs the hash: it may have no row.
     """
-    if not isinstance(source, FileSource):
+    if not isinstance(source, FileSource) or source.path is None:
         return lambda: None
+    path = source.path
 
     def hash_it() -> None:
-        with suppress(UnreadableFile):
-            of_source(source)
+        with suppress(UnreadableFile, OSError):
+            if all(part.stat().st_size <= HOLLOW * on_disk(part) for part in _parts(path)):
+                of_source(source)
 
     thread = Thread(target=hash_it, name="hashing", daemon=True)  # it only reads: it may end with the program
     thread.start()
@@ -105,5 +109,8 @@ def _parts(path: Path) -> list[Path]:
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, changed: int, size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
+        while piece := file.read(2 * COPIED):  # between two of them it waits for its turn beside other threads
+            digest.update(piece)
+    return digest.hexdigest()

@@ -48,9 +48,7 @@ class Copies:
     def look(self, chunk: Chunk, name: str, sensor: Sensor | None) -> None:
         """Look at the next rows of a sensor (N, d)."""
         values = chunk[name]
-        if name not in self._same:
-            self._same[name] = dict.fromkeys(combinations(range(values.shape[1]), 2), 0)
-        same = self._same[name]
+        same = self._same.setdefault(name, dict.fromkeys(combinations(range(values.shape[1]), 2), 0))
         for i, j in list(same):
             if not np.array_equal(values[:100, i], values[:100, j]) or not np.array_equal(values[:, i], values[:, j]):
                 del same[i, j]
@@ -82,9 +80,8 @@ class Rails:
             for axis, (value, count, _, below) in zip(axes_in(sensor, len(side)), side, strict=True):
                 if count >= AT_END * faults.rows and count >= LIVELY and count > STEEP * below:
                     unit, section = ("in SI", "filter.gyro") if sensor is None else (sensor.unit, sensor.section)
-                    why = "as where zero stands for lost samples; name their flag as channel `valid`"
-                    if value != 0:
-                        why = f"as at the end of its range; set {section}.range"
+                    lost = "as where zero stands for lost samples; name their flag as channel `valid`"
+                    why = f"as at the end of its range; set {section}.range" if value != 0 else lost
                     faults.doubt(
                         f"{axis_name(self.name, axis)} shows exactly {sign * value:.6g} {unit}, its "
                         f"{which} reading, in {count:.0f} rows: {why}"
@@ -259,14 +256,13 @@ class Thermometer:
     def flush(self) -> None:
         """Look at all that came."""
         if self._rows:
-            t, T = self._held[:, : self._stop].copy()
-            self._look(t, T, self._rows)
+            self._look(self._held[0, : self._stop].copy(), self._held[1, : self._stop].copy(), self._rows)
 
     def _look(self, t: Array, T: Array, new: int) -> None:
         """Look at times and readings, of which the last `new` have not been looked at."""
         known, self._held[:, 0], self._rows, self._stop = len(t) - new, (t[-1], T[-1]), 0, 1
         steps = np.abs(np.diff(T))
-        self._repeats(t, T, np.flatnonzero(steps) + 1, known)
+        self._repeats(t, T, np.flatnonzero(steps != 0) + 1, known)
         if np.max(steps, initial=0.0) > JUMP:
             self._jumps(t, T, steps)
         self._range(t, T)

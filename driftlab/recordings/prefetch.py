@@ -22,8 +22,7 @@ def prefetch(items: Iterable[Item], depth: int = 2) -> Generator[Item]:
     NumPy, h5py and the compiled loops let both threads run. Close the generator (`contextlib.closing`) where it may
     be left before its end; the second thread ends with the program all the same.
     """
-    queue: Queue[tuple[bool, Any]] = Queue(depth)
-    left = threading.Event()
+    queue, left = Queue[tuple[bool, Any]](depth), threading.Event()
     # no daemon: one that is stopped within a call of h5py keeps its lock, and the end of the program waits for that
     thread = threading.Thread(target=_make, args=(items, queue, left))
     thread.start()

@@ -35,9 +35,8 @@ def read(
     start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     gaps, screen = Gaps(faults), _Screen(faults, sensors or {}, few=few)
     raw = screen.thermometer.along(gaps.along(stream or config.source.chunks(rows, faults)))
-    chunks = usable(raw, faults, config.source.name, start)
     empty, previous = True, None
-    for chunk in chunks:
+    for chunk in usable(raw, faults, config.source.name, start):
         if not DERIVED.isdisjoint(chunk.channels):
             taken = min(DERIVED & set(chunk.channels))
             raise ConfigError(f"channel '{taken}': the program uses this name itself; rename it under source.channels")
@@ -161,15 +160,19 @@ def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: flo
     """
     suspect = False
     for j in range(values.shape[1]):
-        run, value = carried[j], last[j]
+        run, before = carried[j], last[j]
+        low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
         for k in range(len(values)):
-            run = run + 1.0 if values[k, j] == value else 1.0
             value = values[k, j]
+            if value != before and low < value < high:  # nearly always
+                run, before = 1.0, value
+                continue
+            run, before = run + 1.0 if value == before else 1.0, value
             suspect |= run >= STUCK or abs(value) >= limit
             for side in range(2):
                 reading = value if side == 0 else -value
                 if reading < rails[side, j, 2]:
-                    continue  # nearly always
+                    continue
                 if reading > rails[side, j, 0]:
                     rails[side, j, 2], rails[side, j, 3] = rails[side, j, 0], rails[side, j, 1]
                     rails[side, j, 0], rails[side, j, 1] = reading, 1.0
@@ -179,14 +182,14 @@ def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: flo
                     rails[side, j, 2], rails[side, j, 3] = reading, 1.0
                 else:
                     rails[side, j, 3] += 1.0
+            low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
         runs[j] = run
     return suspect
 
 
 def _value_before(chunk: Chunk, name: str) -> Array:
     """Return the value (d,) before the first sample; NaN, which equals nothing, at the start of a recording."""
-    last: Array = chunk[name][0] * np.nan if chunk.previous is None else chunk.previous[name][-1]
-    return last
+    return np.asarray(chunk[name][0] * np.nan if chunk.previous is None else chunk.previous[name][-1])
 
 
 def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:

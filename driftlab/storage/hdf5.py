@@ -139,18 +139,20 @@ class GrowingFile:
         start, whole = written // PIECE * PIECE, end // PIECE * PIECE
         for name, data in self._data.items():
             rows = [*self._begun.get(name, []), *(part[name] for part in parts)]  # from `start` on
+            begins, dtype = np.cumsum([0, *map(len, rows)]).tolist(), data.dtype
             data.id.set_extent((end, *data.shape[1:]))
             for at in range(start, end, PIECE):
-                piece = _joined(rows, at - start, min(at + PIECE, end) - start, data.dtype)
+                piece = _joined(rows, begins, at - start, min(at + PIECE, end) - start, dtype)
                 self._put(name, at, piece, new=at >= written)  # a piece that is there in part keeps its place
-            left = _joined(rows, whole - start, sum(map(len, rows)), data.dtype)
+            left = _joined(rows, begins, whole - start, begins[-1], dtype)
             self._begun[name] = [left.copy() if left.strides[0] else left]
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
         data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
         if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if name in self._settling and new and full and (piece.strides[0] == 0 or np.all(piece[1:] == piece[:-1])):
+        settled = new and full and name in self._settling
+        if settled and (piece.strides[0] == 0 or (np.all(piece[0] == piece[-1]) and np.all(piece[1:] == piece[:-1]))):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
@@ -198,12 +200,11 @@ class GrowingFile:
         self._file.swmr_mode = True
 
 
-def _joined(parts: list[NDArray[Any]], start: int, stop: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _joined(parts: list[NDArray[Any]], begins: list[int], start: int, stop: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return rows of parts that follow one another, row by row in memory; where one stands for all, as one that does.
 
-    Rows of one part are not copied: most pieces are.
+    Each part begins at a row of all. Rows of one part are not copied: most pieces are.
     """
-    begins = np.cumsum([0, *map(len, parts)])
     found = [part[max(start - at, 0) : max(stop - at, 0)] for part, at in zip(parts, begins, strict=False)]
     found = [part for part in found if len(part)] or [parts[0][:0]]
     if len(found[0]) and not any(part.strides[0] or np.any(part[0] != found[0][0]) for part in found):
@@ -219,8 +220,7 @@ def beside(path: Path) -> Path:
 
 def reason(error: BaseException) -> str:
     """Return the reason of an error of the system, or of HDF5, whose texts are long."""
-    number = getattr(error, "errno", None)
-    if number:
+    if number := getattr(error, "errno", None):
         return os.strerror(number)
     message = re.search(r"error message = '([^']*)'", str(error))
     return message[1] if message else str(error)

@@ -99,7 +99,7 @@ class Window:
 
     def cut(self, t: Array) -> slice:
         """Return the rows of the next block that are within the range."""
-        finite = t[np.isfinite(t)]
+        finite = t if np.isfinite(t).all() else t[np.isfinite(t)]
         if len(finite):
             self.first = finite[0] if np.isnan(self.first) else self.first
             self.last = finite[-1]

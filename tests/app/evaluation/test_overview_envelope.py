@@ -9,7 +9,7 @@ from driftlab.evaluation.scores import errors_of
 
 def rows(N, seed=0):
     rng = np.random.default_rng(seed)
-    block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "coast_sigma", "reference")}
+    block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "bias_sigma", "coast_sigma", "reference")}
     return {"t": np.arange(N) / 10.0, "nis": np.ones(N), **block}
 
 
@@ -50,3 +50,14 @@ def test_a_row_without_a_reference_has_no_error_and_hides_no_other():
     inside = (found["t"] > 101) & (found["t"] < 198)
     assert np.all(np.isnan(found["bias"][inside]))
     assert np.all(np.isfinite(found["bias"][(found["t"] < 99) | (found["t"] > 201)]))
+
+
+def test_deviations_are_those_of_the_rows_whose_nis_counts():
+    block, found = rows(5000), Envelope(2)
+    counts = np.random.default_rng(1).random(5000) < 0.3
+    for part in (slice(0, 1), slice(1, 4000), slice(4000, 5000)):
+        some = {name: values[part] for name, values in block.items()}
+        found.add(some, errors_of(some, some["reference"]), counts[part])
+    sigma = block["bias_sigma"][counts]
+    np.testing.assert_array_equal(found.least, sigma.min(axis=0))
+    np.testing.assert_allclose(found.squares, np.sum(sigma**2, axis=0), rtol=1e-12)

@@ -1,9 +1,12 @@
+import os
 import subprocess
 
 import pytest
 
-from driftlab.recordings.identity import identity, of_source, sha256
+from driftlab.recordings import identity as module
+from driftlab.recordings.identity import beforehand, identity, of_source, sha256
 from fusion_core.errors import UnreadableFile
+from fusion_plugins.sources.hdf5 import Hdf5
 from fusion_plugins.sources.rosbag import Rosbag
 
 
@@ -25,6 +28,18 @@ def test_the_hash_of_a_folder_is_that_of_its_list_of_hashes(tmp_path):
     assert identity(str(moved))["sha256"] == found["sha256"]
     (moved / "bag_0.mcap").write_bytes(bytes(999) + b"\1")
     assert identity(str(moved))["sha256"] != found["sha256"]
+
+
+def test_a_hash_begins_beforehand_unless_the_file_is_a_hole(tmp_path, monkeypatch):
+    hashed = []
+    monkeypatch.setattr(module, "sha256", hashed.append)
+    for name, length in (("rows.h5", 0), ("hole.h5", 1 << 30)):
+        path = tmp_path / name
+        path.write_bytes(bytes(range(256)) * 64)
+        if length:
+            os.truncate(path, length)
+        beforehand(Hdf5(path=path, channels={"time": {"path": "t"}}))()
+    assert hashed == [tmp_path / "rows.h5"]
 
 
 @pytest.mark.parametrize("name", ["-", "-::10:20"])
