@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from driftlab.storage.in_memory import CopyName, InMemoryName
+from driftlab.storage.in_memory import CopyName, InMemoryName, MemorySource
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, Stimulus, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, quote
 from fusion_core.escaping import is_plain
@@ -223,6 +223,8 @@ def _undeclared(data: Mapping[str, Any]) -> Iterator[str]:
 def with_recording(config: Config, recording: str) -> Config:
     """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row), or what is held, as source."""
     if isinstance(recording, InMemoryName):
+        if config.filter is not None and isinstance(recording.source, MemorySource):
+            recording.source.check_units(config.filter)
         return config.model_copy(update={"source": recording.source})
     source = config.source
     if source is None:

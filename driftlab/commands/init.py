@@ -134,7 +134,10 @@ def _answers(
     for option, given in (("--column", columns or {}), ("--unit", units or {})):
         for field, value in given.items():
             if field not in FIELDS:
-                raise ConfigError(f"{option} {field}={value}: no channel is called so; known: {', '.join(FIELDS)}")
+                raise ConfigError(
+                    f"{option} {field}={value}: no channel is called so; known: {', '.join(FIELDS)}; name another "
+                    "sensor's in the config that is written"
+                )
     for field, unit in (units or {}).items():
         Channel(path="?", unit=unit).check(field)
     if interval is not None and not to_si(interval, "s") > 0:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import PrivateAttr, computed_field
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import USUAL, Source, Usual
+from fusion_core.contracts import USUAL, MeasurementModel, Source, Usual
 from fusion_core.contracts.table import si_of_channel
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, quote
 from fusion_core.faults import Faults
@@ -36,6 +36,14 @@ class MemorySource(Source):
     units: Mapping[str, str]  # as the samples were given
 
     _samples: Chunk = PrivateAttr()
+    _known: bool = PrivateAttr(default=False)  # to be in SI, as a `Chunk` is
+
+    def check_units(self, model: MeasurementModel) -> None:
+        """Raise UnitError where a sensor that a model follows has no unit, or one of another dimension."""
+        try:
+            model.check_units({} if self._known else {name: self.units.get(name) for name in self._samples.channels})
+        except UnitError as error:
+            raise UnitError(str(error).replace("source.channels.", f"{self.title}: channel ")) from None
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the samples as chunks of at most `size`, in SI units."""
@@ -157,7 +165,7 @@ def in_memory_name(data: Any, units: Mapping[str, str] | None = None, title: str
                 "give channels that were sampled together"
             )
     source = MemorySource(title=title, units=written)
-    source._samples = Chunk(t, values)
+    source._samples, source._known = Chunk(t, values), isinstance(data, Chunk)
     return source
 
 

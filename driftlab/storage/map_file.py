@@ -105,6 +105,8 @@ def _sealed(path: Path, command: str, subject: str) -> Iterator[Path]:
 
 def read_map(path: Path) -> FittedMap:
     """Read the map of a file, of whatever installed kind it is; raises MapError where none can read it."""
+    if path.is_dir():
+        raise MapError(f"map file {path} is a folder; name a file in it")
     if not path.is_file():
         raise MapError(f"map file {path} does not exist; fit it with `driftlab fit-map`")
     why = []

@@ -18,6 +18,8 @@ from driftlab.config import Config, load_config
 from driftlab.errors import BadValue, ConfigError, FusionError, MissingChannel, TimeBackwards, UnitError
 from fusion_core import errors
 from fusion_core.chunk import Chunk
+from fusion_core.contracts import ThermalMap
+from fusion_core.host.registry import registry
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 CONFIG = {"extends": "mems_crs05", "latitude": "40.9 deg", "heading": "0 deg"}
@@ -146,7 +148,7 @@ def test_what_is_given_is_not_changed_and_needs_no_order_in_memory(unit, data):
         (
             lambda d: d.update(v=(d["time"][0], "Volts!")),
             UnitError,
-            "unit 'Volts!' is not known; write it like '0.1 V'",
+            "unit 'Volts!' is not known; write it like 'hPa', 'N' or 'V'",
         ),
         (
             lambda d: d.update(valid=(d["time"][0], "s")),
@@ -173,6 +175,30 @@ def test_data_that_cannot_be_used_is_refused(data, change, error, message):
     with pytest.raises(error, match=message) as raised:
         driftlab.run(CONFIG, data)
     assert error not in {UnitError, BadValue} or f"\n    {raised.value}\n" in LISTED
+
+
+HELD = {"kind": "held", "channel": "pressure", "noise": "2 Pa/sqrt(Hz)",
+        "bias": {"kind": "random_walk", "walk": "0.02 Pa/sqrt(s)"}}  # fmt: skip
+
+
+def test_a_sensor_of_any_unit_needs_one():
+    t = np.arange(400.0)
+    pressure = np.random.default_rng(0).normal(0.0, 2.0, 400)
+    right = driftlab.run({"filter": HELD}, {"time": (t, "s"), "pressure": (pressure / 100, "hPa")})
+    of_chunk = driftlab.run({"filter": HELD}, Chunk(t, {"pressure": pressure}))  # which is in SI
+    np.testing.assert_allclose(right.bias, of_chunk.bias, rtol=1e-12)
+    message = r"data: channel pressure: has no unit, filter\.noise is in Pa/sqrt\(Hz\); write unit: Pa"
+    with pytest.raises(UnitError, match=message) as raised:
+        driftlab.run({"filter": HELD}, {"time": (t, "s"), "pressure": pressure / 100})
+    assert f"\n    {raised.value}\n" in LISTED
+
+
+def test_an_error_shows_a_setting_as_the_function_takes_it(tmp_path):
+    T = np.linspace(0.0, 50.0, 100)
+    polynomial = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "order": 1})
+    polynomial.fit(T, np.outer(T, [1e-5, 2e-5, 3e-5]), {}).save(tmp_path / "map.json")
+    with pytest.raises(ConfigError, match=r"write e\.g\. settings=\{'loss': '1 deg/h'\}"):
+        driftlab.export("c", tmp_path / "map.json", tmp_path / "firmware", settings={"loss": 1.0})
 
 
 def test_rows_that_cannot_be_used_are_left_out_and_told(data, unit):

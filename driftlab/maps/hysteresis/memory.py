@@ -50,7 +50,7 @@ WHY = {
     "is not known; keep what has that period away from the sensor, or go up and down again, at another pace",
     "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
     "its uncertainty; go up and down again, by the same steps",
-    "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C, on axis {axis}, by more than beside it, as in "
+    "narrow": "up and down differ within {width:.2g} K near {T:.3g} °C{axis} by more than beside it, as in "
     "a narrow loop, or where the bias jumped: whether it remembers is not known; go up and down again, by the same "
     "steps",
     "none": "what is between up and down is no more than noise",
@@ -193,7 +193,8 @@ def _narrow(soak: SoakSummary) -> dict[str, Any] | None:
     cell, axis = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
     if not beyond[cell, axis] > NARROW:
         return None
-    name = "xyz"[axis] if soak.bias.shape[1] == 3 else str(axis + 1)
+    d = soak.bias.shape[1]
+    name = "" if d == 1 else f", on axis {'xyz'[axis] if d == 3 else axis + 1},"
     return {"width": float(np.ptp(soak.domain)) / CELLS, "T": float(T[BESIDE + cell]), "axis": name}
 
 
