@@ -164,7 +164,9 @@ class PlacedForces(TriadInput):
         sides = [f"{s}{i}" for s, most in (("+", part.max()), ("-", -part.min())) if most < FACE]
         if sides:
             return f"no placement has {' or '.join(sides)} up; add {'one each' if len(sides) > 1 else 'one'}"
-        return f"{len(up)} placements are too few for all terms; add some in other directions"
+        if self.unsure:
+            return f"gravity is known to {1e6 * self.unsure:.0f} ppm; write latitude, or gravity under stimulus"
+        return "the placements are too few for all terms; add some in other directions"
 
 
 @dataclass(frozen=True, eq=False)

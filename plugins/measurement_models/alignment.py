@@ -190,8 +190,8 @@ def _rate_and_tilt(up: Array, site: Site) -> tuple[Array, Array]:
 def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
     """Return the scatter of the epochs over what the declared noise makes of it, for each sensor (d,).
 
-    The scatter is taken from differences of neighbours (a drift over the stretch does not count); 1 where there are
-    none.
+    The scatter is that of differences of neighbours about their mean, since a temperature that goes on moves the
+    bias; 1 where there are none. The mean of n is of the two ends: it takes 1 / n^2 of their squares.
     """
     ratios, tau = {}, window["tau"]
     root = np.sqrt(1 / tau[1:] + 1 / tau[:-1])[:, None]
@@ -200,6 +200,9 @@ def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
         if len(values) < 2:
             ratios[sensor.channel] = np.ones(values.shape[1])
             continue
-        squares = np.add.reduce(np.square((values[1:] - values[:-1]) / root)) / len(root)
-        ratios[sensor.channel] = np.sqrt(squares) / sensor.noise
+        steps, n = (values[1:] - values[:-1]) / root, len(root)
+        squares = np.add.reduce(np.square(steps)) / n
+        if n > 1:
+            squares = (squares - np.square(np.add.reduce(steps) / n)) / (1 - 1 / n**2)
+        ratios[sensor.channel] = np.sqrt(np.maximum(squares, 0.0)) / sensor.noise
     return ratios
