@@ -117,14 +117,16 @@ def _swept(matrices: Array) -> tuple[Array, Array]:
         for k in range(q):
             pivots[i, k], pivot = S[k, k], 1.0 / S[k, k]
             for m in range(q):
-                row[m] = S[max(k, m), min(k, m)]
+                row[m] = S[k, m] if m < k else S[m, k]
             row[k] = 0.0
             for j in range(q):
                 factor = row[j] * pivot
                 for m in range(j + 1):
                     S[j, m] -= factor * row[m]
-            for m in range(q):
-                S[max(k, m), min(k, m)] = row[m] * pivot
+            for m in range(k):
+                S[k, m] = row[m] * pivot
+            for m in range(k + 1, q):
+                S[m, k] = row[m] * pivot
             S[k, k] = -pivot
         for j in range(q):
             for m in range(j + 1):
@@ -401,17 +403,16 @@ def _nearest(expected: EStep) -> Array:
 
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
-    u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
-    parts: Array = _parts_of_prior(peaks, u, np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9)), *np.exp(numbers))
+    parts: Array = _parts_of_prior(peaks, *np.exp(numbers))
     return parts[0], parts[1:]
 
 
 @compiled
-def _parts_of_prior(
-    peaks: Array, u: Array, shorter: float, a0: float, a1: float, s: float, length: float, r: float
-) -> Array:
-    """Return Psi and its derivatives (6, q, q); k is |T - T'| times `shorter`."""
+def _parts_of_prior(peaks: Array, a0: float, a1: float, s: float, length: float, r: float) -> Array:
+    """Return Psi and its derivatives (6, q, q)."""
     parts = np.empty((6, len(peaks), len(peaks)))
+    u = (peaks - peaks.mean()) / max((peaks.max() - peaks.min()) / 2, 1e-9)
+    shorter = np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9))
     for i in range(len(peaks)):
         for j in range(i + 1):
             distance, tiny = abs(peaks[i] - peaks[j]), 1e-9 if i == j else 0.0

@@ -82,8 +82,9 @@ class SoakRows:
         The level at `start`, by default the first row, is that of the curve; or it is `free`: nothing is known of it,
         as of a further recording of the same unit, and the first time is infinite.
         """
-        dt = np.diff(self.t, prepend=self.t[0] if start is None else start)
-        dt[0] = np.inf if free else dt[0]
+        dt = np.empty(len(self.t))
+        dt[0] = np.inf if free else 0.0 if start is None else self.t[0] - start
+        np.subtract(self.t[1:], self.t[:-1], out=dt[1:])
         return dt
 
     def whitened(self, columns: Array, white: float, walk: float, *, free: bool, start: float | None = None) -> Array:

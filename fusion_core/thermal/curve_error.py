@@ -53,7 +53,8 @@ def nested(modes: Array) -> Modes:
 
 def six_digits(modes: Array) -> Modes:
     """Return modes (r, G, d) as a record holds them, to six digits: a fleet has a map of each unit."""
-    return tuple(tuple(tuple(float(f"{v:.6g}") for v in row) for row in mode) for mode in modes.tolist())
+    text = "%.6g " * modes.size % tuple(modes.ravel().tolist())  # at once it takes two thirds of the time
+    return nested(np.fromstring(text, sep=" ").reshape(modes.shape))
 
 
 def modes_of_axes(per_axis: Sequence[Array]) -> Array:
