@@ -167,14 +167,12 @@ class EStep:
         Weighted sum of the expected outer products of the deviations.
     between : (q, q) array
         Mean over lots of those of their shifts.
-    means : Means
     """
 
     share: Array
     spread: Array
     scatter: Array
     between: Array
-    means: Means
 
     @property
     def dof(self) -> Array:
@@ -284,7 +282,7 @@ def e_step(under: UnitsUnderLaw, w: Array, *, shares: bool = True) -> EStep:
     squares, spread = (np.concatenate(part) for part in zip((w[:0], np.zeros((0, 2))), *rows, strict=True))
     share = squares / np.maximum(spread[:, 0], 1e-12)
     between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
-    return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L))
+    return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T)
 
 
 def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> VarianceComponents:
