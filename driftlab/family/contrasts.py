@@ -138,9 +138,10 @@ class UnitRows:
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]
-        self.Q = [_orthonormal(X) for X in self._white(columns_of(linear, soaked), curves)]
-        bias = self._white([rows.bias[:, :, None] for rows in soaked.recordings])
-        self.r = [y[:, 0] - Q @ (Q.T @ y[:, 0]) for Q, y in zip(self.Q, bias, strict=True)]
+        own = zip(columns_of(linear, soaked), soaked.recordings, strict=True)
+        white = self._white([np.concatenate([X, rows.bias[:, :, None]], axis=2) for X, rows in own], curves)
+        self.Q = [_orthonormal(X[:, :-1]) for X in white]
+        self.r = [X[:, -1] - Q @ (Q.T @ X[:, -1]) for Q, X in zip(self.Q, white, strict=True)]
 
     def contrasts(self, effects: Sequence[Effect], sizes: Sequence[int]) -> EffectContrasts:
         """Return the contrasts for effects, `sizes` coefficients an axis each; 0 where their channels are missing."""
@@ -307,6 +308,7 @@ def _apart(G: Array, b: Array, least: Array) -> Array:
 def _orthonormal(X: Array) -> Array:
     from scipy.linalg import qr
 
-    Q, upper, _ = qr(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300), mode="economic", pivoting=True)
+    ones = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+    Q, upper, _ = qr(ones, mode="economic", pivoting=True, overwrite_a=True, check_finite=False)
     independent = np.abs(np.diag(upper)) > 1e-7
     return np.ascontiguousarray(Q[:, : len(independent)][:, independent])

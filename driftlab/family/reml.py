@@ -378,8 +378,9 @@ def initial_scale(units: Sequence[tuple[Array, Array, Integers]]) -> float:
     own, seen = (np.concatenate(part) for part in zip(*(_alone(J, h) for J, h, _ in units), strict=True))
     own = np.where(seen > 0.01 * np.median(seen), own, np.nan)
     enough = np.sum(np.isfinite(own), axis=0) >= 2
-    middle = np.nanmedian(own[:, enough], axis=0)
-    spread = 1.4826 * float(np.median(np.nanmedian(np.abs(own[:, enough] - middle), axis=0)))
+    median = np.median if np.all(np.isfinite(own)) else np.nanmedian  # which goes coefficient by coefficient
+    middle = median(own[:, enough], axis=0)
+    spread = 1.4826 * float(np.median(median(np.abs(own[:, enough] - middle), axis=0)))
     return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
 
 
