@@ -105,7 +105,7 @@ def arrays_in(content: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _stored(content: bytes, entry: zipfile.ZipInfo) -> bytes:
-    """Return what an archive's entry stores; raises BadZipFile. A file for each, as zipfile has it, takes far longer."""
+    """Return what an archive's entry stores; raises BadZipFile. Files of zipfile take far longer."""
     head = content[entry.header_offset : entry.header_offset + 30]
     begin = entry.header_offset + 30 + sum(int.from_bytes(head[at : at + 2], "little") for at in (26, 28))
     data = content[begin : begin + entry.file_size]
