@@ -308,7 +308,6 @@ def _apart(G: Array, b: Array, least: Array) -> Array:
 def _orthonormal(X: Array) -> Array:
     from scipy.linalg import qr
 
-    ones = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-    Q, upper, _ = qr(ones, mode="economic", pivoting=True, overwrite_a=True, check_finite=False)
+    Q, upper, _ = qr(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300), mode="economic", pivoting=True)
     independent = np.abs(np.diag(upper)) > 1e-7
     return np.ascontiguousarray(Q[:, : len(independent)][:, independent])

@@ -123,10 +123,8 @@ def _swept(matrices: Array) -> tuple[Array, Array]:
                 factor = row[j] * pivot
                 for m in range(j + 1):
                     S[j, m] -= factor * row[m]
-            for m in range(k):
-                S[k, m] = row[m] * pivot
-            for m in range(k + 1, q):
-                S[m, k] = row[m] * pivot
+            for m in range(q):
+                S[max(k, m), min(k, m)] = row[m] * pivot
             S[k, k] = -pivot
         for j in range(q):
             for m in range(j + 1):
@@ -378,9 +376,8 @@ def initial_scale(units: Sequence[tuple[Array, Array, Integers]]) -> float:
     own, seen = (np.concatenate(part) for part in zip(*(_alone(J, h) for J, h, _ in units), strict=True))
     own = np.where(seen > 0.01 * np.median(seen), own, np.nan)
     enough = np.sum(np.isfinite(own), axis=0) >= 2
-    median = np.median if np.all(np.isfinite(own)) else np.nanmedian  # which goes coefficient by coefficient
-    middle = median(own[:, enough], axis=0)
-    spread = 1.4826 * float(np.median(median(np.abs(own[:, enough] - middle), axis=0)))
+    middle = np.nanmedian(own[:, enough], axis=0)
+    spread = 1.4826 * float(np.median(np.nanmedian(np.abs(own[:, enough] - middle), axis=0)))
     return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
 from typing import Any, overload
 
 import numpy as np
@@ -32,7 +31,8 @@ class _FiguresOfRow(Mapping[str, Figure]):
     """Figures of a row by their names, each made when it is asked for: most who go through records ask for none."""
 
     def __init__(self, names: tuple[str, ...], d: int, values: Sequence[float], deviations: Sequence[float]) -> None:
-        self.places, self.columns = _places(names, d), (values, deviations)
+        self.places = {name: slice(k * d, k * d + d) for k, name in enumerate(names)}
+        self.columns = values, deviations
 
     def __getitem__(self, name: str) -> Figure:
         own = (column[self.places[name]] for column in self.columns)
@@ -44,12 +44,6 @@ class _FiguresOfRow(Mapping[str, Figure]):
 
     def __len__(self) -> int:
         return len(self.places)
-
-
-@lru_cache(maxsize=8)
-def _places(names: tuple[str, ...], d: int) -> Mapping[str, slice]:
-    """Return the place of each figure in a row, which many rows have in common."""
-    return {name: slice(k * d, k * d + d) for k, name in enumerate(names)}
 
 
 class UnitRecords:

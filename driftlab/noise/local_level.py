@@ -37,10 +37,8 @@ def whitened(columns: Array, white: Array, walk: Array) -> tuple[Array, Array]:
     walk : (R,) array
         Variance by which the level walks from the row before to each; infinite where it is unknown from there on.
     """
-    R, m = columns.shape
-    out, variances = np.zeros_like(columns), np.full(R, np.inf)
-    x = np.zeros(m)
-    P = 0.0
+    (R, m), P = columns.shape, 0.0
+    out, variances, x = np.zeros_like(columns), np.full(R, np.inf), np.zeros(m)
     for k in range(R):
         P += walk[k]
         if np.isinf(white[k]):

@@ -34,7 +34,7 @@ from driftlab.family.record import PER
 from driftlab.spc.capability import D2, Capability
 from driftlab.spc.subgroups import LotPoint
 from driftlab.units import RATE, BiasUnit
-from fusion_core.chunk import Array, read_only
+from fusion_core.chunk import Array
 
 MIN_UNITS = 10  # for a chart
 LEVEL = "level"
@@ -127,10 +127,14 @@ class ControlChart:
 
     # what follows of the above is computed where it is asked for: of a million units it would be gigabytes
 
+    @lru_cache(maxsize=1)  # noqa: B019  # of the chart that is worked on: its properties ask for them again and again
+    def _figures(self) -> tuple[Array, Array]:
+        return self.figures()
+
     @property
     def value(self) -> Array:
         """Values (m,), SI."""
-        return _known(self.figures)[0]
+        return self._figures()[0]
 
     @property
     def of_family(self) -> bool:
@@ -141,7 +145,7 @@ class ControlChart:
     def sigma(self) -> Array:
         """Deviations (m,) in control, in the scale."""
         # no less than that of values that do not vary
-        return np.maximum(self.law.sigma(_known(self.figures)[1].astype(np.float32).astype(np.float64)), 1e-100)
+        return np.maximum(self.law.sigma(self._figures()[1].astype(np.float32).astype(np.float64)), 1e-100)
 
     @property
     def z(self) -> Array:
@@ -207,13 +211,6 @@ class ControlChart:
             "autocorrelation": self.phi, "changes": changes, "trend": None if self.trend is None else vars(self.trend),
             "lots": [lot.as_json() for lot in self.lots if lot.name],
         }  # fmt: skip
-
-
-@lru_cache(maxsize=1)
-def _known(figures: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Return the figures of the chart that is worked on: its properties ask for them one after the other."""
-    value, own = figures()
-    return read_only(value), read_only(own)
 
 
 @dataclass(frozen=True, eq=False)
