@@ -121,8 +121,7 @@ def own_curve(soaked: UnitInformation) -> Array:
     D = np.diff(np.eye(soaked.knots.q), n=2, axis=0)
     ridge = D.T @ D + 1e-4 * np.eye(soaked.knots.q)
     scales = 1e-4 * np.trace(soaked.J, axis1=1, axis2=2) / soaked.knots.q
-    solved = [np.linalg.solve(J + s * ridge, h) for J, s, h in zip(soaked.J, scales, soaked.h, strict=True)]
-    return np.stack(solved)
+    return np.stack([np.linalg.solve(J + s * ridge, h) for J, s, h in zip(soaked.J, scales, soaked.h, strict=True)])
 
 
 class UnitRows:
@@ -133,8 +132,7 @@ class UnitRows:
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
         self.soaked = soaked
-        low, high = soaked.knots.domain
-        knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
+        knots = SplineBasis.covering(*soaked.knots.domain, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]

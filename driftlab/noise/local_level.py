@@ -112,7 +112,7 @@ class LevelLikelihood:
     def _sums(self, ratio: float) -> tuple[Array, Array]:
         """Return the products (q + d, q + d) of the innovations, whose rows are not kept, and their variances."""
         rows = self.rows(ratio)
-        return sum(X.T @ X for X, _ in rows), np.concatenate([S[np.isfinite(S)] for _, S in rows])
+        return np.asarray(sum(X.T @ X for X, _ in rows)), np.concatenate([S[np.isfinite(S)] for _, S in rows])
 
 
 def walk_of(sensor: Sensor) -> Array | None:
