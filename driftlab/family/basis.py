@@ -65,11 +65,11 @@ class SplineBasis:
         """Return the splines (N, q) at T (N,) degC; beyond the domain those at its ends."""
         x = np.clip(T / self.step - self.first, 0, self.intervals)
         k = np.minimum(x.astype(np.intp), self.intervals - 1)
-        u, rows = x - k, np.arange(len(x))
-        B = np.zeros((len(x), self.q))
+        u, places = x - k, np.arange(len(x)) * self.q + k
+        B = np.zeros(len(x) * self.q)
         for j, spline in enumerate(((1 - u) ** 3, (3 * u - 6) * u**2 + 4, ((3 - 3 * u) * u + 3) * u + 1, u**3)):
-            B[rows, k + j] = spline / 6
-        return B
+            B[places + j] = spline / 6
+        return B.reshape(len(x), self.q)
 
     @lru_cache(maxsize=16)  # noqa: B019  # of a family's knots, which all its units have
     def grid(self, of_interval: int) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ R rows, d axes, K columns of all effects on one axis, J placebos.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -41,7 +42,7 @@ OWN = 0.05  # of e's square, that a placebo shares with no other
 FINER = 2  # splines of a unit's own curve to one of the family's: a kink that the family's cannot follow is no effect
 ROWS = 500  # of a recording: more are averaged
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
-_SMOOTHING = 10.0 ** np.arange(0, 10)  # of third differences
+_SMOOTHING = tuple(10.0 ** np.arange(0, 10))  # of third differences
 LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and the thermometer's noise leave
 
 
@@ -84,15 +85,16 @@ def signatures(effect: Effect, soaked: UnitInformation) -> list[Array]:
     """
     if not effect.acts_on_input:
         return [of_each_axis(effect.signature(chunk, None)[0]) for chunk in chunks_of(soaked)]
-    curve, splines = _own_splines(soaked)
-    lagged = [soaked.knots.values(effect.input(chunk, None)[0]) for chunk in chunks_of(soaked)]
-    return [((there - here) @ curve)[:, :, None] for there, here in zip(lagged, splines, strict=True)]
+    curve, here = _own_curve(soaked)
+    lagged = [soaked.knots.values(effect.input(chunk, None)[0]) @ curve for chunk in chunks_of(soaked)]
+    return [(there - bias)[:, :, None] for there, bias in zip(lagged, here, strict=True)]
 
 
 @lru_cache(maxsize=1)
-def _own_splines(soaked: UnitInformation) -> tuple[Array, list[Array]]:
-    """Return the unit's own curve (q, d), and the splines (R, q) at the temperature of each recording."""
-    return own_curve(soaked).T, [soaked.knots.values(chunk["temperature"]) for chunk in chunks_of(soaked)]
+def _own_curve(soaked: UnitInformation) -> tuple[Array, list[Array]]:
+    """Return the coefficients (q, d) of the unit's own curve, and the curve (R, d) in each recording."""
+    curve = own_curve(soaked).T
+    return curve, [soaked.knots.values(chunk["temperature"]) @ curve for chunk in chunks_of(soaked)]
 
 
 def columns_of(effects: Sequence[Effect], soaked: UnitInformation) -> list[Array]:
@@ -111,8 +113,7 @@ def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> lis
 def of_each_axis(signature: Array) -> Array:
     """Return regressors (N, d, d q), of which each axis has q of its own, as (N, d, q)."""
     N, d, p = signature.shape
-    own = signature.reshape(N, d, d, p // d)
-    return np.ascontiguousarray(own[:, np.arange(d), np.arange(d)])
+    return np.moveaxis(np.diagonal(signature.reshape(N, d, d, p // d), axis1=1, axis2=2), 2, 1)
 
 
 def own_curve(soaked: UnitInformation) -> Array:
@@ -120,8 +121,7 @@ def own_curve(soaked: UnitInformation) -> Array:
     D = np.diff(np.eye(soaked.knots.q), n=2, axis=0)
     ridge = D.T @ D + 1e-4 * np.eye(soaked.knots.q)
     scales = 1e-4 * np.trace(soaked.J, axis1=1, axis2=2) / soaked.knots.q
-    solved = [np.linalg.solve(J + s * ridge, h) for J, s, h in zip(soaked.J, scales, soaked.h, strict=True)]
-    return np.stack(solved)
+    return np.stack([np.linalg.solve(J + s * ridge, h) for J, s, h in zip(soaked.J, scales, soaked.h, strict=True)])
 
 
 class UnitRows:
@@ -132,14 +132,14 @@ class UnitRows:
 
     def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
         self.soaked = soaked
-        low, high = soaked.knots.domain
-        knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
+        knots = SplineBasis.covering(*soaked.knots.domain, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         linear = [one for one in beside if set(one.requires) <= have and not one.acts_on_input]
-        self.Q = [_orthonormal(X) for X in self._white(columns_of(linear, soaked), curves)]
-        bias = self._white([rows.bias[:, :, None] for rows in soaked.recordings])
-        self.r = [y[:, 0] - Q @ (Q.T @ y[:, 0]) for Q, y in zip(self.Q, bias, strict=True)]
+        own = zip(columns_of(linear, soaked), soaked.recordings, strict=True)
+        white = self._white([np.concatenate([X, rows.bias[:, :, None]], axis=2) for X, rows in own], curves)
+        self.Q = [_orthonormal(X[:, :-1]) for X in white]
+        self.r = [X[:, -1] - Q @ (Q.T @ X[:, -1]) for Q, X in zip(self.Q, white, strict=True)]
 
     def contrasts(self, effects: Sequence[Effect], sizes: Sequence[int]) -> EffectContrasts:
         """Return the contrasts for effects, `sizes` coefficients an axis each; 0 where their channels are missing."""
@@ -228,15 +228,15 @@ def without_noise(T: Array) -> Array:
         both = _THIRD[: len(_THIRD) - k] * _THIRD[k:]
         for place, value in enumerate(both):
             bands[-1 - k, place + k : R - len(_THIRD) + 1 + place + k] += value
-    smooth = T
-    for weight in _SMOOTHING:
+
+    def smooth(weight: float) -> Array:
+        """Return the temperatures of the least weighted sum of squares; what is left of T grows with the weight."""
         matrix = weight * bands
         matrix[-1] += 1.0
-        tried = np.asarray(solveh_banded(matrix, T))
-        if np.mean((T - tried) ** 2) > noise:
-            break
-        smooth = tried
-    return smooth
+        return np.asarray(solveh_banded(matrix, T, overwrite_ab=True, check_finite=False))
+
+    k = bisect_right(_SMOOTHING, noise, key=lambda weight: float(np.mean((T - smooth(weight)) ** 2)))
+    return smooth(_SMOOTHING[k - 1]) if k else T
 
 
 def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:

@@ -106,7 +106,8 @@ def fit_some(family: Family, sample: Partitions[OfAxes], lots: Sequence[str], so
     """
     n, counts = len(some), Counter(lots[k] for k in some)
     numbers, laws = numbered(counts, n), map(VarianceComponents, family.Sigma, family.Lambda)
-    fit = partial(_fit_of, sample.parts, some, np.array([numbers[lots[k]] for k in some]), family.knots.peaks)
+    held = [part.read() for part in sample.parts]  # once for all axes
+    fit = partial(_fit_of, held, some, np.array([numbers[lots[k]] for k in some]), family.knots.peaks)
     fits = [fit(axis, law) for axis, law in enumerate(laws)]
     laws_of_some = _laws(fits, [fit.means for fit in fits], {name: (k, counts[name]) for name, k in numbers.items()})
     return family.model_copy(update={"units": n, "sampled": n, **laws_of_some})
@@ -208,11 +209,12 @@ def _stacked(knots: SplineBasis, units: Sequence[UnitOfLot]) -> OfAxes:
 
 
 def _fit_of(
-    sample: Sequence[Partition[OfAxes]], some: Integers | slice, lot: Integers, peaks: Array, axis: int,
+    sample: Sequence[Partition[OfAxes] | OfAxes], some: Integers | slice, lot: Integers, peaks: Array, axis: int,
     law: VarianceComponents | None = None,
 ) -> RemlFit:  # fmt: skip
     """Return the fit of an axis of `some` of a sample, of lots `lot` (n,), from a law on, in parts of SIZE units."""
-    contents = ((own.J[:, axis].copy(), own.h[:, axis]) for own in (part.read() for part in sample))
+    read = (part if isinstance(part, OfAxes) else part.read() for part in sample)
+    contents = ((own.J[:, axis].copy(), own.h[:, axis]) for own in read)
     J, h = (np.concatenate(part)[some] for part in zip(*contents, strict=True))
     cuts = [slice(k, k + SIZE) for k in range(0, len(lot), SIZE)]
     return fit_axis([(J[cut], h[cut], lot[cut]) for cut in cuts], peaks, law)

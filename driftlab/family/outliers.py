@@ -475,11 +475,13 @@ def _smaller(J: Array, h: Array, shapes: DeviationShapes) -> float:
 
     Of an axis in another unit not only the mean is so many times as large, but also what units differ by.
     """
-
-    def cost(times: float) -> float:
-        return _fit(J, h, times * shapes.c, abs(times) * shapes.L, shapes.level[:, None] / times)[0]
-
-    return float(min([*SMALL, *-SMALL], key=cost))
+    c, L, times = shapes.c, shapes.L, np.concatenate([SMALL, -SMALL])
+    gain, U = np.linalg.eigh(L.T @ J @ L)  # in whose coordinates M of every factor is diagonal
+    t, (of_h, of_mean, g) = times[:, None], (U.T @ own for own in (L.T @ h, L.T @ (J @ c), shapes.level))
+    M, a = 1 + t**2 * gain, np.abs(t) * (of_h - t * of_mean)
+    of_level = np.sum(g * a / M, axis=1) ** 2 / np.sum(g**2 * (1 - 1 / M), axis=1)
+    cost = times**2 * (c @ J @ c) - 2 * times * (h @ c) + np.sum(np.log(M) - a**2 / M, axis=1) - of_level
+    return float(times[np.argmin(cost)])
 
 
 def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tuple[float, Array, CurveDeviation]:
@@ -488,8 +490,7 @@ def _fit(J: Array, h: Array, c: Array, L: Array, g: Array | None = None) -> tupl
     Beside it these sizes (G,), and the deviation of the coefficients that is left.
     """
     M = np.eye(L.shape[1]) + L.T @ J @ L
-    V = inverse(M)
-    a = L.T @ (h - J @ c)
+    V, a = inverse(M), L.T @ (h - J @ c)
     z, K = V @ a, np.eye(len(a)) - V
     cost = float(c @ J @ c - 2 * h @ c - a @ z + np.linalg.slogdet(M)[1])
     if g is None:

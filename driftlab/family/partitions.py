@@ -135,16 +135,17 @@ class InFile:
 
 @dataclass(frozen=True, eq=False)
 class ChosenUnits:
-    """Some of the units of partitions, by their places in each."""
+    """Some of the units of partitions: of each its partition, none of which is of chosen ones, and its place there."""
 
-    sources: tuple[tuple[Partition[Sequence[UnitOfLot]], tuple[int, ...]], ...]
+    units: tuple[tuple[Partition[Sequence[UnitOfLot]], int], ...]
 
     def __len__(self) -> int:
-        return sum(len(places) for _, places in self.sources)
+        return len(self.units)
 
     def read(self) -> list[UnitOfLot]:
-        """Return the units."""
-        return [content[k] for part, places in self.sources for content in [part.read()] for k in places]
+        """Return the units; of those in folders no others are read."""
+        contents = {id(part): part.read() for part in {id(part): part for part, _ in self.units}.values()}
+        return [contents[id(part)][k] for part, k in self.units]
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +200,13 @@ class Partitions(Generic[C]):
         starts = [*accumulate(map(len, self.parts), initial=0)]
         at = 0
         while some := list(islice(left, size)):
-            sources: dict[int, list[int]] = {}
+            units = []
             for place in some:
                 while place >= starts[at + 1]:
                     at += 1
-                sources.setdefault(at, []).append(place - starts[at])
-            parts.append(ChosenUnits(tuple((self.parts[k], tuple(own)) for k, own in sources.items())))
+                part, k = self.parts[at], place - starts[at]
+                units.append(part.units[k] if isinstance(part, ChosenUnits) else (part, k))
+            parts.append(ChosenUnits(tuple(units)))
         return Partitions(parts, self.engine, self.scratch)
 
     def read(self: Partitions[Sequence[UnitOfLot]]) -> Iterator[UnitOfLot]:

@@ -117,7 +117,7 @@ def _swept(matrices: Array) -> tuple[Array, Array]:
         for k in range(q):
             pivots[i, k], pivot = S[k, k], 1.0 / S[k, k]
             for m in range(q):
-                row[m] = S[max(k, m), min(k, m)]
+                row[m] = S[k, m] if m < k else S[m, k]
             row[k] = 0.0
             for j in range(q):
                 factor = row[j] * pivot
@@ -165,14 +165,12 @@ class EStep:
         Weighted sum of the expected outer products of the deviations.
     between : (q, q) array
         Mean over lots of those of their shifts.
-    means : Means
     """
 
     share: Array
     spread: Array
     scatter: Array
     between: Array
-    means: Means
 
     @property
     def dof(self) -> Array:
@@ -282,7 +280,7 @@ def e_step(under: UnitsUnderLaw, w: Array, *, shares: bool = True) -> EStep:
     squares, spread = (np.concatenate(part) for part in zip((w[:0], np.zeros((0, 2))), *rows, strict=True))
     share = squares / np.maximum(spread[:, 0], 1e-12)
     between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
-    return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L))
+    return EStep(share, spread, L @ scatter @ L.T, L @ between @ L.T)
 
 
 def m_step(expected: EStep, w: Array, Psi: Array | None, *, lots: bool) -> VarianceComponents:
@@ -401,17 +399,16 @@ def _nearest(expected: EStep) -> Array:
 
 def smooth(peaks: Array, numbers: Array) -> tuple[Array, Array]:
     """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r, and its derivatives (5, q, q) by these."""
-    u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
-    parts: Array = _parts_of_prior(peaks, u, np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9)), *np.exp(numbers))
+    parts: Array = _parts_of_prior(peaks, *np.exp(numbers))
     return parts[0], parts[1:]
 
 
 @compiled
-def _parts_of_prior(
-    peaks: Array, u: Array, shorter: float, a0: float, a1: float, s: float, length: float, r: float
-) -> Array:
-    """Return Psi and its derivatives (6, q, q); k is |T - T'| times `shorter`."""
+def _parts_of_prior(peaks: Array, a0: float, a1: float, s: float, length: float, r: float) -> Array:
+    """Return Psi and its derivatives (6, q, q)."""
     parts = np.empty((6, len(peaks), len(peaks)))
+    u = (peaks - peaks.mean()) / max((peaks.max() - peaks.min()) / 2, 1e-9)
+    shorter = np.sqrt(3.0) / (3 * max(peaks[1] - peaks[0], 1e-9))
     for i in range(len(peaks)):
         for j in range(i + 1):
             distance, tiny = abs(peaks[i] - peaks[j]), 1e-9 if i == j else 0.0

@@ -31,10 +31,8 @@ class _FiguresOfRow(Mapping[str, Figure]):
     """Figures of a row by their names, each made when it is asked for: most who go through records ask for none."""
 
     def __init__(self, names: tuple[str, ...], d: int, values: Sequence[float], deviations: Sequence[float]) -> None:
-        self.places, self.columns = (
-            {name: slice(k * d, k * d + d) for k, name in enumerate(names)},
-            (values, deviations),
-        )
+        self.places = {name: slice(k * d, k * d + d) for k, name in enumerate(names)}
+        self.columns = values, deviations
 
     def __getitem__(self, name: str) -> Figure:
         own = (column[self.places[name]] for column in self.columns)

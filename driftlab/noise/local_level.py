@@ -37,10 +37,8 @@ def whitened(columns: Array, white: Array, walk: Array) -> tuple[Array, Array]:
     walk : (R,) array
         Variance by which the level walks from the row before to each; infinite where it is unknown from there on.
     """
-    R, m = columns.shape
-    out, variances = np.zeros_like(columns), np.full(R, np.inf)
-    x = np.zeros(m)
-    P = 0.0
+    (R, m), P = columns.shape, 0.0
+    out, variances, x = np.zeros_like(columns), np.full(R, np.inf), np.zeros(m)
     for k in range(R):
         P += walk[k]
         if np.isinf(white[k]):
@@ -102,15 +100,19 @@ class LevelLikelihood:
         return self._over(ratios)[:2]
 
     def _over(self, ratios: Sequence[float] | Array) -> tuple[Array, Array, int]:
-        q, each = self.q, [self.rows(ratio) for ratio in ratios]
-        N = np.stack([sum(X.T @ X for X, _ in rows) for rows in each])
-        variances = np.stack([np.concatenate([S[np.isfinite(S)] for _, S in rows]) for rows in each])
+        q, sums = self.q, [self._sums(ratio) for ratio in ratios]
+        N, variances = (np.stack(part) for part in zip(*sums, strict=True))
         L, nu = np.linalg.cholesky(N[:, :q, :q]), max(variances.shape[1] - q, 1)
         taken = np.linalg.solve(L, N[:, :q, q:])
         squares = np.diagonal(N, axis1=1, axis2=2)[:, q:] - np.sum(taken**2, axis=1)
         s2 = np.maximum(squares, np.finfo(float).tiny) / nu
         free = 2 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)), axis=1)
         return nu * np.log(s2) + (np.sum(np.log(variances), axis=1) + free)[:, None], s2, nu
+
+    def _sums(self, ratio: float) -> tuple[Array, Array]:
+        """Return the products (q + d, q + d) of the innovations, whose rows are not kept, and their variances."""
+        rows = self.rows(ratio)
+        return np.asarray(sum(X.T @ X for X, _ in rows)), np.concatenate([S[np.isfinite(S)] for _, S in rows])
 
 
 def walk_of(sensor: Sensor) -> Array | None:

@@ -179,5 +179,5 @@ def _fan(overview: FleetOverview, bands: Array, curves: Any, mean: Array | None,
 
 def percentiles(curves: Any) -> Array:
     """Return percentiles SHARES (5, d, G) of curves (U, d, G), an axis at a time."""
-    bands = [np.nanpercentile(curves[:, k], SHARES, axis=0) for k in range(curves.shape[1])]
-    return np.stack(bands, axis=1).astype(np.float64)
+    of_all = np.percentile if np.all(np.isfinite(curves)) else np.nanpercentile  # which goes temperature by temperature
+    return np.stack([of_all(own, SHARES, axis=0) for own in curves.swapaxes(0, 1)], axis=1).astype(np.float64)

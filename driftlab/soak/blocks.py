@@ -82,9 +82,8 @@ class SoakRows:
         The level at `start`, by default the first row, is that of the curve; or it is `free`: nothing is known of it,
         as of a further recording of the same unit, and the first time is infinite.
         """
-        dt = np.diff(self.t, prepend=self.t[0] if start is None else start)
-        dt[0] = np.inf if free else dt[0]
-        return dt
+        first = np.inf if free else 0.0 if start is None else self.t[0] - start
+        return np.concatenate([[first], np.diff(self.t)])
 
     def whitened(self, columns: Array, white: float, walk: float, *, free: bool, start: float | None = None) -> Array:
         """Return columns (R, m) over the rows as normalised innovations.

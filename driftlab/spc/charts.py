@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
@@ -126,10 +127,14 @@ class ControlChart:
 
     # what follows of the above is computed where it is asked for: of a million units it would be gigabytes
 
+    @lru_cache(maxsize=1)  # noqa: B019  # of the chart that is worked on: its properties ask for them again and again
+    def _figures(self) -> tuple[Array, Array]:
+        return self.figures()
+
     @property
     def value(self) -> Array:
         """Values (m,), SI."""
-        return self.figures()[0]
+        return self._figures()[0]
 
     @property
     def of_family(self) -> bool:
@@ -140,7 +145,7 @@ class ControlChart:
     def sigma(self) -> Array:
         """Deviations (m,) in control, in the scale."""
         # no less than that of values that do not vary
-        return np.maximum(self.law.sigma(self.figures()[1].astype(np.float32).astype(np.float64)), 1e-100)
+        return np.maximum(self.law.sigma(self._figures()[1].astype(np.float32).astype(np.float64)), 1e-100)
 
     @property
     def z(self) -> Array:

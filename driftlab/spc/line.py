@@ -161,8 +161,7 @@ def _control(
     whole = in_control(x, own).sigma(own) if len(x) >= MIN_UNITS else np.zeros(len(x))  # no change is looked for
     course = course_of(x, whole, alpha, _runs(lots.tolist()))
     level_steps, trend = course.steps, _trend(course, scale)
-    edges = [0, *(step.at for step in level_steps), len(x)]
-    stretches = list(pairwise(edges))
+    stretches = list(pairwise([0, *(step.at for step in level_steps), len(x)]))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop]) if frozen is None else frozen
     sigma = np.maximum(law.sigma(own.astype(np.float32).astype(np.float64)), 1e-100)  # of values that do not vary
@@ -187,8 +186,7 @@ def _multivariate(line: LineReport) -> tuple[TSquaredChart, ...]:
         at = np.flatnonzero(np.isfinite(value))
         if not len(at):
             continue
-        some = (value[at], limit[at], contributions[at])
-        result.append(TSquaredChart(together.axis, together.quantities, at, *some))
+        result.append(TSquaredChart(together.axis, together.quantities, at, value[at], limit[at], contributions[at]))
     return tuple(result)
 
 
@@ -278,14 +276,12 @@ def _trend(course: Course, scale: ChartScale) -> Trend | None:
     if course.slope is None:
         return None
     middle, half = course.slope.tolist()
-    before, after = scale.back(np.array([middle - half, middle + half])).tolist()
-    return Trend(before, after)
+    return Trend(*scale.back(np.array([middle - half, middle + half])).tolist())
 
 
 def _runs(lots: list[str]) -> list[tuple[int, int]]:
     """Return from where to where units in a row are of one lot."""
-    edges = [0, *(k for k in range(1, len(lots)) if lots[k] != lots[k - 1]), len(lots)]
-    return list(pairwise(edges))
+    return list(pairwise([0, *(k for k in range(1, len(lots)) if lots[k] != lots[k - 1]), len(lots)]))
 
 
 def _changes(

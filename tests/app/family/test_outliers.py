@@ -12,8 +12,18 @@ from numpy.testing import assert_allclose
 
 from driftlab.family.file import load_family, save_family
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.outlier_tests import CurveStatistics
-from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_outliers, simes
+from driftlab.family.outlier_tests import CurveStatistics, DeviationShapes
+from driftlab.family.outliers import (
+    SMALL,
+    CurveReasons,
+    Outlier,
+    _fit,
+    _smaller,
+    chosen,
+    describe,
+    find_outliers,
+    simes,
+)
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.tail_law import TailLaw, standardised
@@ -286,6 +296,19 @@ def test_an_axis_in_another_unit_is_named_with_its_factor(times: float) -> None:
     (reason,) = CurveReasons(CurveStatistics(family, fitted=False), laws).of(*family.information_of(scaled), "", (0,))
     assert reason.what == "scale"
     assert 0.3 < reason.times / times < 3.0
+
+
+@pytest.mark.parametrize("seen", [slice(0, None), slice(3, None)])
+def test_the_factor_of_a_small_axis_is_the_likeliest_of_fits_one_by_one(seen: slice) -> None:
+    rng = np.random.default_rng(34)
+    for times in (*rng.uniform(0.001, 0.24, 20), *rng.uniform(-0.24, -0.001, 20)):
+        B, L, c = rng.normal(size=(30, 8)), np.linalg.cholesky(0.4 * np.eye(8) + 0.6), 3 * rng.normal(size=8)
+        rows = np.zeros((30, 8))
+        rows[:, seen] = 100 * B[:, seen]
+        J, level = rows.T @ rows, np.linalg.solve(L, np.ones(8))
+        h = times * J @ (c + L @ rng.normal(size=8)) + rows.T @ rng.normal(size=30)
+        fits = {t: _fit(J, h, t * c, abs(t) * L, level[:, None] / t)[0] for t in (*SMALL, *-SMALL)}
+        assert _smaller(J, h, DeviationShapes(c, L, level, level, level[:, None])) == min(fits, key=fits.__getitem__)
 
 
 def test_a_unit_that_disagrees_with_itself_is_named() -> None:

@@ -60,6 +60,30 @@ def test_partitions_of_units_have_their_part_of_what_is_sent(units: list[partiti
     assert [soaked.unit for soaked, _ in some.read()] == [names[k] for k in (3, 8, 9, 22, 59)]
 
 
+class _Counted(list[partitions.UnitOfLot]):
+    """Units that are read one by one, and know which."""
+
+    read: list[str]
+
+    def __getitem__(self, k: int) -> partitions.UnitOfLot:  # type: ignore[override]
+        unit = super().__getitem__(k)
+        self.read.append(unit[0].unit)
+        return unit
+
+
+def test_of_units_that_are_chosen_among_chosen_ones_no_others_are_read(units: list[partitions.UnitOfLot]) -> None:
+    contents = [_Counted(units[k : k + 7]) for k in range(0, 60, 7)]
+    read: list[str] = []
+    for content in contents:
+        content.read = read
+    parts = Partitions([InMemory(content, len(content)) for content in contents])
+    some = parts.chosen(range(0, 60, 3), 8).chosen([1, 9, 10], 2)
+    assert [len(part) for part in some.parts] == [2, 1]
+    assert read == []
+    expected = [units[k][0].unit for k in (3, 27, 30)]
+    assert [soaked.unit for soaked, _ in some.read()] == expected == read
+
+
 def _with_names(own: list[partitions.UnitOfLot], names: list[str], places: np.ndarray) -> list[tuple[str, str, int]]:
     return [(soaked.unit, name, int(k)) for (soaked, _), name, k in zip(own, names, places, strict=True)]
 
@@ -94,12 +118,13 @@ def test_sums_of_partitions_of_any_size_agree(units: list[partitions.UnitOfLot])
     found = []
     for size in (1, 7, 60):
         cuts = [slice(k, k + size) for k in range(0, 60, size)]
-        found.append(e_step(UnitsUnderLaw(law, [(J[cut, 1], h[cut, 1], lot[cut]) for cut in cuts]), w))
-    for other in found[1:]:
+        under = UnitsUnderLaw(law, [(J[cut, 1], h[cut, 1], lot[cut]) for cut in cuts])
+        found.append((e_step(under, w), under.means(w)))
+    for other, means in found[1:]:
         for name in ("share", "spread", "scatter", "between"):
-            one = getattr(found[0], name)
+            one = getattr(found[0][0], name)
             assert_allclose(getattr(other, name), one, rtol=1e-9, atol=1e-9 * np.max(np.abs(one)))
-        assert_allclose(other.means.mu, found[0].means.mu, rtol=1e-9)
+        assert_allclose(means.mu, found[0][1].mu, rtol=1e-9)
 
 
 def test_families_of_partitions_of_any_size_are_the_same(units: list[partitions.UnitOfLot]) -> None:

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from driftlab.family.contrasts import OWN, PLACEBOS, _placebos
 from driftlab.family.reml import (
-    EStep,
+    Means,
     UnitsUnderLaw,
     VarianceComponents,
     _log_det,
@@ -25,8 +25,8 @@ from driftlab.family.reml import (
 
 def reml(
     J: np.ndarray, h: np.ndarray, lot: np.ndarray, start: VarianceComponents, *, tolerance: float, most: int = 2000
-) -> tuple[VarianceComponents, EStep]:
-    """Return the law of highest restricted likelihood, every unit's weight 1, and the expectations under it."""
+) -> tuple[VarianceComponents, Means]:
+    """Return the law of highest restricted likelihood, every unit's weight 1, and the means under it."""
     w, lots = np.ones(len(J)), int(lot.max()) > 0
     law = start if lots else replace(start, Lambda=np.zeros_like(start.Sigma))
     units = [(J[k : k + 90], h[k : k + 90], lot[k : k + 90]) for k in range(0, len(J), 90)]
@@ -35,7 +35,8 @@ def reml(
         law, moved = later, change(law, later)
         if moved < tolerance:
             break
-    return law, e_step(UnitsUnderLaw(law, units), w)
+    under = UnitsUnderLaw(law, units)
+    return law, under.means(w).turned(under.L)
 
 
 def dense(y: np.ndarray, X: list[np.ndarray], noise: float, Sigma: np.ndarray) -> float:
@@ -80,8 +81,8 @@ def test_it_is_the_restricted_maximum_of_statsmodels() -> None:
         J, h, np.zeros(len(X), dtype=int), VarianceComponents(np.eye(2), np.zeros((2, 2))), tolerance=1e-9
     )
     assert_allclose(law.Sigma, np.asarray(theirs.cov_re), rtol=2e-3)
-    assert_allclose(found.means.mu, theirs.fe_params, rtol=1e-4)
-    assert_allclose(found.means.covariance, np.asarray(theirs.cov_params())[:2, :2], rtol=2e-3)
+    assert_allclose(found.mu, theirs.fe_params, rtol=1e-4)
+    assert_allclose(found.covariance, np.asarray(theirs.cov_params())[:2, :2], rtol=2e-3)
 
 
 def test_it_maximises_the_dense_likelihood_though_a_unit_saw_one_place() -> None:
@@ -110,7 +111,7 @@ def test_the_mean_without_its_uncertainty_would_make_units_too_alike() -> None:
         J, 1e12 * c, np.zeros(5, dtype=int), VarianceComponents(np.eye(2), np.zeros((2, 2))), tolerance=1e-10
     )
     assert_allclose(law.Sigma, np.cov(c.T), rtol=1e-6)
-    assert_allclose(found.means.covariance, np.cov(c.T) / 5, rtol=1e-5)
+    assert_allclose(found.covariance, np.cov(c.T) / 5, rtol=1e-5)
 
 
 def test_lots_are_random_effects() -> None:
@@ -126,7 +127,7 @@ def test_lots_are_random_effects() -> None:
     assert_allclose(law.Sigma[0, 0], within, rtol=1e-3)
     assert_allclose(law.Lambda[0, 0], between, rtol=1e-2)
     shrunk = (np.array([y[lot == g].mean() for g in range(lots)]) - y.mean()) * between / (between + within / each)
-    assert_allclose(found.means.shifts[:, 0], shrunk, rtol=2e-2, atol=1e-2)
+    assert_allclose(found.shifts[:, 0], shrunk, rtol=2e-2, atol=1e-2)
 
 
 def covariances(n: int, q: int, condition: float) -> np.ndarray:
