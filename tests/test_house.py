@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4109
+    assert 0 < count <= 4127
 
 
 def imports():
@@ -256,38 +256,38 @@ def test_tests_mirror_the_tree():
 
 
 BUDGET = {
-    "driftlab": 634,
-    "driftlab/commands": 3817,
+    "driftlab": 639,
+    "driftlab/commands": 3826,
     "driftlab/evaluation": 1610,
     "driftlab/family": 3410,
-    "driftlab/filtering": 1312,
+    "driftlab/filtering": 1322,
     "driftlab/identification": 2345,
     "driftlab/live": 844,
-    "driftlab/maps": 2085,
-    "driftlab/noise": 1544,
+    "driftlab/maps": 2094,
+    "driftlab/noise": 1550,
     "driftlab/planning": 1261,
     "driftlab/production": 3222,
     "driftlab/products": 6,
-    "driftlab/recordings": 743,
+    "driftlab/recordings": 747,
     "driftlab/reports": 3561,
-    "driftlab/soak": 888,
+    "driftlab/soak": 890,
     "driftlab/spc": 1686,
     "driftlab/starter": 927,
-    "driftlab/storage": 1275,
+    "driftlab/storage": 1283,
     "driftlab/triad": 717,
     "fusion_core": 1978,
-    "fusion_core/contracts": 1993,
-    "fusion_core/fast": 861,
+    "fusion_core/contracts": 1994,
+    "fusion_core/fast": 860,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1288,
+    "fusion_core/thermal": 1307,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 251,
     "plugins/effects": 711,
     "plugins/exporters": 1720,
     "plugins/framings": 625,
-    "plugins/measurement_models": 748,
+    "plugins/measurement_models": 751,
     "plugins/sources": 5478,
     "plugins/stimuli": 298,
     "plugins/thermal_maps": 889,

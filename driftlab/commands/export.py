@@ -234,7 +234,7 @@ def _sensitivities(kind: str, what: Export) -> Iterator[str]:
 
 
 def _shown_by_soaks(what: Export) -> Iterator[str]:
-    """Yield what the soaks of maps showed, and neither curve nor sigma has."""
+    """Yield the differences between up and down that soaks of maps showed, and neither curve nor sigma has."""
     for sensor in what.sensors:
         unit = BiasUnit(sensor.unit, sensor.shown)
         if sensor.map is not None and (text := shown_by_soak(sensor.map, sensor.axes, unit)):

@@ -45,7 +45,7 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
 
 
 def shown_by_soak(fitted: FittedMap, axes: Sequence[str], unit: BiasUnit) -> str:
-    """Return what the soak of a map showed and no sigma of its curve has, as the end of a sentence; empty: nothing."""
+    """Return the difference between up and down of a map's soak, which no sigma has, as the end of a sentence."""
     memory = fitted.record.memory or {}
     size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
     likely = memory.get("answer") == "undecided" and (memory.get("log_evidence") or 0.0) > SEEN
