@@ -125,12 +125,12 @@ def _with_spread(fitted: FittedMap, memory: MemoryVerdict) -> FittedMap:
 
 
 def _likelier(error: SingularFit | SwingTooSmall, soak: GatheredSoak) -> str:
-    """Return the text of an error with what is likelier its cause: first that most is not used, then the length."""
+    """Return the text of an error with likelier causes: most is not used, it is in doubt, the length is wrong."""
     unused, lasts = soak.used.sentence(), duration(soak.interval * len(soak.T))
     if soak.used.share > MOST:
         left = str(error).partition(";")[0]  # which says what to do about the soak, and that is not at fault
         return f"{unused}; the {lasts} that are left are too few ({left}); see why, or record again"
-    text = f"{error}; {unused}" if unused else str(error)
+    text = "; ".join([str(error), *soak.doubts[-1:], *([unused] if unused else [])])
     if isinstance(error, SingularFit):
         return text
     correct = "where length or swing are not what was recorded, correct unit and path of time and temperature"
@@ -249,6 +249,7 @@ class GatheredSoak:
     used: Used = field(default_factory=Used)  # share of the recordings that they are
     steps: Steps = NO_STEPS  # of the thermometer
     off: Array | None = None  # (N,): how far T may be off between them (`between_steps`), K^2 s
+    doubts: tuple[str, ...] = ()  # whether the recordings are what their config says
 
     @cached_property
     def summary(self) -> SoakSummary:
@@ -353,6 +354,7 @@ def gather(
         used,
         steps,
         off,
+        tuple(faults.doubts),
     )
 
 

@@ -7,6 +7,7 @@ What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import combinations
 
@@ -228,6 +229,7 @@ class Thermometer:
         self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
         self.fast = self.odd = False  # whether it has moved faster than any, and shown what no soak has
         self.impossible: set[float] = set()  # readings below absolute zero: one or two of a logger that has none
+        self.alone = Counter[float]()  # readings between others that are far off them, and near one another
 
     def along(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         """Pass the rows of a source on, and look for readings below absolute zero that change as readings do."""
@@ -257,6 +259,11 @@ class Thermometer:
         """Look at all that came."""
         if self._rows:
             self._look(self._held[0, : self._stop].copy(), self._held[1, : self._stop].copy(), self._rows)
+        for value, count in self.alone.most_common(1):
+            self.faults.doubt(
+                f"temperature is {value:.6g} °C in {count} rows, alone between others, as of a thermometer that has no "
+                "reading; leave such rows out, by a channel `valid` that is zero there"
+            )
 
     def _look(self, t: Array, T: Array, new: int) -> None:
         """Look at times and readings, of which the last `new` have not been looked at."""
@@ -287,7 +294,11 @@ class Thermometer:
 
     def _jumps(self, t: Array, T: Array, steps: Array) -> None:
         usual = float(np.median(steps[steps > 0]))
-        for k in np.flatnonzero((steps > max(JUMP, USUAL * usual)) & (steps > FASTEST * np.diff(t)))[:1]:
+        beyond = (steps > max(JUMP, USUAL * usual)) & (steps > FASTEST * np.diff(t))
+        back = np.flatnonzero(beyond[:-1] & beyond[1:] & (np.abs(T[2:] - T[:-2]) < JUMP))
+        self.alone.update(T[back + 1].tolist())
+        beyond[back] = beyond[back + 1] = False
+        for k in np.flatnonzero(beyond)[:1]:
             self.faults.doubt(
                 f"temperature jumps from {T[k]:.4g} to {T[k + 1]:.4g} °C within {t[k + 1] - t[k]:.3g} s at "
                 f"{self.faults.when(t[k + 1])}, as no body does; leave that part out, or correct the thermometer"

@@ -29,6 +29,8 @@ from fusion_core.errors import ConfigError
 from fusion_core.escaping import line
 from fusion_core.thermal.triad_matrix import TriadMatrix
 
+CLOSER = 10  # times TEMPERATURES, at which a loss is looked at: its largest lies between the knots of a target's table
+
 
 @dataclass(frozen=True)
 class ReadBack:
@@ -202,7 +204,7 @@ class SensorLoss:
         domain = sensor.fitted.domain
 
         def over(ends: tuple[float, float]) -> Deviation:
-            T = np.linspace(*ends, TEMPERATURES)
+            T = np.linspace(*ends, CLOSER * TEMPERATURES)
             return Deviation.of(target(T) - sensor.fitted.bias(T))
 
         recording = warm_up(domain)
