@@ -49,7 +49,7 @@ __all__ = [
 ]  # fmt: skip
 
 OPTIONS = {"input": "data", "select": "neurons", "set": "settings", "unit": "units"}  # where an argument's name differs
-OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)(?: '([\w-]+)=([^']+)'|( (?=')|\b))")
+OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)(?: '([\w.-]+)=([^']+)'|( (?=')|\b))")
 ALIASES = {"Place": "str | PathLike", "Units": "Mapping", "Progress": "Callable"}
 
 
@@ -94,7 +94,7 @@ def as_function(function: Function) -> Function:
         name = option[1].replace("-", "_")
         name = name if name in known else OPTIONS.get(name, "")
         if name in known and option[2]:
-            mapping = "Mapping" in str(known[name].annotation)
+            mapping = re.search("Mapping|Units", str(known[name].annotation))
             return f"{name}=" + (f"{{{option[2]!r}: {option[3]!r}}}" if mapping else f"'{option[2]}={option[3]}'")
         return f"{name}{'=' if option[4] else ''}" if name in known else option[0]
 

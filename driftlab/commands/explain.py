@@ -17,7 +17,7 @@ from driftlab import __version__
 from driftlab.commands.console import print_verdict, say, terminal
 from driftlab.commands.inputs import ConfigLike, DataLike, Place, Units, config_of, recordings_of
 from driftlab.commands.result import Result, in_folder
-from driftlab.config import Config, load_config, part_of, paths_of, with_recording
+from driftlab.config import Config, load_config, paths_of, with_recording
 from driftlab.evaluation.limits import LimitResult, least_kept, verdict
 from driftlab.evaluation.overview import ScoredRun, scored
 from driftlab.evaluation.scores import moving_average
@@ -31,13 +31,12 @@ from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
 from driftlab.recordings.epochs import epochs
-from driftlab.recordings.identity import identity
+from driftlab.recordings.identity import TWICE, identity, span_of
 from driftlab.recordings.overlap import SMALL, Content, recording_content
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
 from driftlab.reports.figures import figure_of
 from driftlab.reports.provenance import Sheet, sheet_of
-from driftlab.storage.in_memory import InMemoryName
 from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Chunk
@@ -340,12 +339,11 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
     for role, names in recordings.items():
         if not names:
             raise ConfigError(f"--{role} is missing; name at least one recording")
-    once = "has samples in common with {}, and would count twice; name it once"
     alike = "overlaps {}, which was given for calibration, and would count twice; give the same part as both, or parts "
     alike += "that do not overlap"
     fresh = "overlaps {}, which was given for fitting, and cannot judge it; name another recording"
     pairs = [
-        *((role, k, names[:k], once, np.inf) for role, names in recordings.items() for k in range(len(names))),
+        *((role, k, names[:k], TWICE, np.inf) for role, names in recordings.items() for k in range(len(names))),
         *(("train", k, calibration, alike, SAME) for k in range(len(train))),
         *(("holdout", k, [*calibration, *train], fresh, np.inf) for k in range(len(holdout))),
     ]
@@ -361,7 +359,7 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
 
 def _contents(config: Config, names: Sequence[str]) -> dict[str, Content]:
     """Return the contents of recordings, read side by side; empty where all are parts of one file."""
-    if len({_span(name)[0] for name in names}) < 2:
+    if len({span_of(name)[0] for name in names}) < 2:
         return {}
     assert config.filter is not None
     channel = config.filter.tracked.channel
@@ -376,19 +374,12 @@ def _contents(config: Config, names: Sequence[str]) -> dict[str, Content]:
 
 def _share(name: str, other: str, contents: Mapping[str, Content]) -> float:
     """Return the share of the samples of the shorter recording that is in both; 1 where one file's parts overlap."""
-    (file, start, stop), (other_file, other_start, other_stop) = _span(name), _span(other)
+    (file, start, stop), (other_file, other_start, other_stop) = span_of(name), span_of(other)
     if file == other_file:
         if (start, stop) == (other_start, other_stop):
             return 1.0
         return SAME / 2 if start < other_stop and other_start < stop else 0.0
     return contents[name].share(contents[other])
-
-
-def _span(name: str) -> tuple[str, float, float]:
-    content = identity(name).get("sha256", "-")  # of standard input, which is one recording
-    span = {} if isinstance(name, InMemoryName) else part_of(name)[1]
-    start, stop = span.get("start"), span.get("stop")
-    return content, -np.inf if start is None else start, np.inf if stop is None else stop
 
 
 def show(result: ExplainResult, given: Mapping[str, Any]) -> None:

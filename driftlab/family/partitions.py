@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import accumulate, chain, islice
+from itertools import accumulate, chain, groupby, islice
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, Generic, Protocol, TypeVar
@@ -144,8 +144,12 @@ class ChosenUnits:
 
     def read(self) -> list[UnitOfLot]:
         """Return the units; of those in folders no others are read."""
-        contents = {id(part): part.read() for part in {id(part): part for part, _ in self.units}.values()}
-        return [contents[id(part)][k] for part, k in self.units]
+        units = list[UnitOfLot]()
+        for _, some in groupby(self.units, lambda one: id(one[0])):  # of rising places: each partition once
+            part, places = zip(*some, strict=True)
+            content = part[0].read()
+            units += [content[k] for k in places]
+        return units
 
 
 @dataclass(frozen=True, eq=False)

@@ -248,14 +248,15 @@ class Run:
 
 
 def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
-    """Note that the soak of a sensor's map showed a memory which no effect of its bias has."""
+    """Note that the soak of a sensor's map showed a difference between up and down which no effect of its bias has."""
     memory = fitted.record.memory or {}
-    effects = sensor.bias.effects if isinstance(sensor.bias, ThermalBias) else ()
-    followed = {effect.kind for effect in effects} & {*memory.get("kinds", ())} or memory.get("answer") != "seen"
-    if text := shown_by_soak(fitted, sensor.axes, unit_of(sensor)) if not (effects and followed) else "":
+    kinds = {effect.kind for effect in sensor.bias.effects} if isinstance(sensor.bias, ThermalBias) else set()
+    if kinds & ({*memory.get("kinds", ())} if memory.get("answer") == "seen" else {"turn_on", "drift"}):
+        return
+    if text := shown_by_soak(fitted, sensor.axes, unit_of(sensor)):
         faults.note(
             f"the soak of the {sensor.channel}'s map {text}, which no effect of the config follows and no sigma has in "
-            "it; `driftlab explain` finds it"
+            "it; `driftlab explain` looks for its cause"
         )
 
 

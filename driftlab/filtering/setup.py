@@ -47,16 +47,21 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
 def shown_by_soak(fitted: FittedMap, axes: Sequence[str], unit: BiasUnit) -> str:
     """Return the difference between up and down of a map's soak, which no sigma has, as the end of a sentence."""
     memory = fitted.record.memory or {}
-    size = np.abs(np.array(memory.get("size") or [np.nan], dtype=np.float64))
-    likely = memory.get("answer") == "undecided" and (memory.get("log_evidence") or 0.0) > SEEN
-    if not (likely or memory.get("answer") == "seen") or np.all(np.isnan(size)):
+    answer, evidence, kinds, why = (memory.get(name) for name in ("answer", "log_evidence", "kinds", "why"))
+    likely = answer == "undecided" and isinstance(evidence, float) and evidence > SEEN and isinstance(why, str)
+    try:
+        size = np.abs(np.array(memory.get("size"), dtype=np.float64))
+    except (TypeError, ValueError):  # of a file that somebody has changed
+        return ""
+    if not (likely or answer == "seen") or size.shape != (len(axes),) or np.all(np.isnan(size)):
         return ""
     axis = int(np.nanargmax(size))
     apart = f"up and down differ by up to {size[axis] * unit.factor:.3g} {unit.shown}, {axes[axis]}"
     if not likely:
-        return f"showed a {' or '.join(memory.get('kinds') or ['memory'])}: {apart}"
-    why = str(memory.get("why")).partition(";")[0].partition(": whether")[0]
-    return f"showed that {apart} ({why.removeprefix('up and down differ ')})"
+        named = " or ".join(map(str, kinds)) if isinstance(kinds, list | tuple) else ""
+        return f"showed a {named or 'memory'}: {apart}"
+    because = str(why).partition(";")[0].partition(": whether")[0].removeprefix("up and down differ ")
+    return "" if "uncertainty" in because else f"showed that {apart} ({because})"
 
 
 def too_few_updates(model: MeasurementModel, updates: int, apart: float) -> str:
@@ -97,13 +102,14 @@ def noise_remarks(sensor: Sensor, ratios: Array, least: float = 2.0, updates: fl
 def _by_chance(updates: float) -> tuple[float, float]:
     """Return the least and the largest ratio that chance makes of the noise of so many updates.
 
-    Mean squares of differences of neighbours, which share an update, vary as those of two thirds as many numbers.
+    Mean squares of differences of neighbours about their mean, which share an update, vary as those of two thirds as
+    many numbers, less one third.
     """
     if not np.isfinite(updates):
         return 1.0, 1.0
     from scipy.special import chdtri
 
-    freedom = max(2 / 3 * (updates - 1), 1.0)
+    freedom = max(2 / 3 * (updates - 1) - 1 / 3, 1.0)
     low, high = (float(np.sqrt(chdtri(freedom, p) / freedom)) for p in (1 - CHANCE / 2, CHANCE / 2))
     return low, high
 

@@ -18,7 +18,7 @@ from driftlab.filtering.setup import ENOUGH, shown_by_soak, too_few_updates
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
-from driftlab.recordings.overlap import SMALL, recording_content
+from driftlab.recordings.identity import TWICE, span_of
 from driftlab.recordings.screening import read
 from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
@@ -322,7 +322,19 @@ def gather(
     *,
     keep: bool = False,
 ) -> GatheredSoak:
-    """Return the samples of all recordings; `keep`: with their epochs, as much memory as they take."""
+    """Return the samples of all recordings; `keep`: with their epochs, as much memory as they take.
+
+    Raises
+    ------
+    ConfigError
+        If parts of one file, or of copies of it, overlap.
+    DataError
+        If a recording cannot be used.
+    """
+    for one, other in combinations(recordings, 2):
+        (content, start, stop), (same, begin, end) = span_of(one), span_of(other)
+        if content == same and start < end and begin < stop:
+            raise ConfigError(f"{other}: {TWICE.format(one)}")
     configs = [with_recording(config, item) for item in recordings] or [config]
     used = Used()
     parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
@@ -359,14 +371,10 @@ def gather(
 
 
 def _compare(config: Config, parts: Sequence[_Samples], names: Sequence[str], faults: Faults) -> None:
-    """Note doubts about recordings that contradict the others; raises ConfigError where two have samples in common."""
-    if config.filter is None or not 1 < len(parts) <= len(names):
+    """Note doubts about recordings that contradict the others."""
+    if config.filter is None or len(names) < len(parts):
         return
     tracked = config.filter.tracked
-    contents = [recording_content([Chunk(part.t, {"bias": part.bias})], "bias") for part in parts]
-    for j, k in combinations(range(len(contents)), 2):
-        if contents[j].share(contents[k]) > SMALL:
-            raise ConfigError(f"{names[k]}: has samples in common with {names[j]}, and would count twice; name it once")
     T, bias = [part.T for part in parts], [part.bias for part in parts]
     for text in contradictions(T, bias, names, tracked.channel, tracked.axes):
         faults.doubt(text)
@@ -418,7 +426,8 @@ def _samples(
     interval = config.filter.update_interval if config.filter else 1.0
     stretches: list[RestStretch] = []
     times: list[Array] = []
-    count, before = 0, replace(faults)
+    count, before, seconds, moving = 0, replace(faults), used.seconds, used.moving
+    used.most = 0
     for rest in at_rest(config, epochs(read(config, faults), interval), faults, used):
         times.append(rest.window.t)
         stretches.append(rest if keep else rest._replace(window=NOTHING))
@@ -428,12 +437,13 @@ def _samples(
     used.read(faults, before)
     if not stretches:
         name = config.source.name if config.source else "the recording"
-        if config.filter and used.most < ENOUGH:
-            raise EmptyRecording(f"{name}: {too_few_updates(config.filter, used.most, used.seconds / used.moving)}")
+        seconds, count = used.seconds - seconds, used.moving - moving
+        if config.filter and 0 < used.most < ENOUGH and ENOUGH * seconds > config.filter.align * count:
+            raise EmptyRecording(f"{name}: {too_few_updates(config.filter, used.most, seconds / count)}")
         section = config.filter.tracked.section if config.filter else "filter.gyro"
         raise EmptyRecording(
-            f"{name}: is nowhere at rest in {used.seconds:.3g} s; record a soak of hours, or check {section}.noise and "
-            "the channels' units"
+            f"{name}: is nowhere at rest in {seconds:.3g} s; record a soak of hours, or check {section}.noise and the "
+            "channels' units"
         )
     # the median over the windows knows of no gap
     ends, sizes = np.array([rest.t for rest in stretches]), np.array([len(rest.T) for rest in stretches])

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
+from math import inf
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -17,6 +18,7 @@ from fusion_core.contracts import FileSource, Source
 from fusion_core.errors import UnreadableFile
 
 STANDARD_INPUT = Path("-")
+TWICE = "has samples in common with {}, and would count twice; name it once, or give parts that do not overlap"
 HOLLOW = 100  # times what it takes on its disk: a larger file is little more than a hole
 
 
@@ -31,6 +33,14 @@ def identity(name: str) -> dict[str, Any]:
     if isinstance(name, InMemoryName):
         return {"name": str(name), **name.identity()}
     return {"name": name, **of_file(part_of(name)[0])}
+
+
+def span_of(name: str) -> tuple[str, float, float]:
+    """Return the hash of a recording's file (or samples), and from when to when it is of that, s; raises as that."""
+    content = identity(name).get("sha256", "-")  # of standard input, which is one recording
+    span = {} if isinstance(name, InMemoryName) else part_of(name)[1]
+    start, stop = span.get("start"), span.get("stop")
+    return content, -inf if start is None else start, inf if stop is None else stop
 
 
 def of_source(source: Source) -> dict[str, Any]:

@@ -7,7 +7,6 @@ What is found is noted as a doubt (`Faults.doubt`): the rows stay, and no limit 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import combinations
 
@@ -24,6 +23,7 @@ LIVELY = 100  # changes of a reading that show its habit
 STUCK = 100  # times its longest repetition before: a thermometer that repeats a reading for longer is stuck
 LASTING = 60.0  # s that it stands, at least
 ENOUGH = 1000  # rows that are looked at together: a live source has one at a time
+ALONE = "rows whose temperature stands alone between others"
 JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
@@ -229,7 +229,8 @@ class Thermometer:
         self.first: tuple[float, float] | None = None  # time in s and temperature of the first row
         self.fast = self.odd = False  # whether it has moved faster than any, and shown what no soak has
         self.impossible: set[float] = set()  # readings below absolute zero: one or two of a logger that has none
-        self.alone = Counter[float]()  # readings between others that are far off them, and near one another
+        # the last two rows, and whether the first of them stands alone
+        self._last: tuple[Array, Array, bool] = np.empty(0), np.empty(0), False
 
     def along(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         """Pass the rows of a source on, and look for readings below absolute zero that change as readings do."""
@@ -259,19 +260,13 @@ class Thermometer:
         """Look at all that came."""
         if self._rows:
             self._look(self._held[0, : self._stop].copy(), self._held[1, : self._stop].copy(), self._rows)
-        for value, count in self.alone.most_common(1):
-            self.faults.doubt(
-                f"temperature is {value:.6g} °C in {count} rows, alone between others, as of a thermometer that has no "
-                "reading; leave such rows out, by a channel `valid` that is zero there"
-            )
 
     def _look(self, t: Array, T: Array, new: int) -> None:
         """Look at times and readings, of which the last `new` have not been looked at."""
         known, self._held[:, 0], self._rows, self._stop = len(t) - new, (t[-1], T[-1]), 0, 1
         steps = np.abs(np.diff(T))
         self._repeats(t, T, np.flatnonzero(steps != 0) + 1, known)
-        if np.max(steps, initial=0.0) > JUMP:
-            self._jumps(t, T, steps)
+        self._jumps(t[known:], T[known:])
         self._range(t, T)
 
     def _repeats(self, t: Array, T: Array, changed: NDArray[np.intp], known: int) -> None:
@@ -292,17 +287,34 @@ class Thermometer:
         self.changes, self.longest = self.changes + len(changed), int(np.max(runs[:-1], initial=self.longest))
         self.run, self.since = int(runs[-1]), float(t[changed[-1]] if len(changed) else since)
 
-    def _jumps(self, t: Array, T: Array, steps: Array) -> None:
-        usual = float(np.median(steps[steps > 0]))
-        beyond = (steps > max(JUMP, USUAL * usual)) & (steps > FASTEST * np.diff(t))
-        back = np.flatnonzero(beyond[:-1] & beyond[1:] & (np.abs(T[2:] - T[:-2]) < JUMP))
-        self.alone.update(T[back + 1].tolist())
-        beyond[back] = beyond[back + 1] = False
-        for k in np.flatnonzero(beyond)[:1]:
+    def _jumps(self, t: Array, T: Array) -> None:
+        """Look at new rows for jumps, and for readings that stand alone between others; the last row waits."""
+        before, shown, alone_before = self._last
+        t, T = np.concatenate([before, t]), np.concatenate([shown, T])
+        steps, alone = np.abs(np.diff(T)), np.zeros(len(T), dtype=bool)
+        if len(T) > 2 and np.max(steps) > JUMP:
+            beyond = (steps > max(JUMP, USUAL * float(np.median(steps[steps > 0])))) & (steps > FASTEST * np.diff(t))
+            alone[1:-1] = beyond[:-1] & beyond[1:] & (np.abs(T[2:] - T[:-2]) < JUMP)
+            alone[0] = alone_before
+            for k in np.flatnonzero(beyond[:-1] & ~alone[:-2] & ~alone[1:-1])[:1]:
+                self.faults.doubt(
+                    f"temperature jumps from {T[k]:.4g} to {T[k + 1]:.4g} °C within {t[k + 1] - t[k]:.3g} s at "
+                    f"{self.faults.when(t[k + 1])}, as no body does; leave that part out, or correct the thermometer"
+                )
+            self._note_alone(t, T, np.flatnonzero(alone[1:-1]) + 1)
+        self._last = t[-2:], T[-2:], bool(alone[-2]) if len(T) > 1 else False
+
+    def _note_alone(self, t: Array, T: Array, rows: NDArray[np.intp]) -> None:
+        """Note readings that stand alone: once as a doubt, and each in a count."""
+        if not len(rows):
+            return
+        first = f"{T[rows[0]]:.6g} °C at {self.faults.when(t[rows[0]])}"
+        if ALONE not in self.faults.found:
             self.faults.doubt(
-                f"temperature jumps from {T[k]:.4g} to {T[k + 1]:.4g} °C within {t[k + 1] - t[k]:.3g} s at "
-                f"{self.faults.when(t[k + 1])}, as no body does; leave that part out, or correct the thermometer"
+                f"temperature is {first}, alone between readings far off it, as of a thermometer that has none; "
+                "leave such rows out, by a channel `valid` that is zero there"
             )
+        self.faults.add(ALONE, len(rows), first)
 
     def _range(self, t: Array, T: Array) -> None:
         if self.first is None:

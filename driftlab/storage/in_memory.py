@@ -40,9 +40,13 @@ class MemorySource(Source):
 
     def check_units(self, model: MeasurementModel) -> None:
         """Raise UnitError where a sensor that a model follows has no unit, or one of another dimension."""
+        names = [name for name in self._samples.channels if name in self.units or not self._known]
         try:
-            model.check_units({} if self._known else {name: self.units.get(name) for name in self._samples.channels})
+            model.check_units({name: self.units.get(name) for name in names})
         except UnitError as error:
+            for name in names:
+                if name not in self.units and f"channels.{name}:" in str(error):
+                    raise _without_unit(self.title, name, model.tracked.shown) from None
             raise UnitError(str(error).replace("source.channels.", f"{self.title}: channel ")) from None
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
@@ -243,12 +247,14 @@ def _si(name: str, unit: str | None, usual: Usual | None, title: str) -> str | N
     """Return the unit to convert a channel to; None where it stays as it is."""
     if unit is None:
         if usual is not None and usual.example is not None:
-            raise UnitError(
-                f'{title}: channel {name} has no unit; write "{name}": ({name}, "{usual.example}"), or '
-                f'units={{"{name}": "{usual.example}"}}'
-            )
+            raise _without_unit(title, name, usual.example)
         return None
     try:
         return si_of_channel(name, unit)
     except UnitError as error:
         raise UnitError(f"{title}: {error}") from None
+
+
+def _without_unit(title: str, name: str, example: str) -> UnitError:
+    advice = f'write "{name}": ({name}, "{example}"), or units={{"{name}": "{example}"}}'
+    return UnitError(f"{title}: channel {name} has no unit; {advice}")

@@ -4,7 +4,7 @@ The loss of a calibration is measured as the target evaluates it:
 
 ::
 
-    over the domain:     target(T) - map(T)       at TEMPERATURES places from its lowest to its highest temperature
+    over the domain:     target(T) - map(T)       at many places from its lowest to its highest temperature
     over a warm-up:      target - (map and effects),   T(t) = T_high - (T_high - T_low) exp(-t / 15 min), 1 h at 1 Hz
 
 The first is the curve's; the second has what runs in time: a lag that the target cannot hold, a correction that it

@@ -407,7 +407,7 @@ def _lock(items: Iterable[Memory], depth: int = 8) -> None:
     for item in items:
         if isinstance(item, np.ndarray):
             item.setflags(write=False)
-        elif item and depth and isinstance(item, (tuple, list, dict)):
+        elif isinstance(item, (tuple, list, dict)) and item and depth:
             _lock(item.values() if isinstance(item, dict) else item, depth - 1)
 
 

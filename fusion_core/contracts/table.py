@@ -212,7 +212,7 @@ class Channel(Settings):
 def si_of_channel(name: str, unit: str) -> str:
     """Return the SI unit of channel `name` given in `unit`; raises UnitError as `Channel.check`."""
     usual = USUAL.get(name)
-    example = (usual and usual.example) or "hPa', 'N' or 'V"
+    example = (usual and usual.example) or "hPa"
     try:
         si = si_unit_of(unit)
     except UnitError:

@@ -47,10 +47,10 @@ def _finite(values: Any) -> Array:
     """Return numbers, nested as they may be, as an array that cannot be written to."""
     try:
         array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("numbers were expected, as many in each row") from None
-    if not np.all(np.isfinite(array)):
-        raise ValueError("a number is not finite")
+    if array.ndim == 0 or not np.all(np.isfinite(array)):
+        raise ValueError("finite numbers in rows were expected")
     return locked(array)
 
 

@@ -15,6 +15,7 @@ N samples, d axes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,9 +56,10 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
     way = np.repeat(directions(means, TURN * float(np.ptp(T))), step)[: len(T)]
     found: list[Ripple | None] = [None] * left.shape[1]
     least = np.sqrt(2 * np.log(HALVINGS / CHANCE))
+    cells = _cells_of(((T - T.min()) / (width / 2**HALVINGS)).astype(np.int64), way, left)
     for halving in range(1, HALVINGS + 1):
         cell = width / 2**halving
-        ways, noise, at = _ways_apart(((T - T.min()) / cell).astype(np.int64), way, left)
+        ways, noise, at = _ways_apart(cells, HALVINGS - halving)
         where, third = float(T.min()) + (at + 0.5) * cell, at % 3 == 1  # of cells that no other three have
         inner = (where > T.min() + width) & (where < T.max() - width)  # about a turn, both ways are of one moment
         products = ways[0, third] * ways[1, third]
@@ -76,31 +78,48 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
     return found
 
 
-def _ways_apart(cell: Integers, way: Integers, left: Array) -> tuple[Array, Array, Integers]:
-    """Return u and v (2, M, d) of each three neighbouring cells that both ways have gone through.
+class _Cells(NamedTuple):
+    """Sums of the K cells that passes of one way go through, in order of the passes, then of the temperature."""
 
-    And their deviations (2, M) for white noise of 1 a sample, and the middle cells (M,).
-    """
-    count = int(cell.max()) + 1
-    run = np.cumsum(np.diff(way, prepend=way[:1]) != 0)
-    apart, noise, there = [], [], np.ones(max(count - 2, 0), dtype=np.bool_)
+    run: Integers  # (K,): number of the pass
+    at: Integers  # (K,): number of the cell
+    n: Array  # (K,): samples
+    sums: Array  # (K, d)
+
+
+def _cells_of(cell: Integers, way: Integers, left: Array) -> tuple[_Cells, _Cells]:
+    """Return the cells of the ways up and of the ways down, of samples in `cell` (N,)."""
+    count, run = int(cell.max()) + 1, np.cumsum(np.diff(way, prepend=way[:1]) != 0)
+    both = []
     for sign in (1, -1):
         own = way == sign
-        _, passes = np.unique(run[own], return_inverse=True)
-        place, shape = passes * count + cell[own], (int(passes.max(initial=-1)) + 1, count)
-        n = np.bincount(place, minlength=shape[0] * count).reshape(shape).astype(np.float64)
-        with np.errstate(divide="ignore"):
-            weight = 1 / (1 / n[:, 1:-1] + (1 / n[:, :-2] + 1 / n[:, 2:]) / 4)  # none where one of the three is empty
-        total = weight.sum(axis=0)
+        key, of = np.unique(run[own] * count + cell[own], return_inverse=True)
+        sums = np.stack([np.bincount(of, column, len(key)) for column in left[own].T], axis=1)
+        both.append(_Cells(key // count, key % count, np.bincount(of, minlength=len(key)).astype(np.float64), sums))
+    return both[0], both[1]
+
+
+def _ways_apart(cells: Sequence[_Cells], shift: int) -> tuple[Array, Array, Integers]:
+    """Return u and v (2, M, d) of each three neighbouring cells that both ways have gone through.
+
+    And their deviations (2, M) for white noise of 1 a sample, and the middle cells (M,). 2^`shift` cells are one.
+    """
+    count = max(int(one.at.max(initial=0) >> shift) for one in cells) + 1
+    apart, noise, there = [], [], np.ones(count, dtype=np.bool_)
+    for run, at, n, sums in cells:
+        at = at >> shift
+        first = np.flatnonzero((np.diff(at, prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0))
+        run, at, n = run[first], at[first], np.add.reduceat(n, first) if len(first) else n
+        means = (np.add.reduceat(sums, first) if len(first) else sums) / n[:, None]
+        k = np.flatnonzero((run[2:] == run[:-2]) & (at[2:] - at[:-2] == 2)) + 1
+        weight = 1 / (1 / n[k] + (1 / n[k - 1] + 1 / n[k + 1]) / 4)
+        total = np.bincount(at[k], weight, count)
         there &= total > 0
-        u = []
-        for column in left[own].T:
-            means = np.bincount(place, column, shape[0] * count).reshape(shape) / np.maximum(n, 1)
-            u.append(np.sum(weight * (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2), axis=0))
         total = np.where(total > 0, total, 1.0)
-        apart.append(np.stack(u, axis=1) / total[:, None])
+        off = weight[:, None] * (means[k] - (means[k - 1] + means[k + 1]) / 2)
+        apart.append(np.stack([np.bincount(at[k], column, count) / total for column in off.T], axis=1))
         noise.append(1 / np.sqrt(total))
-    return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64) + 1
+    return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64)
 
 
 def _dips(ways: Array, noise: Array, where: Array, cell: float) -> list[Ripple | None]:

@@ -63,9 +63,10 @@ class ZeroVelocity:
 
     def measurement(self, N: int) -> Measurement:
         """Zero motion, N times."""
-        if self._still is None or len(self._still.z) != N:
-            self._still = Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
-        return self._still
+        still = self._still
+        if still is None or len(still.z) != N:
+            self._still = still = Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
+        return still
 
     def transition(self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment) -> Transition:
         """Put the bias models' steps and the integrals of the epochs together."""

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer
+from driftlab.recordings.plausibility import ALONE, Copies, Rails, Rounding, Thermometer
 from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
@@ -65,14 +65,31 @@ def test_one_that_is_read_once_a_second_is_stuck_later():
 
 @pytest.mark.parametrize(("T", "word"), [
     (np.where(np.arange(N) > 9_000, NOISY + 3, NOISY), "jumps"),
-    (np.where(np.arange(N) == 9_000, 85.0, NOISY), "is 85 °C in 1 rows, alone"),
-    (np.where(np.arange(N) % 1_700 == 900, -60.0, NOISY), "is -60 °C in 23 rows, alone"),
     (held(NOISY, 0, 20_000), "jumps"),
     (NOISY + 273.15, "kelvin"),
 ])  # fmt: skip
 def test_jumps_and_kelvin_are_named(T, word):
     (text,) = doubts(T)
     assert word in text
+
+
+@pytest.mark.parametrize("size", [1, 7, 313, 1_000, 3_000])
+@pytest.mark.parametrize("rows", [[9_000], [998, 999, 1_000], range(900, N, 1_700), [999, 5_000, 9_999, 20_001]])
+def test_readings_that_stand_alone_are_named_and_counted(rows, size):
+    """Whatever the chunks are; two in a row are none, and a jump there and back."""
+    faults, T, rows = Faults(first_row=0.0), NOISY.copy(), list(rows)
+    T[rows] = -60.0
+    thermometer = Thermometer(faults)
+    for k in range(0, N, size):
+        thermometer.look(Chunk(np.arange(k, min(k + size, N)) * DT, {"temperature": T[k : k + size]}))
+    thermometer.flush()
+    text, *more = faults.doubts
+    if 999 in rows and 1_000 in rows:
+        assert "jumps from" in text
+    else:
+        assert not more
+        assert f"is -60 °C at {rows[0] * DT:.1f} s, alone between" in text
+        assert faults.found[ALONE].count == len(rows)
 
 
 @pytest.mark.parametrize("size", [1, 313, 3_000])

@@ -190,7 +190,7 @@ def test_no_time_and_no_interval(kind):
             r"channel temperature: unit 'C' cannot be converted to degC; write a unit like 'degC'",
         ),
         ("gyro", "dge/s", r"channel gyro: unit 'dge/s' is not known; write it like 'deg/s'"),
-        ("voltage", "Vlot", r"channel voltage: unit 'Vlot' is not known; write it like 'hPa', 'N' or 'V'"),
+        ("voltage", "Vlot", r"channel voltage: unit 'Vlot' is not known; write it like 'hPa'"),
         ("valid", "s", r"channel valid: unit 's' cannot be converted to 1; it has no unit, remove it"),
     ],
 )
