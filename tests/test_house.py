@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4127
+    assert 0 < count <= 4139
 
 
 def imports():
@@ -263,7 +263,7 @@ BUDGET = {
     "driftlab/filtering": 1328,
     "driftlab/identification": 2345,
     "driftlab/live": 844,
-    "driftlab/maps": 2098,
+    "driftlab/maps": 2089,
     "driftlab/noise": 1550,
     "driftlab/planning": 1261,
     "driftlab/production": 3222,

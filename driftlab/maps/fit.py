@@ -331,10 +331,7 @@ def gather(
     DataError
         If a recording cannot be used.
     """
-    for one, other in combinations(recordings, 2):
-        (content, start, stop), (same, begin, end) = span_of(one), span_of(other)
-        if content == same and start < end and begin < stop:
-            raise ConfigError(f"{other}: {TWICE.format(one)}")
+    _check_overlap(recordings)
     configs = [with_recording(config, item) for item in recordings] or [config]
     used = Used()
     parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
@@ -354,20 +351,16 @@ def gather(
         bias, placements = placed(T, bias + known[placement], placement, *unknown)
         starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
     return GatheredSoak(
-        _joined([part.t for part in parts], interval),
-        T,
-        bias,
-        names,
-        starts,
-        interval,
-        _about(configs),
-        placements,
-        windows,
-        used,
-        steps,
-        off,
-        tuple(faults.doubts),
-    )
+        _joined([part.t for part in parts], interval), T, bias, names, starts, interval, _about(configs), placements,
+        windows, used, steps, off, tuple(faults.doubts),
+    )  # fmt: skip
+
+
+def _check_overlap(recordings: Sequence[str]) -> None:
+    for one, other in combinations(recordings, 2):
+        (content, start, stop), (same, begin, end) = span_of(one), span_of(other)
+        if content == same and start < end and begin < stop:
+            raise ConfigError(f"{other}: {TWICE.format(one)}")
 
 
 def _compare(config: Config, parts: Sequence[_Samples], names: Sequence[str], faults: Faults) -> None:

@@ -94,7 +94,7 @@ def _cells_of(cell: Integers, way: Integers, left: Array) -> tuple[_Cells, _Cell
     for sign in (1, -1):
         own = way == sign
         key, of = np.unique(run[own] * count + cell[own], return_inverse=True)
-        sums = np.stack([np.bincount(of, column, len(key)) for column in left[own].T], axis=1)
+        sums: Array = np.stack([np.bincount(of, column, len(key)) for column in left[own].T], axis=1)
         both.append(_Cells(key // count, key % count, np.bincount(of, minlength=len(key)).astype(np.float64), sums))
     return both[0], both[1]
 
