@@ -260,7 +260,7 @@ BUDGET = {
     "driftlab/commands": 3819,
     "driftlab/evaluation": 1610,
     "driftlab/family": 3414,
-    "driftlab/filtering": 1328,
+    "driftlab/filtering": 1329,
     "driftlab/identification": 2345,
     "driftlab/live": 844,
     "driftlab/maps": 2089,

@@ -250,8 +250,9 @@ class Run:
 def _note_memory(sensor: Sensor, fitted: FittedMap, faults: Faults) -> None:
     """Note that the soak of a sensor's map showed a difference between up and down which no effect of its bias has."""
     memory = fitted.record.memory or {}
-    kinds = {effect.kind for effect in sensor.bias.effects} if isinstance(sensor.bias, ThermalBias) else set()
-    if kinds & ({*memory.get("kinds", ())} if memory.get("answer") == "seen" else {"turn_on", "drift"}):
+    effects = sensor.bias.effects if isinstance(sensor.bias, ThermalBias) else ()
+    kinds = memory.get("kinds") if memory.get("answer") == "seen" else ("turn_on", "drift")
+    if isinstance(kinds, list | tuple) and any(effect.kind in kinds for effect in effects):
         return
     if text := shown_by_soak(fitted, sensor.axes, unit_of(sensor)):
         faults.note(

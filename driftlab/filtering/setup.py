@@ -48,7 +48,7 @@ def shown_by_soak(fitted: FittedMap, axes: Sequence[str], unit: BiasUnit) -> str
     """Return the difference between up and down of a map's soak, which no sigma has, as the end of a sentence."""
     memory = fitted.record.memory or {}
     answer, evidence, kinds, why = (memory.get(name) for name in ("answer", "log_evidence", "kinds", "why"))
-    likely = answer == "undecided" and isinstance(evidence, float) and evidence > SEEN and isinstance(why, str)
+    likely = answer == "undecided" and isinstance(evidence, int | float) and evidence > SEEN and isinstance(why, str)
     try:
         size = np.abs(np.array(memory.get("size"), dtype=np.float64))
     except (TypeError, ValueError):  # of a file that somebody has changed

@@ -49,3 +49,11 @@ def test_what_a_soak_showed_is_said_where_no_sigma_has_it(answer, evidence, said
     unit = BiasUnit("rad/s", "deg/h")
     assert shown_by_soak(CURVE.noting(memory=memory), "xyz", unit) == said
     assert shown_by_soak(CURVE, "xyz", unit) == ""
+
+
+@pytest.mark.parametrize("memory", [
+    {"answer": "seen", "size": "abc"}, {"answer": "seen", "size": [1.0, 2.0, 3.0, 4.0], "kinds": 5},
+    {"answer": "undecided", "size": [1.0, 2.0, 3.0], "log_evidence": "a"}, {"answer": "seen"}, {"answer": 7},
+])  # fmt: skip
+def test_a_file_that_somebody_has_changed_says_nothing(memory):
+    assert shown_by_soak(CURVE.noting(memory=memory), "xyz", BiasUnit("rad/s", "deg/h")) == ""
