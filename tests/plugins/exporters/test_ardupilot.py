@@ -72,7 +72,7 @@ def test_what_is_written_is_what_the_firmware_takes_off(low, high, T_cal, path):
     (loss,) = ardupilot().export(unit(exact), path).sensors
     (back,) = ardupilot().read(path)
     assert rows(path)["INS_GYR1_CALTEMP"] == T_cal
-    T = np.linspace(low, high, 2001)
+    T = np.linspace(low, high, 20_010)
     found = np.max(np.abs(back.bias(T) - exact.bias(T)), axis=0)
     np.testing.assert_allclose(found, loss.domain.largest, rtol=1e-9)
     assert back.domain == (low, high)

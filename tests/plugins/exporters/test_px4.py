@@ -57,7 +57,7 @@ def test_what_is_written_is_what_the_firmware_takes_off(path):
     exact = fitted()
     (loss,) = px4().export(unit(exact), path).sensors
     (back,) = px4().read(path)
-    T = np.linspace(-10, 50, 2001)
+    T = np.linspace(-10, 50, 20_010)
     np.testing.assert_array_equal(np.max(np.abs(back.bias(T) - exact.bias(T)), axis=0), loss.domain.largest)
     assert (back.channel, back.unit, back.axes) == ("gyro", "rad/s", ("x", "y", "z"))
     assert back.domain == (-10.0, 50.0)

@@ -305,10 +305,13 @@ def test_the_loss_is_kept_and_no_knot_is_too_many(loss, floats):
 def test_the_loss_that_is_said_is_the_loss(tmp_path):
     loss = exported(tmp_path, sensor())
     own = program(sensor())
-    T = np.linspace(LOW, HIGH, 2001)
+    T = np.linspace(LOW, HIGH, 20_010)
     error = at_rest(own, T.astype(np.float32)) - sensor().fitted.bias(T)
     np.testing.assert_allclose(loss.sensors[0].domain.rms, np.sqrt(np.mean(error**2, axis=0)))
     np.testing.assert_allclose(loss.sensors[0].domain.largest, np.max(np.abs(error), axis=0))
+    T = np.linspace(LOW, HIGH, 200_001)  # between the knots of the table, and between those places
+    error = at_rest(own, T.astype(np.float32)) - sensor().fitted.bias(T)
+    np.testing.assert_allclose(loss.sensors[0].domain.largest, np.max(np.abs(error), axis=0), rtol=0.02)
     header = (tmp_path / "gyro_bias.h").read_text()
     assert all(f" * {line}\n" in header for line in loss.lines())
     assert " * Unit SN 7.\n" in header
