@@ -49,7 +49,9 @@ class Copies:
     def look(self, chunk: Chunk, name: str, sensor: Sensor | None) -> None:
         """Look at the next rows of a sensor (N, d)."""
         values = chunk[name]
-        same = self._same.setdefault(name, dict.fromkeys(combinations(range(values.shape[1]), 2), 0))
+        if name not in self._same:
+            self._same[name] = dict.fromkeys(combinations(range(values.shape[1]), 2), 0)
+        same = self._same[name]
         for i, j in list(same):
             if not np.array_equal(values[:100, i], values[:100, j]) or not np.array_equal(values[:, i], values[:, j]):
                 del same[i, j]
@@ -264,8 +266,7 @@ class Thermometer:
     def _look(self, t: Array, T: Array, new: int) -> None:
         """Look at times and readings, of which the last `new` have not been looked at."""
         known, self._held[:, 0], self._rows, self._stop = len(t) - new, (t[-1], T[-1]), 0, 1
-        steps = np.abs(np.diff(T))
-        self._repeats(t, T, np.flatnonzero(steps != 0) + 1, known)
+        self._repeats(t, T, np.flatnonzero(T[1:] != T[:-1]) + 1, known)
         self._jumps(t[known:], T[known:])
         self._range(t, T)
 
@@ -294,8 +295,7 @@ class Thermometer:
         steps, alone = np.abs(np.diff(T)), np.zeros(len(T), dtype=bool)
         if len(T) > 2 and np.max(steps) > JUMP:
             beyond = (steps > max(JUMP, USUAL * float(np.median(steps[steps > 0])))) & (steps > FASTEST * np.diff(t))
-            alone[1:-1] = beyond[:-1] & beyond[1:] & (np.abs(T[2:] - T[:-2]) < JUMP)
-            alone[0] = alone_before
+            alone[0], alone[1:-1] = alone_before, beyond[:-1] & beyond[1:] & (np.abs(T[2:] - T[:-2]) < JUMP)
             for k in np.flatnonzero(beyond[:-1] & ~alone[:-2] & ~alone[1:-1])[:1]:
                 self.faults.doubt(
                     f"temperature jumps from {T[k]:.4g} to {T[k + 1]:.4g} °C within {t[k + 1] - t[k]:.3g} s at "

@@ -109,8 +109,8 @@ def _ways_apart(cells: Sequence[_Cells], shift: int) -> tuple[Array, Array, Inte
     for run, at, n, sums in cells:
         at = at >> shift
         first = np.flatnonzero((np.diff(at, prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0))
-        run, at, n = run[first], at[first], np.add.reduceat(n, first) if len(first) else n
-        means = (np.add.reduceat(sums, first) if len(first) else sums) / n[:, None]
+        run, at, n = run[first], at[first], np.add.reduceat(n, first)
+        means = np.add.reduceat(sums, first) / n[:, None]
         k = np.flatnonzero((run[2:] == run[:-2]) & (at[2:] - at[:-2] == 2)) + 1
         weight = 1 / (1 / n[k] + (1 / n[k - 1] + 1 / n[k + 1]) / 4)
         total = np.bincount(at[k], weight, count)
