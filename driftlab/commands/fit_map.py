@@ -353,4 +353,4 @@ def _print_map(fitted: FitMapResult) -> None:
     say_lines(fitted.verdict.sentences(fitted.unit))
     print_verdict(fitted.limits_verdict, "limits: ")
     say_lines((row.line(fitted.unit) for row in fitted.limits), "  ")
-    say_lines(fitted.faults.lines(), "note: ")
+    say_lines(fitted.faults.lines(doubts=False), "note: ")

@@ -15,6 +15,7 @@ import numpy as np
 
 from driftlab.noise.allan import curve
 from driftlab.noise.local_level import LevelLikelihood
+from driftlab.recordings.plausibility import alone, usual_change
 from fusion_core.chunk import Array, Flags
 
 MIN_SAMPLES = 200  # of a stretch
@@ -55,7 +56,7 @@ def noise_of(t: Array, values: Array, temperature: Array | None = None) -> Quick
     rows = _quietest(t, values)
     if rows is None:
         return None
-    quiet = values[rows]
+    quiet = _mended(values[rows])
     dt = float(np.median(np.diff(t[rows])))
     white = np.empty(values.shape[1])
     for k in range(values.shape[1]):
@@ -64,8 +65,17 @@ def noise_of(t: Array, values: Array, temperature: Array | None = None) -> Quick
         white[k] = float(np.median(allan.allan[early] * np.sqrt(allan.tau[early])))
     if not np.all(white > 0):
         return None
-    walk, known = _walk(t, values, temperature)
+    walk, known = _walk(t, _mended(values), temperature)
     return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt, known)
+
+
+def _mended(values: Array) -> Array:
+    """Return values (N, d) with the means of the neighbours in the place of readings that stand alone far off."""
+    mended = values.copy()
+    for x, usual in zip(mended.T, usual_change(values), strict=True):
+        rows = alone(x, usual)
+        x[rows] = (x[rows - 1] + x[rows + 1]) / 2
+    return mended
 
 
 def _walk(t: Array, values: Array, temperature: Array | None) -> tuple[Array, Flags]:

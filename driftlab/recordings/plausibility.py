@@ -25,11 +25,15 @@ LASTING = 60.0  # s that it stands, at least
 ENOUGH = 1000  # rows that are looked at together: a live source has one at a time
 ALONE = "rows whose temperature stands alone between others"
 JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
+ABOUT = 16  # rows before and behind a reading that show how much its neighbours scatter
+MEDIAN = 0.6745  # of the sizes of normal numbers of variance 1
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
 AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the rows next to it: at least
 BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
 HELD = "is held by what writes it down"  # in the doubt about it
+SINGLE = "single readings far off both neighbours"  # likewise
+SEVERAL = 10  # of them are a doubt: a knock or two are motion
 ENDS, CHANCE, SHARE = 10, 1e-6, 0.01  # ends of repetitions, chance of a longer one, share of the rows: of readings held
 MANY, SOME = 20, 10  # chunks, after which one in SOME is looked at: of steps
 EXACT = 0.01  # of a step: so far changes may be from multiples of it
@@ -211,6 +215,67 @@ class Holds:
                 f"{share:.0%} of the rows, where its noise would not {most + 1:.0f} times: it {HELD}, as over a "
                 "link that loses samples; record each reading once, or correct the logger"
             )
+
+
+def usual_change(values: Array) -> Array:
+    """Return the median size (d,) of the changes from row to row of values (N, d); NaN where none changes."""
+    changes = np.abs(np.diff(values, axis=0))
+    return np.array([np.median(column[column > 0]) if np.any(column > 0) else np.nan for column in changes.T])
+
+
+def alone(x: Array, usual: float) -> NDArray[np.intp]:
+    """Return the rows of readings x (N,) that are far from both neighbours, which are close to each other.
+
+    Far is more than USUAL usual changes from row to row, and as many of those in the rows about it: where all scatter
+    more, as in motion, none stands alone.
+    """
+    steps = np.diff(x)
+    sizes = np.abs(steps)
+    least = np.minimum(sizes[:-1], sizes[1:])
+    rows = np.flatnonzero((least > USUAL * usual) & (np.abs(steps[:-1] + steps[1:]) < least / 2)) + 1
+    about = np.clip(rows - ABOUT, 0, max(len(sizes) - 2 * ABOUT, 0))[:, None] + np.arange(min(2 * ABOUT, len(sizes)))
+    far: NDArray[np.intp] = rows[least[rows - 1] > USUAL * np.median(sizes[about], axis=1)]
+    return far
+
+
+class Lone:
+    """Readings of a sensor that stand alone between others: bits were lost on the way, or something knocked."""
+
+    def __init__(self, name: str, sensor: Sensor | None, d: int) -> None:
+        self.name, self.axes = name, axes_in(sensor, d)
+        self.unit = "in SI" if sensor is None else sensor.unit
+        self.rows, self.usual = 0, np.full(d, np.nan)
+        self.counts, self.squares = np.zeros(d), np.zeros(d)  # of such readings, and of the changes to and from them
+        self._t, self._last = np.empty(0), np.empty((0, d))  # some rows before; the last waits for what follows
+
+    def look(self, chunk: Chunk, leaps: Array, limit: float, faults: Faults) -> None:
+        """Look at the next rows, of which `leaps` (d,) are the largest changes of each axis; what saturates is none."""
+        values = chunk[self.name]
+        if len(values) >= BLOCK and not np.all(leaps <= USUAL * self.usual):
+            self.usual = usual_change(values[: BLOCK * BLOCKS])
+            self._count(np.append(self._t, chunk.t), np.concatenate([self._last, values]), limit, faults)
+        self.rows, self._t, self._last = self.rows + len(values), chunk.t[-ABOUT:].copy(), values[-ABOUT:].copy()
+
+    def _count(self, t: Array, values: Array, limit: float, faults: Faults) -> None:
+        waited = len(self._t) - 1
+        for k, axis in enumerate(self.axes):
+            rows = alone(values[:, k], self.usual[k])
+            rows = rows[(rows >= waited) & (np.abs(values[rows, k]) < limit)]
+            if len(rows):
+                self.counts[k] += len(rows)
+                self.squares[k] += 2 * np.sum((values[rows, k] - values[rows - 1, k]) ** 2)
+                first = f"{values[rows[0], k]:.6g} {self.unit} at {faults.when(t[rows[0]])}"
+                faults.add(f"readings of {axis_name(self.name, axis)} alone between others far off", len(rows), first)
+
+    def judge(self, faults: Faults) -> None:
+        """Note a doubt about each axis of whose noise some such readings are more than all others."""
+        shares = self.squares / self.rows / (self.usual / MEDIAN) ** 2
+        for axis, count, share in zip(self.axes, self.counts, shares, strict=True):
+            if count >= SEVERAL and share > 1:
+                faults.doubt(
+                    f"{axis_name(self.name, axis)}: most of its noise is {SINGLE}, as of lost bits or of knocks; leave "
+                    "such rows out, by a channel `valid` that is zero there"
+                )
 
 
 def axes_in(sensor: Sensor | None, d: int) -> list[str]:

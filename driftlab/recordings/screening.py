@@ -7,7 +7,7 @@ from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.recordings.plausibility import Copies, Rails, Rounding, Thermometer, axes_in
+from driftlab.recordings.plausibility import Copies, Lone, Rails, Rounding, Thermometer, axes_in
 from fusion_core.checks import all_finite
 from fusion_core.chunk import Array, Chunk, Flags, concatenate, read_only
 from fusion_core.contracts import FileSource, Sensor
@@ -52,7 +52,7 @@ def read(
             previous = chunk.last()
             screen.thermometer.look(chunk)
     screen.thermometer.flush()
-    for looks in (screen.rails, screen.roundings):
+    for looks in (screen.rails, screen.roundings, screen.lone):
         for look in looks.values():
             look.judge(faults)
     if empty:
@@ -70,6 +70,7 @@ class _Screen:
         self.runs: dict[str, Array] = {}  # length of the repetition of each axis
         self.rails: dict[str, Rails] = {}
         self.roundings: dict[str, Rounding] = {}
+        self.lone: dict[str, Lone] = {}
 
     def keep(self, chunk: Chunk) -> Flags | None:
         """Return the rows (N,) that can be used; None where all can."""
@@ -81,11 +82,13 @@ class _Screen:
             limit = 0.999 * ((sensor and sensor.range) or np.inf)
             if name not in self.runs:
                 self.runs[name], self.rails[name] = np.zeros(d), Rails(name, sensor, d)
-                self.roundings[name] = Rounding(name, sensor, d)
+                self.roundings[name], self.lone[name] = Rounding(name, sensor, d), Lone(name, sensor, d)
             self.roundings[name].look(chunk)
             before, self.runs[name], table = self.runs[name], np.empty(d), self.rails[name].table
-            last = read_only(_value_before(chunk, name))
-            if not suspect(values, last, before, self.runs[name], limit, table):
+            last, leaps = read_only(_value_before(chunk, name)), np.zeros(d)
+            suspected = suspect(values, last, before, self.runs[name], limit, table, leaps)
+            self.lone[name].look(chunk, leaps, limit, self.faults)
+            if not suspected:
                 continue
             repeats = _repeats(chunk, name, before)
             for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(values) >= limit)):
@@ -152,18 +155,22 @@ class Gaps:
 
 
 @compiled
-def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: float, rails: Array) -> bool:
-    """Return True if any value (N, d) is stuck or beyond the limit; `runs` are the lengths of the repetitions (d,).
+def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: float, rails: Array, leaps: Array) -> bool:
+    """Return True if any value (N, d) is stuck or beyond the limit.
+
+    `runs` (d,) are to be the lengths of the repetitions at the end, `leaps` (d,) the largest changes from row to row.
 
     One pass over what is nearly always good; `_repeats` says where it is not, in NumPy. `rails` (2, d, 4) goes on: the
     largest value and how often it was there, the next one and how often, of the readings and with their sign reversed.
     """
     suspect = False
     for j in range(values.shape[1]):
-        run, before = carried[j], last[j]
+        run, before, leap = carried[j], last[j], 0.0
         low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
         for k in range(len(values)):
             value = values[k, j]
+            if abs(value - before) > leap:  # not NaN
+                leap = abs(value - before)
             if value != before and low < value < high:  # nearly always
                 run, before = 1.0, value
                 continue
@@ -183,7 +190,7 @@ def _suspect(values: Array, last: Array, carried: Array, runs: Array, limit: flo
                 else:
                     rails[side, j, 3] += 1.0
             low, high = max(-rails[1, j, 2], -limit), min(rails[0, j, 2], limit)
-        runs[j] = run
+        runs[j], leaps[j] = run, leap
     return suspect
 
 

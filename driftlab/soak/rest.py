@@ -28,7 +28,7 @@ from driftlab.filtering.setup import (
     noise_remarks,
     other_calibrations,
 )
-from driftlab.recordings.plausibility import HELD
+from driftlab.recordings.plausibility import HELD, SINGLE
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Sensor
@@ -179,9 +179,9 @@ def _judge_noise(sensor: Sensor, T: Array, epochs: Array, ratios: Array, faults:
     usual = np.median(ratios, axis=0)
     over = np.max(np.divide(ratios, usual, out=np.zeros_like(ratios), where=usual > 0), axis=1)
     loud = (over > LOUD) & (epochs >= ENOUGH)
-    # noise is then what comes when a hold ends
-    held = any(HELD in text and text.startswith(sensor.channel) for text in faults.doubts)
-    if np.sum(epochs[loud]) >= NOTED * np.sum(epochs) and not held:
+    # noise is then what comes when a hold ends, or of those readings
+    of_readings = any((HELD in text or SINGLE in text) and text.startswith(sensor.channel) for text in faults.doubts)
+    if np.sum(epochs[loud]) >= NOTED * np.sum(epochs) and not of_readings:
         faults.doubt(
             f"{sensor.channel}: noise is {np.median(over[loud]):.2g} times the usual between {np.min(T[loud]):.3g} and "
             f"{np.max(T[loud]):.3g} °C ({np.sum(epochs[loud]) / np.sum(epochs):.0%} of the rest), as of vibration, "

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import ALONE, Copies, Rails, Rounding, Thermometer
+from driftlab.recordings.plausibility import ALONE, Copies, Lone, Rails, Rounding, Thermometer
 from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
@@ -147,9 +147,10 @@ def test_axes_that_are_alike_for_a_while_or_stand_still_are_no_copies():
 
 def ends(values, size=999):
     """Return the doubts of readings (N, 1) that come in chunks."""
-    faults, rails = Faults(rows=len(values)), Rails("gyro", None, 1)
+    faults, rails, one = Faults(rows=len(values)), Rails("gyro", None, 1), np.empty(1)
     for start in range(0, len(values), size):
-        _suspect(values[start : start + size], np.full(1, np.nan), np.zeros(1), np.empty(1), np.inf, rails.table)
+        part = values[start : start + size]
+        _suspect(part, np.full(1, np.nan), np.zeros(1), one, np.inf, rails.table, np.empty(1))
     rails.judge(faults)
     return faults.doubts
 
@@ -257,3 +258,59 @@ def test_rows_that_come_ten_times_as_fast_as_readings_are_a_note(steps, rows):
     doubts, notes = of_holds(values, 65_536)
     assert doubts == []
     assert [note.partition(":")[0] for note in notes] == ["gyro gives each reading about 10 times"]
+
+
+def single_readings(x, size):
+    """Return the doubts about readings (N, 3) of a gyro, and how many of each axis stand alone."""
+    faults, look, t = Faults(first_row=0.0), Lone("gyro", None, 3), np.arange(len(x)) * DT
+    last = np.full(3, np.nan)
+    for start in range(0, len(x), size):
+        part, leaps = x[start : start + size], np.zeros(3)
+        _suspect(part, last, np.zeros(3), np.zeros(3), np.inf, np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 3, 1)), leaps)
+        look.look(Chunk(t[start : start + size], {"gyro": part}), leaps, np.inf, faults)
+        last = part[-1]
+    look.judge(faults)
+    return faults.doubts, {what: fault.count for what, fault in faults.found.items() if fault.count}
+
+
+@pytest.mark.parametrize("size", [999, 7_000, N])
+@pytest.mark.parametrize(("every", "far", "doubtful"), [(400, 30.0, True), (400, -3e5, True), (8_000, 30.0, False)])
+def test_single_readings_far_off_are_counted_whatever_the_chunks(size, every, far, doubtful):
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(N, 3)) + 1e-3 * np.arange(N)[:, None]
+    rows = np.arange(every // 2, N, every)
+    x[rows, 1] += far
+    doubts, counts = single_readings(x, size)
+    assert counts == {"readings of gyro y alone between others far off": len(rows)}
+    assert [text.partition(":")[0] for text in doubts] == ["gyro y"] * doubtful
+
+
+def test_a_single_reading_on_the_border_of_two_chunks_is_counted():
+    for row in (6_998, 6_999, 7_000, 7_001):
+        x = np.random.default_rng(4).normal(size=(N, 3))
+        x[row, 2] += 100
+        assert single_readings(x, 7_000)[1] == {"readings of gyro z alone between others far off": 1}
+
+
+def _in_bursts(rng):
+    return rng.normal(size=(N, 3)) * np.where(np.arange(N) // 3_000 % 3 == 1, 100.0, 1.0)[:, None]
+
+
+SCATTERED = {
+    "noise": lambda rng: rng.normal(size=(N, 3)),
+    "noise of tails, Student's of 5": lambda rng: rng.standard_t(5, size=(N, 3)),
+    "bursts of noise": _in_bursts,
+    "coarse steps": lambda rng: np.rint(0.2 * rng.normal(size=(N, 3))),
+    "steps of the level": lambda rng: rng.normal(size=(N, 3)) + 200 * (np.arange(N) // 500 % 2)[:, None],
+    "a tone near half the sampling rate": lambda rng: (
+        500 * np.sin(3.1 * np.arange(N))[:, None] + rng.normal(size=(N, 3))
+    ),
+    "nothing": lambda rng: np.zeros((N, 3)),
+}
+
+
+@pytest.mark.parametrize("kind", SCATTERED)
+def test_noise_motion_and_steps_are_no_single_readings(kind):
+    doubts, counts = single_readings(SCATTERED[kind](np.random.default_rng(5)), 7_000)
+    assert doubts == []
+    assert sum(counts.values()) <= (20 if "tails" in kind else 4 if "bursts" in kind else 0)

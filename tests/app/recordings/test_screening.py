@@ -75,7 +75,9 @@ def test_a_range_in_the_wrong_unit_leaves_nothing_and_says_so():
 def test_without_a_range_nothing_is_saturated():
     faults = Faults()
     list(read(config(limit=None), faults))
-    assert len(faults.lines()) == 1
+    alone, stuck = faults.lines()
+    assert alone.startswith("readings of gyro z alone between others far off: 1 (first -5.3 rad/s at 10.01 s)")
+    assert "stuck" in stuck
 
 
 @given(size=st.integers(1, 500))
@@ -118,11 +120,12 @@ def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
     chunk = Chunk(np.arange(400.0), {"gyro": values}, before)
     carried = np.zeros(2) if first else np.array([STUCK - 20.0, 3.0])
     last = np.full(2, np.nan) if first else np.zeros(2)
-    runs, rails = np.empty(2), np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 2, 1))
-    suspect = _suspect(values, last, carried, runs, level, rails)
+    runs, leaps, rails = np.empty(2), np.empty(2), np.tile([-np.inf, 0.0, -np.inf, 0.0], (2, 2, 1))
+    suspect = _suspect(values, last, carried, runs, level, rails, leaps)
     repeats = _repeats(chunk, "gyro", carried)
     assert suspect == bool(np.any(repeats >= STUCK) or np.any(np.abs(values) >= level))
     np.testing.assert_array_equal(runs, repeats[-1])
+    np.testing.assert_array_equal(leaps, np.nanmax(np.abs(np.diff(values, axis=0, prepend=last[None])), axis=0))
 
 
 @given(seed=st.integers(0, 2**32 - 1), epochs=st.integers(1, 20))

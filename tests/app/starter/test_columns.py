@@ -82,6 +82,17 @@ def test_noise_is_that_of_the_quietest_stretch():
     assert noise_of(t[:50], values[:50]) is None
 
 
+def test_single_readings_far_off_are_no_noise():
+    """0.2 % of 200 deviations would make the noise 13 times as large, and the walk at most as much larger."""
+    t = np.arange(60_000) / 100
+    values = RNG.standard_normal((60_000, 2))
+    spoilt = values.copy()
+    spoilt[RNG.choice(60_000, 120, replace=False), 0] += 200
+    clean, noise = noise_of(t, values), noise_of(t, spoilt)
+    np.testing.assert_allclose(noise.white, 0.1, rtol=0.05)
+    np.testing.assert_allclose(noise.walk, clean.walk, rtol=0.2)
+
+
 def test_the_walk_is_that_whose_allan_curve_has_this_floor():
     """The curve of white noise N and a walk K is lowest at K = sqrt(3) / 2 B^2 / N: what is drawn comes back."""
     t = np.arange(200_000) / 10
