@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
@@ -31,8 +32,8 @@ from driftlab.identification.records import Progress, gather
 from driftlab.identification.result import Identification, Outcome, closed, investigate
 from driftlab.maps.fit import fit_map
 from driftlab.recordings.epochs import epochs
-from driftlab.recordings.identity import TWICE, identity, span_of
-from driftlab.recordings.overlap import SMALL, Content, recording_content
+from driftlab.recordings.identity import identity, span_of
+from driftlab.recordings.overlap import SAME, SMALL, TWICE, Contents
 from driftlab.recordings.screening import read
 from driftlab.reports.explain import prediction_chart, tables, write_report
 from driftlab.reports.figures import figure_of
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")
-SAME = 0.9  # share of the samples from which on two recordings are one
 
 
 class ExplainResult(Result):
@@ -122,8 +122,7 @@ def explain(
         The declared model; the map that it names, if it does, is fitted on the calibration.
     calibration : as `data` of `run`, or a list of them
         The soak; may be repeated.
-        All recordings are at rest. What is in memory is distinguished by the hash of its samples; parts that overlap
-        are not recognised.
+        All recordings are at rest. Recordings are compared by their samples, those in memory too.
     train : as `calibration`
         To find effects on; may be repeated.
     holdout : as `calibration`
@@ -351,35 +350,24 @@ def distinct(config: Config, recordings: Mapping[str, Sequence[str]]) -> tuple[l
     for role, k, others, problem, same in pairs:
         name = recordings[role][k]
         for other in others:
-            if SMALL < _share(name, other, contents) < same:
+            if SMALL < contents.share(name, other) < same:
                 raise ConfigError(f"--{role} {name}: {problem.format(other)}")
-    names = [next((c for c in calibration if _share(name, c, contents) >= SAME), name) for name in train]
+    names = [next((c for c in calibration if contents.share(name, c) >= SAME), name) for name in train]
     return list(calibration), names
 
 
-def _contents(config: Config, names: Sequence[str]) -> dict[str, Content]:
-    """Return the contents of recordings, read side by side; empty where all are parts of one file."""
-    if len({span_of(name)[0] for name in names}) < 2:
-        return {}
+def _contents(config: Config, names: Sequence[str]) -> Contents:
+    """Return the contents of recordings, read side by side; they are not read where all are parts of one file."""
     assert config.filter is not None
-    channel = config.filter.tracked.channel
+    contents = Contents(config.filter.tracked.channel)
 
-    def content(name: str) -> Content:
-        chunks = read(with_recording(config, name), Faults())
-        return recording_content((chunk for chunk in chunks if channel in chunk.channels), channel)
+    def take(name: str) -> None:
+        deque(contents.along(name, read(with_recording(config, name), Faults())), 0)
 
-    with ThreadPoolExecutor(2) as pool:
-        return dict(zip(names, pool.map(content, names), strict=True))
-
-
-def _share(name: str, other: str, contents: Mapping[str, Content]) -> float:
-    """Return the share of the samples of the shorter recording that is in both; 1 where one file's parts overlap."""
-    (file, start, stop), (other_file, other_start, other_stop) = span_of(name), span_of(other)
-    if file == other_file:
-        if (start, stop) == (other_start, other_stop):
-            return 1.0
-        return SAME / 2 if start < other_stop and other_start < stop else 0.0
-    return contents[name].share(contents[other])
+    if len({span_of(name)[0] for name in names}) > 1:
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(take, names))
+    return contents
 
 
 def show(result: ExplainResult, given: Mapping[str, Any]) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from driftlab.filtering.setup import ENOUGH, shown_by_soak, too_few_updates
 from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
-from driftlab.recordings.identity import TWICE, span_of
+from driftlab.recordings.overlap import Contents
 from driftlab.recordings.screening import read
 from driftlab.soak.agreement import contradictions
 from driftlab.soak.blocks import SoakRows, SoakSummary, brief, means
@@ -327,14 +327,19 @@ def gather(
     Raises
     ------
     ConfigError
-        If parts of one file, or of copies of it, overlap.
+        If recordings have samples in common, in whatever file or cut.
     DataError
         If a recording cannot be used.
     """
-    _check_overlap(recordings)
+    contents = Contents(config.filter.tracked.channel if config.filter else "gyro")
+    contents.check_apart(recordings)
     configs = [with_recording(config, item) for item in recordings] or [config]
     used = Used()
-    parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
+    rows: list[Iterator[Chunk]] = [read(c, faults) for c in configs]
+    if len(rows) > 1:
+        rows = list(map(contents.along, recordings, rows))
+    parts = [_samples(*each, faults, used, progress, keep=keep) for each in zip(configs, rows, strict=True)]
+    contents.check_apart(recordings)
     windows = tuple(window for part in parts for window in part.windows)
     starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
     smooth, steps = soak_temperatures([(part.t, part.T) for part in parts])
@@ -354,13 +359,6 @@ def gather(
         _joined([part.t for part in parts], interval), T, bias, names, starts, interval, _about(configs), placements,
         windows, used, steps, off, tuple(faults.doubts),
     )  # fmt: skip
-
-
-def _check_overlap(recordings: Sequence[str]) -> None:
-    for one, other in combinations(recordings, 2):
-        (content, start, stop), (same, begin, end) = span_of(one), span_of(other)
-        if content == same and start < end and begin < stop:
-            raise ConfigError(f"{other}: {TWICE.format(one)}")
 
 
 def _compare(config: Config, parts: Sequence[_Samples], names: Sequence[str], faults: Faults) -> None:
@@ -414,14 +412,14 @@ class _Samples(NamedTuple):
 
 
 def _samples(
-    config: Config, faults: Faults, used: Used, progress: Progress | None = None, *, keep: bool = False
+    config: Config, rows: Iterable[Chunk], faults: Faults, used: Used, progress: Progress | None, *, keep: bool
 ) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
     stretches: list[RestStretch] = []
     times: list[Array] = []
     count, before, seconds, moving = 0, replace(faults), used.seconds, used.moving
     used.most = 0
-    for rest in at_rest(config, epochs(read(config, faults), interval), faults, used):
+    for rest in at_rest(config, epochs(rows, interval), faults, used):
         times.append(rest.window.t)
         stretches.append(rest if keep else rest._replace(window=NOTHING))
         count += len(rest.T)

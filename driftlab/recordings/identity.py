@@ -18,7 +18,6 @@ from fusion_core.contracts import FileSource, Source
 from fusion_core.errors import UnreadableFile
 
 STANDARD_INPUT = Path("-")
-TWICE = "has samples in common with {}, and would count twice; name it once, or give parts that do not overlap"
 HOLLOW = 100  # times what it takes on its disk: a larger file is little more than a hole
 
 

@@ -7,13 +7,16 @@ Where two words agree, so must the values that they begin with, within a part of
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.recordings.identity import span_of
 from fusion_core.chunk import Array, Chunk, Flags
+from fusion_core.errors import ConfigError
 
 BITS = 64  # of a word, at most
 MAX_WORDS = 200_000  # words of a recording, at most about twice as many: those whose own bits choose them
@@ -23,6 +26,8 @@ ROUNDED = 1e-6  # of a value, by which it may differ
 STEPS = 1000  # samples of a chunk that its usual step is taken of
 MIN_COMMON = 8  # words in common that count
 SMALL = 0.01  # share of the shorter recording that may be in common by some accident
+SAME = 0.9  # share from which on two recordings are one
+TWICE = "has samples in common with {}, and would count twice; name it once, or give parts that do not overlap"
 
 Words = NDArray[np.uint64]
 
@@ -53,34 +58,75 @@ class Content:
         return common / min(len(one.words), len(two.words)) if common >= MIN_COMMON else 0.0
 
 
-def recording_content(chunks: Iterable[Chunk], channel: str) -> Content:
-    """Return the words of a channel (N, d) in all of a recording."""
-    words: list[Words] = []
-    values: list[Array] = []
-    steps: list[Array] = []
-    sparse, tail = 1, None
-    for chunk in chunks:
-        x = chunk[channel].reshape(len(chunk), -1)
-        x = x if tail is None else np.concatenate([tail, x])
+class Contents:
+    """The contents of recordings by their names: words of the samples of `channel`, taken while these pass."""
+
+    def __init__(self, channel: str) -> None:
+        self.channel, self._of = channel, dict[str, Content]()
+
+    def along(self, name: str, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Pass on the chunks of a recording, and keep its words at its end."""
+        words = _WordsOf()
+        for chunk in chunks:
+            if self.channel in chunk.channels:
+                words.take(chunk[self.channel].reshape(len(chunk), -1))
+            yield chunk
+        self._of[name] = words.content()
+
+    def share(self, one: str, other: str) -> float:
+        """Return the share of the samples of the shorter recording that is in both; 0 before these are known.
+
+        Parts of one file are not read for it: equal ones share all, others that overlap some.
+        """
+        (file, start, stop), (same, begin, end) = span_of(one), span_of(other)
+        if file != same:
+            return self._of[one].share(self._of[other]) if one in self._of and other in self._of else 0.0
+        if (start, stop) == (begin, end):
+            return 1.0
+        return SAME / 2 if start < end and begin < stop else 0.0
+
+    def check_apart(self, names: Sequence[str]) -> None:
+        """Raise ConfigError if two recordings have samples in common."""
+        for one, other in combinations(names, 2):
+            if self.share(one, other) > SMALL:
+                raise ConfigError(f"{other}: {TWICE.format(one)}")
+
+
+class _WordsOf:
+    """Words of the samples of a sensor so far, and the values that they begin with."""
+
+    def __init__(self) -> None:
+        self.words: list[Words] = []
+        self.values: list[Array] = []
+        self.steps: list[Array] = []
+        self.sparse = 1
+        self.tail: Array | None = None  # rows of which no word is whole yet
+
+    def take(self, x: Array) -> None:
+        """Take the next samples (N, d)."""
+        x = x if self.tail is None else np.concatenate([self.tail, x])
         long = _rows(x.shape[1])
-        tail = x[-long:]
+        self.tail = x[-long:]
         if len(x) <= long:
-            continue
-        steps.append(np.median(np.abs(np.diff(x[:STEPS], axis=0)), axis=0))
+            return
+        self.steps.append(np.median(np.abs(np.diff(x[:STEPS], axis=0)), axis=0))
         new = _words(x, long)
-        keep = np.flatnonzero(_chosen(new, sparse))
+        keep = np.flatnonzero(_chosen(new, self.sparse))
         keep = keep[_noisy(new[keep], long * min(x.shape[1], BITS))]
-        words.append(new[keep])
-        values.append(x[keep])
-        while sum(map(len, words)) > 2 * MAX_WORDS:
-            sparse *= 2
-            chosen = [_chosen(part, sparse) for part in words]
-            words = [part[k] for part, k in zip(words, chosen, strict=True)]
-            values = [part[k] for part, k in zip(values, chosen, strict=True)]
-    if not words:
-        return Content(np.zeros(0, dtype=np.uint64), np.zeros((0, 1)), np.zeros(1), 1)
-    unique, first = np.unique(np.concatenate(words), return_index=True)
-    return Content(unique, np.concatenate(values)[first], np.median(steps, axis=0), sparse)
+        self.words.append(new[keep])
+        self.values.append(x[keep])
+        while sum(map(len, self.words)) > 2 * MAX_WORDS:
+            self.sparse *= 2
+            chosen = [_chosen(part, self.sparse) for part in self.words]
+            self.words = [part[k] for part, k in zip(self.words, chosen, strict=True)]
+            self.values = [part[k] for part, k in zip(self.values, chosen, strict=True)]
+
+    def content(self) -> Content:
+        """Return the content of all that was taken."""
+        if not self.words:
+            return Content(np.zeros(0, dtype=np.uint64), np.zeros((0, 1)), np.zeros(1), 1)
+        unique, first = np.unique(np.concatenate(self.words), return_index=True)
+        return Content(unique, np.concatenate(self.values)[first], np.median(self.steps, axis=0), self.sparse)
 
 
 def _rows(d: int) -> int:

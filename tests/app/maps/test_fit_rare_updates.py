@@ -32,6 +32,9 @@ def test_samples_that_are_given_twice_are_refused_and_others_are_not():
     one, other = soak(7200), soak(7200, seed=1)
     with pytest.raises(ConfigError, match=r"data\[1\]: has samples in common with data\[0\], and would count twice"):
         driftlab.fit_map(CONFIG, [one, dict(one)])
+    cut = {name: (values[3000:], unit) for name, (values, unit) in one.items()}
+    with pytest.raises(ConfigError, match=r"data\[1\]: has samples in common with data\[0\], and would count twice"):
+        driftlab.fit_map(CONFIG, [one, {**cut, "time": (cut["time"][0] - 3000.0, "s")}])
     alone, both = driftlab.fit_map(CONFIG, one), driftlab.fit_map(CONFIG, [one, other])
     assert 0.5 < np.mean(both.map.sigma([20.0]) / alone.map.sigma([20.0])) < 1.0
 

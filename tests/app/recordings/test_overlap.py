@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from driftlab.recordings.overlap import MAX_WORDS, recording_content
-from fusion_core.chunk import Chunk
+from driftlab.recordings.overlap import MAX_WORDS, _WordsOf
 
 
 def content(x, rows=1000):
-    parts = np.array_split(x, max(len(x) // rows, 1))
-    return recording_content((Chunk(np.arange(len(part)) * 1.0, {"gyro": part}) for part in parts), "gyro")
+    words = _WordsOf()
+    for part in np.array_split(x, max(len(x) // rows, 1)):
+        words.take(part)
+    return words.content()
 
 
 def noise(seed, d, N=6000):
