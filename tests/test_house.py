@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4139
+    assert 0 < count <= 4141
 
 
 def imports():
@@ -259,11 +259,11 @@ BUDGET = {
     "driftlab": 639,
     "driftlab/commands": 3811,
     "driftlab/evaluation": 1610,
-    "driftlab/family": 3414,
+    "driftlab/family": 3408,
     "driftlab/filtering": 1329,
     "driftlab/identification": 2345,
     "driftlab/live": 844,
-    "driftlab/maps": 2089,
+    "driftlab/maps": 2090,
     "driftlab/noise": 1557,
     "driftlab/planning": 1261,
     "driftlab/production": 3222,
@@ -280,7 +280,7 @@ BUDGET = {
     "fusion_core/fast": 860,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1319,
+    "fusion_core/thermal": 1321,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 251,

@@ -30,7 +30,7 @@ from driftlab.family.bands import Bands
 from driftlab.family.baseline import Baseline
 from driftlab.family.basis import SplineBasis
 from driftlab.family.partitions import SIZE, FamilyUnits, Partition, Partitions, UnitOfLot, added, in_partitions, tree
-from driftlab.family.record import LOT_DIGITS, Covariances, Numbers, RoundedCovariances
+from driftlab.family.record import LOT_DIGITS, Covariances, RoundedCovariances
 from driftlab.family.reml import (
     ByLot,
     Means,
@@ -47,6 +47,7 @@ from driftlab.family.tail_law import TailLaws
 from driftlab.family.terms import TermsLaw
 from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array, Integers
+from fusion_core.thermal.curve_error import Numbers
 from fusion_core.thermal.fitted_map import COLDEST, HOTTEST
 from fusion_core.thermal.map_file import expect_covariance
 from fusion_core.thermal.record_texts import AxisNames, Name, Plain, SiUnit, check_tree

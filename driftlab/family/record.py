@@ -13,23 +13,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator
 
 from fusion_core.chunk import Array
+from fusion_core.thermal.curve_error import Numbers, numbers
 
 LOT_DIGITS = 9  # significant ones of a lot's covariance, of which there are many
 
 
-def _finite(values: Any) -> Array:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError("no array of numbers") from None
-    if not np.all(np.isfinite(array)):
-        raise ValueError("a number that is not finite")
-    return array
-
-
 def _square(values: Any) -> Array:
     """Return the symmetric matrices (..., q, q) of lists of upper triangles, row by row; arrays as they are."""
-    triangles = _finite(values)
+    triangles = numbers(values)
     n = triangles.shape[-1] if triangles.ndim else 0
     q = (isqrt(8 * n + 1) - 1) // 2
     if isinstance(values, np.ndarray) or q * (q + 1) // 2 != n:
@@ -48,7 +39,6 @@ def _rounded_triangles(matrices: Array) -> Any:
     return [[float(f"{value:.{LOT_DIGITS}g}") for value in row] for row in _triangles(matrices)]
 
 
-Numbers = Annotated[Array, PlainValidator(_finite), PlainSerializer(np.ndarray.tolist)]
 Covariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_triangles)]
 RoundedCovariances = Annotated[Array, PlainValidator(_square), PlainSerializer(_rounded_triangles)]
 

@@ -24,7 +24,6 @@ from pydantic import (
 
 from driftlab.family.contrasts import EffectContrasts, UnitRows, columns_of, seen_temperatures
 from driftlab.family.partitions import Partitions, UnitOfLot, by_lot
-from driftlab.family.record import Numbers
 from driftlab.family.shared_effect_search import Offer, between, chances, mean_of, noise_of, together
 from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
@@ -35,6 +34,7 @@ from fusion_core.chunk import Array, Integers
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 from fusion_core.host.registry import Installed
+from fusion_core.thermal.curve_error import Numbers
 from fusion_core.threads import one_thread
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are distinguished

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from driftlab.family.record import Covariances, Numbers, TermParabolas, UnitRecord
+from driftlab.family.record import Covariances, TermParabolas, UnitRecord
 from driftlab.family.reml import WEIGHT, fit_axis
 from driftlab.triad.model import PARABOLA, TermPrior
 from fusion_core.chunk import Array
+from fusion_core.thermal.curve_error import Numbers
 from fusion_core.thermal.map_file import expect_covariance
 
 MIN_UNITS = 5  # of which a law is fitted

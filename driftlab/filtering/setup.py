@@ -34,7 +34,7 @@ FORCE = "accel"  # the channel of the specific force
 TURNED = 0.02  # rad, between two inputs: more is no bias
 CHANCE = 1e-3  # probability that noise as it is declared is said to be another
 ENOUGH = 3  # updates of an alignment
-SEEN = np.log(100.0)  # of the evidence of a difference between up and down, whatever its cause
+SEEN = np.log(100.0)  # of the evidence that up and down differ: one soak in 1,000 of all noises drawn has more
 OFF = 5.0  # factor between measured and declared noise: more may be a wrong unit or path
 
 

@@ -43,7 +43,7 @@ class Misfit(Frozen):
     noise: Annotated[FiniteFloat, Field(ge=0)]
 
 
-def _finite(values: Any) -> Array:
+def numbers(values: Any) -> Array:
     """Return numbers, nested as they may be, as an array that cannot be written to."""
     try:
         array = np.array(values, dtype=np.float64)
@@ -52,6 +52,10 @@ def _finite(values: Any) -> Array:
     if array.ndim == 0 or not np.all(np.isfinite(array)):
         raise ValueError("finite numbers in rows were expected")
     return locked(array)
+
+
+Numbers = Annotated[Array, PlainValidator(numbers), PlainSerializer(np.ndarray.tolist)]
+"""An array in a record: numbers nested in lists as JSON, read-only once they are read."""
 
 
 def six_digits(modes: Array) -> Array:
@@ -85,7 +89,7 @@ class CurveError(Frozen):
     """
 
     T: tuple[FiniteFloat, ...]
-    modes: Annotated[Array, PlainValidator(_finite), PlainSerializer(np.ndarray.tolist)]
+    modes: Numbers
     bend: tuple[FiniteFloat, ...]
     holes: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
     misfits: tuple[Misfit, ...] = ()

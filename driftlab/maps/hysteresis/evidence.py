@@ -28,10 +28,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.filtering.setup import SEEN
 from driftlab.maps.hysteresis.contrasts import SIZES, THIN, TINY, SoakContrasts, log_mean
 from fusion_core.chunk import Array, Integers
 
-SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
 MAX_T = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is

@@ -9,8 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from driftlab.filtering.setup import SEEN
 from driftlab.maps.hysteresis.contrasts import FINEST, MIN_CONTRASTS, THIN, FollowingCurves, SoakContrasts
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, Pairs, ShapeEvidence
 from driftlab.maps.hysteresis.rivals import of_a_jump, tone_of
 from driftlab.maps.hysteresis.shapes import MemoryShapes, Sweeps, shapes_of
 from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
