@@ -161,15 +161,12 @@ class Whiteness:
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""
-        products, total = self._products.copy(), self._total.copy()
+        products, total, lag = self._products.copy(), self._total.copy(), np.arange(self.lags + 1)[:, None]
         _lagged(np.concatenate([self._last, np.zeros((self.lags, len(total)))]), len(self._last), products, total)
-        lag = np.arange(self.lags + 1)[:, None]
-        mean = total / self.N
-        none = np.zeros((1, len(mean)))
+        mean, none = total / self.N, np.zeros((1, len(total)))
         edges = (np.cumsum(np.concatenate([none, part]), axis=0) for part in (self._first, self._last[::-1]))
         ends = sum(edge[np.minimum(lag[:, 0], len(edge) - 1)] for edge in edges)
-        covariances: Array = products - mean * (2 * total - ends) + np.maximum(self.N - lag, 0) * mean**2
-        return covariances
+        return np.asarray(products - mean * (2 * total - ends) + np.maximum(self.N - lag, 0) * mean**2)
 
     def autocorrelation(self) -> Array:
         """Return the autocorrelation (lags, m) at lags 1 to `lags`."""

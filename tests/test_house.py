@@ -172,7 +172,7 @@ def test_the_numerics_of_the_core_stay_small():
     """Every module of the core that is no contract, host, law or unit counts: there is no list to forget one in."""
     rooms = {(name, path, tree) for name, path, tree in modules() if name.startswith("fusion_core.")}
     count = sum(code_lines(path, tree) for name, path, tree in rooms if name.split(".")[1] not in NO_NUMERICS)
-    assert 0 < count <= 4141
+    assert 0 < count <= 4139
 
 
 def imports():
@@ -275,12 +275,12 @@ BUDGET = {
     "driftlab/starter": 927,
     "driftlab/storage": 1287,
     "driftlab/triad": 717,
-    "fusion_core": 1978,
+    "fusion_core": 1975,
     "fusion_core/contracts": 1995,
-    "fusion_core/fast": 860,
+    "fusion_core/fast": 862,
     "fusion_core/host": 745,
     "fusion_core/testing": 988,
-    "fusion_core/thermal": 1321,
+    "fusion_core/thermal": 1320,
     "fusion_core/units": 428,
     "plugins": 302,
     "plugins/bias_models": 251,

@@ -118,12 +118,10 @@ def _filled(lists: list[Integers], filling: int) -> Integers:
 def _nonzero(matrices: Array) -> Flags:
     """Return the flags of entries (i, j) that are not zero in all matrices (K, i, j), by their bits less the sign."""
     if len(matrices) == 1:
-        once: Flags = matrices[0] != 0
-        return once
+        return np.asarray(matrices[0] != 0)
     rows, columns = matrices.shape[1:]
     flat = np.ascontiguousarray(matrices).reshape(len(matrices), rows * columns).view(np.uint64)
-    nonzero: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
-    return nonzero
+    return np.asarray((_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0)
 
 
 @compiled

@@ -19,7 +19,7 @@ from fusion_core.checks import FLOAT, covariance
 from fusion_core.chunk import Array, Flags, every
 from fusion_core.fast import compiled, inlined, loop
 from fusion_core.fast.groups import IndependentGroups, Lanes, Size, find_groups
-from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
+from fusion_core.fast.loop import Data, Model, Places, SampleArrays, SampleStep, recursive
 from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Measurement, State, Transition
 
@@ -116,21 +116,28 @@ class Job:
         y, white = (np.empty((N, m)) if self.complete else np.full((N, m), np.nan) for _ in range(2))
         x, sigma, nis, log_det = np.empty((N, n)), np.empty((N, n)), np.empty(N), np.empty(N)
         P, K, root = np.empty((N if keep_P else 0, G, s, s)), np.zeros((some, G, c, s)), np.zeros((some, G, c))
+        (F, F_t, Q), (w, q, of_group), H = np.zeros((3, G, s, s)), np.zeros((3, s)), np.zeros((G, c, s))
+        self.step = SampleStep(F, F_t, Q, H, np.zeros((G, s)), of_group, w, q)
         self.results = SampleArrays(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
 
     def recursive(self, start: int, stop: int) -> int:
         """Run up to `stop`, or further while P is wide; return where."""
         at = start
         while at < stop:
-            x, P, given = self.x, self.P, self._part(at, stop)
-            self.x, self.P, done = recursive(self.places, x, P, *given, self.fours)
+            x, P = self.x, self.P
+            self.x, self.P, done = self._recursion(x, P, at, stop)
             if at + done < stop:  # not finite after it, or P is too wide for it
                 covariance("Q", self.model.Q[min(at + done, len(self.model.Q) - 1)], sample=at + done)
                 if done:
-                    x, P, _ = recursive(self.places, x, P, *self._part(at, at + done), self.fours)
+                    x, P, _ = self._recursion(x, P, at, at + done)
                 done += self._wide(x, P, at + done)
             at += done
         return at
+
+    def _recursion(self, x: Array, P: Array, start: int, stop: int) -> tuple[Array, Array, int]:
+        given = self.places, (x.copy(), np.empty_like(x)), (P.copy(), np.empty_like(P)), self.step
+        x, P, done = recursive(*given, *self._part(start, stop), self.fours)
+        return x, P, done
 
     def _wide(self, x: Array, P: Array, start: int) -> int:
         """Run from x (G, s) and P (G, s, s) on until P is narrow; return how many samples that took."""

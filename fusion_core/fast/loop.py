@@ -5,6 +5,7 @@ of places, so that `predict` and `correct` are the textbook's, for s states that
 and c come as lengths of tuples: the compiler then knows them and unrolls the loops, which are two to three times as
 fast. What is compiled together stands in one file: the compiler keeps its results file by file. And few views, no
 further parts in `recursive`: past a size the compiler no longer drops its count of references, at three times the time.
+Nor are arrays made there: that takes an eighth of the time to compile it.
 
 Where P is far wider than R, what is measured would be lost in its rounding, whatever the form of the update: such a
 sample is given up, and done by `fusion_core.fast.factored`.
@@ -54,6 +55,9 @@ class Data(NamedTuple):
     used: Flags  # (N, m)
     gates: Array  # (m + 1,) largest nis by the number of components that were measured
     reset: Flags  # (n,)
+
+
+Pair = tuple[Array, Array]
 
 
 class SampleStep(NamedTuple):
@@ -279,19 +283,17 @@ def measure(
 
 @compiled
 def recursive(
-    places: Places, x: Array, P: Array, model: Model, data: Data, results: SampleArrays, fours: bool | None
-) -> tuple[Array, Array, int]:
+    places: Places, of_x: Pair, of_P: Pair, step: SampleStep, model: Model, data: Data, results: SampleArrays,
+    fours: bool | None,
+) -> tuple[Array, Array, int]:  # fmt: skip
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
-    The third that is returned is the first sample after which anything is not finite, or N. The gate looks at all
-    groups: each is predicted and corrected, and what was predicted stands where it refuses. `fours` is None for groups
-    of fewer than four states: the compiler leaves out then what only many need.
+    Both are the first of a pair of arrays that it writes to. The third that is returned is the first sample after which
+    anything is not finite, or N. The gate looks at all groups: each is predicted and corrected, and what was predicted
+    stands where it refuses. `fours` is None for groups of fewer than four states: the compiler leaves out then what
+    only many need.
     """
-    (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
-    x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
-    x, P = x.copy(), P.copy()
-    F, H = np.zeros((G, s, s)), np.zeros((G, len(places.c), s))
-    step = SampleStep(F, F.copy(), F.copy(), H, np.zeros((G, s)), np.zeros(s), np.zeros(s), np.zeros(s))
+    (x, x_), (P, P_), G, n = of_x, of_P, len(places.states), np.uint64(model.F.shape[1])
     for k in range(len(data.z)):
         sums = InnovationSums(0.0, 0.0, 1.0, 0)
         for g in range(G):

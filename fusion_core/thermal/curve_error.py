@@ -12,6 +12,7 @@ way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid point
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Any, Self
 
@@ -45,13 +46,11 @@ class Misfit(Frozen):
 
 def numbers(values: Any) -> Array:
     """Return numbers, nested as they may be, as an array that cannot be written to."""
-    try:
+    with suppress(TypeError, ValueError, OverflowError):
         array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError("numbers were expected, as many in each row") from None
-    if array.ndim == 0 or not np.all(np.isfinite(array)):
-        raise ValueError("finite numbers in rows were expected")
-    return locked(array)
+        if array.ndim and np.all(np.isfinite(array)):
+            return locked(array)
+    raise ValueError("finite numbers were expected, as many in each row")
 
 
 Numbers = Annotated[Array, PlainValidator(numbers), PlainSerializer(np.ndarray.tolist)]
