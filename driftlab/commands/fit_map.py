@@ -30,7 +30,7 @@ from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_all
 from fusion_core.chunk import Array
-from fusion_core.contracts import ThermalMap
+from fusion_core.contracts import ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults, in_doubt
 from fusion_core.host.provenance import participants
@@ -276,10 +276,8 @@ def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
     if family is None and lot is not None:
         raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     if family is not None and more:
-        raise ConfigError(
-            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare, "
-            "--report and --certificate out"
-        )
+        gives = "gives a spline over the family's range, and no page"
+        raise ConfigError(f"--family: {gives}; leave --kind, --select, --compare, --report and --certificate out")
 
 
 def _asks_for_triad(terms: str | None, stimulus: str | None, others: bool) -> bool:
@@ -335,9 +333,11 @@ def show(result: FitMapResult | FamilyMapResult | TriadMapResult, given: Mapping
     _print_map(result)
     say(f"written to {', '.join(map(str, result.written))}\n")
     if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
-        path = os.path.relpath(result.written[0], given["config"].file.parent)
-        line = f"{{kind: {result.map.record.kind}, path: {path}}}"
-        say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")
+        kind, path = result.map.record.kind, os.path.relpath(result.written[0], given["config"].file.parent)
+        place = "bias.map" if isinstance(result.sensor.bias, ThermalBias) else "calibration"
+        there = any(settings.kind == kind for settings in given["config"].tracked_maps())  # with its order or interval
+        line = f".path: {path}" if there else f": {{kind: {kind}, path: {path}}}"
+        say(f"to use it, write in the config: {result.sensor.section}.{place}{line}\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:

@@ -123,6 +123,8 @@ def test_a_prediction_far_beyond_its_sigma_is_named_and_one_within_is_not():
     (line,) = said(replace(QUIET, yardsticks=replace(SCORES, coast=coast)), journal())
     assert line.startswith("prediction, to the end: off by gyro y ")
     assert "34 times its sigma" in line
+    assert "of the map" not in line  # the config has none
+    assert "fit a map of the temperature with driftlab fit-map" in line
     near = {**SCORES.coast, "to the end": np.array([1.0, 3.5, 2.0])}
     assert said(replace(QUIET, yardsticks=replace(SCORES, coast=near)), journal()) == []
 
