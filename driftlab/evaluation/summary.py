@@ -87,7 +87,7 @@ def remarks(run: ScoredRun) -> list[str]:
         )
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
-        lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
+        lines.append(f"NIS {nis.mean:.3g} per component, {expected}: {inconsistency(nis.mean)}")
     lines += wandering(run)
     updates = model.align / first.dt
     noises = (noise_remarks(s, first.noise_ratio[s.channel], updates=updates) for s in model.sensors)
