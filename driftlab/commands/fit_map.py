@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +29,7 @@ from driftlab.soak.blocks import means, runs
 from driftlab.storage.json import plain, text_of
 from driftlab.storage.map_file import check_all
 from fusion_core.chunk import Array
-from fusion_core.contracts import ThermalBias, ThermalMap
+from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults, in_doubt
 from fusion_core.host.provenance import participants
@@ -333,11 +332,7 @@ def show(result: FitMapResult | FamilyMapResult | TriadMapResult, given: Mapping
     _print_map(result)
     say(f"written to {', '.join(map(str, result.written))}\n")
     if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
-        kind, path = result.map.record.kind, os.path.relpath(result.written[0], given["config"].file.parent)
-        place = "bias.map" if isinstance(result.sensor.bias, ThermalBias) else "calibration"
-        there = any(settings.kind == kind for settings in given["config"].tracked_maps())  # with its order or interval
-        line = f".path: {path}" if there else f": {{kind: {kind}, path: {path}}}"
-        say(f"to use it, write in the config: {result.sensor.section}.{place}{line}\n")
+        say(f"to use it, write in the config: {result.line_for(given['config'])}\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:
