@@ -190,9 +190,8 @@ def _run() -> None:
     for name in COUNTS:
         value, least = os.environ.get(name, "1"), int(name.endswith("THREADS"))
         if not (value.isdecimal() and int(value) >= least):
-            raise ConfigError(
-                f"{name}='{quote(value)}': a whole number from {least} on was expected of this variable; unset it"
-            )
+            given = f"{name}='{quote(value)}'"
+            raise ConfigError(f"{given}: a whole number from {least} on was expected of this variable; unset it")
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
             raise ConfigError(f"'{quote(argument)}': is not UTF-8 text; rename the file, results could not name it")

@@ -180,6 +180,8 @@ def load_config(
     ConfigError
         With one line for each thing that is wrong.
     """
+    if str(path) in products() and not path.exists():
+        raise ConfigError(f"{path}: is a packaged product, which a config names; write one with extends: {path}")
     config = understood(reduce(override, settings, read_document(path, products())), measuring=measuring)
     config._file = path
     return config if recording is None else with_recording(config, recording)
@@ -263,9 +265,8 @@ def _seconds(text: str, recording: str) -> float | None:
     if not text:
         return None
     if not NUMBER.fullmatch(text) or not abs(float(text)) <= LIMITS["s"][1]:
-        raise ConfigError(
-            f"'{quote(recording, 200)}': '{quote(text)}' is not a number of seconds; write PATH::START:STOP"
-        )
+        given = quote(recording, 200)
+        raise ConfigError(f"'{given}': '{quote(text)}' is not a number of seconds; write PATH::START:STOP")
     return Quantity(float(text), f"{text} s", "s")
 
 

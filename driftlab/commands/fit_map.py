@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -276,10 +275,8 @@ def _check_family(family: Place | None, lot: str | None, more: bool) -> None:
     if family is None and lot is not None:
         raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     if family is not None and more:
-        raise ConfigError(
-            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare, "
-            "--report and --certificate out"
-        )
+        gives = "gives a spline over the family's range, and no page"
+        raise ConfigError(f"--family: {gives}; leave --kind, --select, --compare, --report and --certificate out")
 
 
 def _asks_for_triad(terms: str | None, stimulus: str | None, others: bool) -> bool:
@@ -335,9 +332,7 @@ def show(result: FitMapResult | FamilyMapResult | TriadMapResult, given: Mapping
     _print_map(result)
     say(f"written to {', '.join(map(str, result.written))}\n")
     if result.sensor is not None and not _names_a_path(result.config) and result.comparison is None:
-        path = os.path.relpath(result.written[0], given["config"].file.parent)
-        line = f"{{kind: {result.map.record.kind}, path: {path}}}"
-        say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")
+        say(f"to use it, write in the config: {result.line_for(given['config'])}\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from driftlab.triad.model import BIAS, GROUPS, SENSITIVITIES, TERMS
 from driftlab.triad.samples import Gathered, stimulus_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Flags
-from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalMap
+from fusion_core.contracts import FittedMap, MapRecord, Stimulus, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, MapError, quote
 from fusion_core.faults import DOUBT, Faults, in_doubt
 from fusion_core.host.provenance import Participant
@@ -80,6 +81,14 @@ class MapResult(Result):
         self.limits = check_limits(config.limits, self.measured, faults.doubts)
         self.limits_verdict = verdict_line(self.limits)
         self.written: tuple[Path, ...] = ()
+
+    def line_for(self, config: Config) -> str:
+        """Return the line of a config by which its filter takes the map that was written, by where it has maps."""
+        assert self.sensor is not None, "it is of a sensor"
+        kind, path = self.map.record.kind, relpath(self.written[0], config.file and config.file.parent)
+        place = f"{self.sensor.section}.{'bias.map' if isinstance(self.sensor.bias, ThermalBias) else 'calibration'}"
+        there = any(settings.kind == kind for settings in config.tracked_maps())  # with its order or interval
+        return f"{place}.path: {path}" if there else f"{place}: {{kind: {kind}, path: {path}}}"
 
     @abstractmethod
     def _texts(self, sheet: Sheet) -> list[str]:
@@ -331,7 +340,6 @@ def _map_of(
 
 def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     """Print the terms, what is not observable, and where the map was written."""
-    assert result.sensor is not None, "the triad is described"
     terminal().print(words.table(result.fit, result.unit))
     say_lines(result.verdict())
     print_verdict(result.limits_verdict, "limits: ")
@@ -341,5 +349,4 @@ def show_triad_map(result: TriadMapResult, given: Mapping[str, Any]) -> None:
     if not np.any(result.fit.observable[len(BIAS) :]):
         say("no term of scale factor and misalignment is known: the map is of no use\n")
         return
-    line = f"{{kind: {result.map.record.kind}, path: {result.written[0]}}}"
-    say(f"to use it, write in the config: {result.sensor.section}.calibration: {line}\n")
+    say(f"to use it, write in the config: {result.line_for(given['config'])}\n")

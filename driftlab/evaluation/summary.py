@@ -87,7 +87,7 @@ def remarks(run: ScoredRun) -> list[str]:
         )
     if not nis.consistent and abs(nis.mean - 1) >= NOTICED:
         expected = f"{nis.low:.3g} to {nis.high:.3g} was expected"
-        lines.append(f"NIS {nis.mean:.3g} a component, {expected}: {inconsistency(nis.mean)}")
+        lines.append(f"NIS {nis.mean:.3g} per component, {expected}: {inconsistency(nis.mean)}")
     lines += wandering(run)
     updates = model.align / first.dt
     noises = (noise_remarks(s, first.noise_ratio[s.channel], updates=updates) for s in model.sensors)
@@ -220,13 +220,12 @@ def mispredicted(run: ScoredRun) -> list[str]:
     for name, (error, _, ratio) in run.predictions.items():
         if np.any(ratio > FAR_OFF) and not _turned(run):  # one that was turned is another matter
             k = int(np.nanargmax(ratio))
-            axis = axis_name(run.sensor.channel, run.yardsticks.axes[k])
-            by = f"{axis} {error[k] * unit.factor:.3g} {unit.shown}"
-            return [
-                f"prediction, {name}: off by {by}, {ratio[k]:.2g} times its sigma and the reference's noise together, "
-                "so map or walk do not fit this recording; check that unit, axes and thermometer are those of the map, "
-                "and see with driftlab explain what is missing"
-            ]
+            by = f"{axis_name(run.sensor.channel, run.yardsticks.axes[k])} {error[k] * unit.factor:.3g} {unit.shown}"
+            mapped = "map or walk do not fit this recording; check that unit, axes and thermometer are those of the map"
+            bare = "the walk does not fit this recording; fit a map of the temperature with driftlab fit-map"
+            so = f"so {mapped if run.config.tracked_maps() else bare}, and see with driftlab explain what is missing"
+            times = f"{ratio[k]:.2g} times its sigma and the reference's noise together"
+            return [f"prediction, {name}: off by {by}, {times}, {so}"]
     return []
 
 

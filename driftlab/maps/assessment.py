@@ -120,7 +120,7 @@ class MapVerdict:
         return numbers | {"memory": self.memory.as_json()}
 
     def _good(self, unit: BiasUnit) -> list[str]:
-        low, high = self.fitted.domain
+        low, high = np.round(self.fitted.domain, 2) + 0.0  # no -0
         between = f"between {low:.3g} and {high:.3g} °C"
         if self.good is None or self.sigma is None:
             left = self.fitted.record.residual
@@ -138,7 +138,7 @@ class MapVerdict:
         good = (
             f"good to {text(float(np.max(self.good)) * unit.factor)} {unit.shown} {between} (1 sigma, rms over the "
             f"range: {each}; worst {self.axes[int(worst)]} {text(self.sigma[k, worst] * unit.factor)} at "
-            f"{self.T[k]:.3g} °C)"
+            f"{round(self.T[k], 2) + 0.0:.3g} °C)"
         )
         level = "another power-up may shift it, and every alignment learns it anew"
         if self.placements is not None:

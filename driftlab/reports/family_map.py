@@ -105,10 +105,9 @@ def _measured(known: UnitPosterior) -> str:
     if known.family.bands is None:
         return GAUSSIAN
     low, high = float(np.min(known.band.factors[1])), float(np.max(known.band.factors[1]))
-    return (
-        f"{measured_on(known.family.bands.units)}: 95 of 100 lay within 1.96 sigma ("
-        f"{low:.2f} to {high:.2f} times that of a Gaussian law where nothing was soaked)"
-    )
+    times = " to ".join(dict.fromkeys((f"{low:.2f}", f"{high:.2f}")))  # one number where they are alike
+    where = f"{times} times that of a Gaussian law where nothing was soaked"
+    return f"{measured_on(known.family.bands.units)}: 95 of 100 lay within 1.96 sigma ({where})"
 
 
 def rms(values: Array) -> Array:

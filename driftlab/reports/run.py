@@ -94,19 +94,19 @@ def result_sentences(run: ScoredRun) -> tuple[str, str]:
         return "No prediction of a minute or more is scored: too little of the recording is at rest.", ""
     errors, sigmas, ratios = of_all[name]
     worst, unsure = int(np.argmax(errors)), int(np.nanargmax(ratios))
-    axis = f", {scores.axes[worst]}" if len(scores.axes) > 1 else ""
+    axis = f" of {scores.axes[worst]}" if len(scores.axes) > 1 else ""
     several, length = name not in HORIZONS, "10 min" if name not in HORIZONS else name
     which = f" of {len(scores.coasts)} predictions" if several else ""
     size = f"{unit.number(errors[worst])} {unit.shown}"
-    result = f"Without updates the bias is predicted over {length} to {size} rms{which}{axis}"
+    result = f"Without updates the bias{axis} is predicted over {length} to {size} rms{which}"
     if several and np.all(np.isfinite(own := scores.coast[length])):
-        result += f"; the first of them is off by {unit.number(own[worst])} {unit.shown}"
+        result += f"; the first is off by {unit.number(own[worst])} {unit.shown}"
     of = axis and f" of {scores.axes[unsure]}"
-    verdict = "a right sigma allows" if ratios[unsure] <= REFUTED else "is too much: widen walk or map"
+    verdict = "sigma is large enough" if ratios[unsure] <= REFUTED else "sigma is too small; widen walk or map"
     size = f"{unit.number(sigmas[unsure])} {unit.shown}"
-    times = f"the error {ratios[unsure]:.1f} times that and the noise of the reference together"
-    whose = f"of all {len(scores.coasts)} the sigma{of}" if several else f"its sigma{of} there"
-    trust = f"{whose} is {size}, {times}, which {verdict}"
+    times = f"the error {ratios[unsure]:.1f} times that and the reference's noise together"
+    whose = f"sigma{of}" + (f" over all {len(scores.coasts)}" if several else " there")
+    trust = f"{whose} is {size}, and {times}: {verdict}"
     known = run.sensor.integral is not None  # without gravity no axis is known as up
     angle = float(np.rad2deg(scores.heading[length])) if known else np.nan
     turned = (
@@ -121,7 +121,7 @@ def nis_sentence(nis: NisTest) -> str:
     """Return in a sentence or two what the NIS says of the deviations of a run."""
     if not np.isfinite(nis.mean):
         return "The NIS is not known, no update was used."
-    mean, bounds = f"The mean NIS a component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
+    mean, bounds = f"The mean NIS per component is {nis.mean:.3f}", f"{nis.low:.3f} to {nis.high:.3f}"
     if nis.consistent:
         return f"{mean}, within {bounds}: innovations are as large as the model says, over one update."
     return f"{mean}, outside {bounds}: {inconsistency(nis.mean)}."
@@ -203,7 +203,7 @@ def nis_chart(overview: Overview, m: int) -> Chart:
     wide = overview.nis_highest > 20 * m
     level = Rule(1.0, "1: as good as it says")
     drawn = tuple(map(_positive, lines)) if wide else lines
-    panel = Panel(drawn, "NIS a component [1]", rules=(level,), log=wide)
+    panel = Panel(drawn, "NIS per component [1]", rules=(level,), log=wide)
     return Chart((panel,), clock.label, "Is the filter as good as it says?")
 
 

@@ -108,7 +108,7 @@ class Yield:
         """Return the yield and its reasons, and the columns by whose groups it differs."""
         whole = self.whole
         why = "limits do not see why" if self.judged else "no limits are set"
-        unlike = f"{whole.accepted_odd:,} of the {whole.accepted:,} accepted units stand out: {why}"
+        unlike = f"accepted units that stand out: {whole.accepted_odd:,} of {whole.accepted:,}; {why}"
         more_than_limits = [unlike] if whole.accepted_odd else []
         if not whole.reasons:
             return more_than_limits

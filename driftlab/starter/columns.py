@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise, noise_of
-from driftlab.starter.names import NO_SENSOR, Name, known_unit, leading, named, quantity_of, read_name
+from driftlab.starter.names import NO_SENSOR, TRIADS, Name, known_unit, leading, named, quantity_of, read_name
 from driftlab.starter.reading import FileColumns
 from driftlab.units import YEARS
 from fusion_core.chunk import Array, Chunk, Flags
@@ -24,7 +24,6 @@ from fusion_core.errors import ConfigError, quote
 from fusion_core.units import convert, same_dimension, to_si
 
 V = TypeVar("V")
-SENSORS = ("gyro", "accel")
 FIELDS = ("time", "gyro", "accel", "temperature")
 
 
@@ -85,7 +84,7 @@ def channels_of(columns: FileColumns, given: Answers, written: Mapping[str, str]
         T = _between(channels["temperature"].values[:, 0]) if "temperature" in channels else None
         own = _known(values)  # rows that are not another sensor's alone
         own = own & led if led is not None and np.any(own & led) else own  # and of these the gyro's, which are used
-        if field in SENSORS and t is not None:
+        if field in TRIADS and t is not None:
             quick = noise_of(t[own], values[own], None if T is None else T[own])
             noise |= {} if quick is None else {field: quick}
         stated = _stated(field, group, columns, given.units, written)
@@ -115,11 +114,8 @@ def _chosen(field: str, text: str, names: list[Name]) -> list[Name]:
     for word in [text] if text in by_path else [part.strip() for part in text.split(",")]:
         alike = [path for path in by_path if path.lower().startswith(word.lower())]
         if word not in by_path and len(alike) != 1:
-            like = (
-                f"{len(alike)} columns begin so"
-                if alike
-                else f"no column of numbers is called so, there are {', '.join(by_path)}"
-            )
+            none = f"no column of numbers is called so, there are {', '.join(by_path)}"
+            like = f"{len(alike)} columns begin so" if alike else none
             raise ConfigError(f"--column {field}={text}: '{word}': {like}; write the whole name of one")
         group.append(by_path[word if word in by_path else alike[0]])
     if len(group) > 3:
@@ -140,7 +136,7 @@ def channels_in(samples: Chunk) -> Channels:
         values = samples[field].reshape(len(samples), -1)
         channels[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
     T = samples.channels.get("temperature")
-    pairs = ((field, noise_of(samples.t, channels[field].values, T)) for field in SENSORS if field in channels)
+    pairs = ((field, noise_of(samples.t, channels[field].values, T)) for field in TRIADS if field in channels)
     return Channels(channels, {field: noise for field, noise in pairs if noise is not None}, (), _step(samples.t))
 
 
@@ -220,7 +216,7 @@ def _stated(
         return Guess(written[field], "as the file says")
     by_name = {name.unit for name in group}
     unit = next(iter(by_name))
-    if unit is not None and field in SENSORS and not same_dimension(unit, USUAL[field].si):
+    if unit is not None and field in TRIADS and not same_dimension(unit, USUAL[field].si):
         why = f"is in {unit}, which is no unit of {field}; name other columns, or its unit with --unit {field}=UNIT"
         raise ConfigError(f"column '{quote(group[0].path)}': {why}")
     return Guess(unit, "by the name") if len(by_name) == 1 and unit is not None else None

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.noise.quick import QuickNoise
-from driftlab.starter.columns import SENSORS, Channels, GuessedChannel, of_accel
-from driftlab.starter.names import Name, read_name
+from driftlab.starter.columns import Channels, GuessedChannel, of_accel
+from driftlab.starter.names import TRIADS, Name, read_name
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
 from fusion_core.escaping import line, yaml_text
@@ -197,7 +197,7 @@ def of_a_sensor(columns: FileColumns) -> OpenQuestion:
 
 
 def _noises(channels: Channels) -> Iterator[str]:
-    for field in SENSORS:
+    for field in TRIADS:
         if field in channels.found and field not in channels.noise:
             yield f"the noise of {field}: no quiet stretch with a known time was found"
 
@@ -244,7 +244,7 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
     yield "filter:"
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 60 s             # at rest at the beginning"
-    for sensor in SENSORS:
+    for sensor in TRIADS:
         channel, noise = channels.found.get(sensor), channels.noise.get(sensor)
         if channel is None and sensor == "accel":
             yield "  accel: null             # none was found"
@@ -267,7 +267,7 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
 
 def _quiet(channels: Channels) -> Iterator[str]:
     """Yield a sentence on each axis that has far less noise than the others of its sensor."""
-    for sensor in SENSORS:
+    for sensor in TRIADS:
         channel, noise = channels.found.get(sensor), channels.noise.get(sensor)
         if channel is None or noise is None:
             continue
@@ -312,7 +312,7 @@ def _stretch(noise: QuickNoise) -> str:
 
 def held_of(columns: FileColumns, channels: Channels) -> Name | None:
     """Return the column that a `held` filter may take, where the file has neither gyro nor accelerometer."""
-    if any(sensor in channels.found for sensor in SENSORS) or "temperature" not in channels.found:
+    if any(sensor in channels.found for sensor in TRIADS) or "temperature" not in channels.found:
         return None
     others = (n for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1)
     return next((name for name in others if _measures(columns.values[name.path])), None)

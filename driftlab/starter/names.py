@@ -46,6 +46,7 @@ SCALE = re.compile(
     re.I,
 )  # of a count, as [131 LSB/(deg/s)] or (0.0305 deg/s/LSB)
 AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "3": "3"}
+VEHICLE = {"gyro": ["roll", "pitch", "yaw"], "accel": ["long", "lat", "vert", "longitudinal", "lateral", "vertical"]}
 FROM_ONE = {"y": "x", "z": "y", "3": "z"}  # of three columns that are counted from 1
 
 
@@ -106,6 +107,10 @@ def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str
     ):
         if axis in AXES and rest and (quantity := _quantity(rest, axis=True)):
             return quantity, AXES[axis], rest
+    for word in words:  # `Roll rate`, `acc_lateral`: axes of a vehicle
+        rest = [other for other in words if other != word]
+        if word in VEHICLE.get(quantity := _quantity(rest, axis=word == words[-1]) or "", ()):
+            return quantity, "xyz"[VEHICLE[quantity].index(word) % 3], rest
     if len(words) > 1 and last in AXES:
         return None, AXES[last], words[:-1]
     return _quantity(words, axis=False), None, words
@@ -128,8 +133,7 @@ def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[N
         if {name.axis for name in group} == set(FROM_ONE):
             group[:] = [replace(name, axis=FROM_ONE[name.axis or ""]) for name in group]
         group.sort(key=lambda name: name.axis or "")
-        axes = [name.axis for name in group]
-        if len(set(axes)) < len(axes):
+        if len({name.axis for name in group}) < len(group):
             del group[1:]
     return sorted(
         groups.values(),
@@ -148,10 +152,9 @@ def _alike(group: list[Name], beside: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def leading(names: Iterable[Name]) -> str | None:
+def leading(names: Sequence[Name]) -> str | None:
     """Return the first column of the gyro that is taken, of the accelerometer where there is none; None without."""
-    names = list(names)
-    groups = [group for quantity in ("gyro", "accel") for group in named(names, quantity)]
+    groups = [group for quantity in TRIADS for group in named(names, quantity)]
     return groups[0][0].path if groups else None
 
 

@@ -202,10 +202,8 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
         if isinstance(item, tuple) and len(item) == 2 and isinstance(item[1], str):
             given[name] = item[0]
             if written.setdefault(name, item[1]) != item[1]:
-                raise UnitError(
-                    f"{title}: channel {name} is in '{quote(item[1])}' and in '{quote(written[name])}' by units; "
-                    "remove one of the two"
-                )
+                own, by = quote(item[1]), quote(written[name])
+                raise UnitError(f"{title}: channel {name} is in '{own}' and in '{by}' by units; remove one of the two")
     return written
 
 
@@ -226,6 +224,8 @@ def _values(name: str, item: Any, unit: str | None, title: str) -> Array:
     """Return a channel in SI: (N, d) of gyro and accel, (N,) or (N, d) of the others."""
     usual = USUAL.get(name)
     array = _plain(item)
+    if name == "time" and array.dtype.kind == "M":  # with a date: s since 1970, as a file's are
+        array, unit = (array - np.datetime64(0, "s")) / np.timedelta64(1, "s"), "s"
     if array.dtype.kind not in "iufb":
         raise BadValue(f"{title}: channel {name} is of type {array.dtype}, numbers were expected; convert it")
     most = (usual and usual.axes) or np.inf

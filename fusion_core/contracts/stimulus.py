@@ -80,7 +80,7 @@ class TriadInput(ABC):
 
     @abstractmethod
     def lacking(self, term: int) -> str:
-        """Return the reason that a term of `TERMS`, then `SENSITIVITIES`, cannot be seen; after `; ` the remedy."""
+        """Return the reason that a term of `TERMS`, then `SENSITIVITIES`, cannot be seen, then `; REMEDY`."""
 
     @property
     def free(self) -> Flags:

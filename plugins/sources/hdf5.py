@@ -185,4 +185,5 @@ def _translated(path: Path) -> Iterator[None]:
             raise UnreadableFile(
                 f"{path}: was not closed by the program that wrote it; repair a copy with `h5clear -s COPY`"
             ) from None
-        raise damaged(path, reason) from None
+        # of `Unable to ... (truncated file: eof = ...)` the library's cause, without its numbers
+        raise damaged(path, reason.rpartition(" (")[2].partition(": eof")[0].rstrip(")")) from None

@@ -62,6 +62,18 @@ def bench(tmp_path_factory):
     return folder
 
 
+def test_a_map_without_a_path_is_used_as_the_fit_says(bench):
+    """The line that `fit-map` prints, as settings: that of the bias model where the config has its map there."""
+    followed, subtracted = bench / "followed.yaml", bench / "subtracted.yaml"
+    followed.write_text(CONFIG.replace(", path: map.json", ""))
+    subtracted.write_text(CONFIG.partition("filter:")[0])
+    for path in (followed, subtracted):
+        done = driftlab("fit-map", path, "--input", "soak.h5", "--out", "used.json", cwd=bench)
+        key, value = done.stdout.partition("to use it, write in the config: ")[2].splitlines()[0].split(": ", 1)
+        run = driftlab("run", path, "--set", f"{key}={value}", "--input", "ramp.h5", "--out", path.stem, cwd=bench)
+        assert run.returncode == 0, run.stderr
+
+
 def test_a_check_loads_no_library_that_it_does_not_need(bench):
     heavy = ["numba", "scipy", "polars", "pint", "onnx", "onnxruntime", "rich.progress", "jinja2"]
     command = ["check", "unit.yaml", "--input", "ramp.h5"]

@@ -67,3 +67,11 @@ def test_a_wrong_filter_is_not_told_twice(tmp_path):
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, text)
     assert "limits" not in str(caught.value)
+
+
+def test_a_product_in_the_place_of_a_config_is_named_with_what_to_write(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"mems_crs05: is a packaged product.*; write one with extends: mems_crs05"):
+        check("mems_crs05", None)
+    (tmp_path / "mems_crs05").write_text("extends: mems_crs05\n")  # a file of that name is a config
+    assert check("mems_crs05", None).config.filter is not None

@@ -83,7 +83,7 @@ def test_run_is_in_ppm_in_the_terminal_on_the_page_and_in_the_json(bench):
     assert float(shown[1]) * PPM == pytest.approx(coast, rel=1e-3)
     assert "<th>resistance [ppm]</th></tr>" in page
     assert "bias resistance [ppm]" in page  # of the figure
-    assert "<h2>Resistance bias</h2>" in page
+    assert "<h2>Bias of the resistance</h2>" in page
     (note,) = [line for line in printed.splitlines() if "white noise" in line]
     assert re.search(
         r"resistance: white noise is not as declared \(measured / declared: \S+\); set filter\.noise", note

@@ -33,6 +33,12 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.parent.name != "adr")]
 RAISES = {"errors.md"}  # what it shows must fail: tests of their own
 ELSEWHERE = [["plugins", "--check"]]  # half a minute, as `tests/test_plugin_examples.py` runs it
+PRINTED = {
+    "first_run",
+    "plan_a_soak",
+    "put_a_map_into_your_firmware",
+}  # on recordings of their own: in full or shortened
+TYPED = ("driftlab", "$", "...", "python", ".venv/", "source .venv")
 UNDER = {  # where a piece of a config belongs that does not begin at its top
     "calibration": ("filter", "gyro"),
     "bias": ("filter", "gyro"),
@@ -121,6 +127,12 @@ def bench(tmp_path_factory):
 def run_in(folder, *args):
     done = driftlab(*args, cwd=folder)
     assert done.returncode == 0, f"driftlab {shlex.join(args)}: {done.stderr}"
+    return done.stdout
+
+
+def words_of(text):
+    """Return a text without the frames of tables and the breaks of lines."""
+    return " ".join(re.sub("[━─┏┓┗┛┃┳┻╇┡┩│├┤┼└┘┴]", " ", text).split())
 
 
 def with_commands():
@@ -146,6 +158,7 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
 
 
 def follow(page, tmp_path, running):
+    printed = ""
     for kind, text, before in blocks(page):
         if kind == "yaml" and (name := name_of(text, before)) and read(text).keys() <= TOP:
             (tmp_path / name).unlink(missing_ok=True)
@@ -165,7 +178,10 @@ def follow(page, tmp_path, running):
                 if command[-1] == "&":
                     running.enter_context(in_background(tmp_path, *command[:-1]))
                 elif command not in ELSEWHERE:
-                    run_in(tmp_path, *command)
+                    printed += words_of(run_in(tmp_path, *command)) + " "
+            if page.stem in PRINTED:
+                for line in text.splitlines():
+                    assert line.strip().startswith(TYPED) or words_of(line) in printed
 
 
 TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "stimulus", "limits", "certificate"}

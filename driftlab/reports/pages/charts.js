@@ -195,8 +195,9 @@ const driftlab = (() => {
         u.ctx.stroke();
         u.ctx.font = `${11 * ratio}px system-ui, sans-serif`;
         u.ctx.textAlign = "right";
-        u.ctx.textBaseline = "bottom";
-        const place = [rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y - 2 * ratio];
+        const below = y - 14 * ratio < u.bbox.top; // no room above the line
+        u.ctx.textBaseline = below ? "top" : "bottom";
+        const place = [rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y + (below ? 3 : -2) * ratio];
         u.ctx.setLineDash([]);
         u.ctx.lineWidth = 4 * ratio;
         u.ctx.strokeStyle = css("--paper"); // a rim, so that it can be read before lines and points

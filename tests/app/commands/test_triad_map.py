@@ -52,7 +52,17 @@ def test_the_terminal_shows_each_term_and_how_to_use_the_map(folder):
     assert rows["scale y"][5] == "none"
     assert all(len(line) <= 80 for line in said.partition("frame")[0].splitlines())
     assert "frame: that of the stimulus, with the mounting of the unit in it (9 terms of M)" in said
-    assert "filter.gyro.calibration: {kind: polynomial, path: gyro.json}" in said
+    assert "to use it, write in the config: filter.gyro.calibration.path: gyro.json\n" in said
+
+
+def test_a_map_that_the_bias_model_follows_is_used_where_it_is(folder):
+    followed = "kind: thermal_derivative, walk: 1e-6 rad/s/sqrt(s), map: {kind: polynomial}}"
+    text = GYRO.replace("kind: random_walk, walk: 1e-6 rad/s/sqrt(s)}", followed)
+    (folder / "followed.yaml").write_text(text.replace("    calibration: {kind: polynomial, path: gyro.json}\n", ""))
+    done = run("fit-map", "followed.yaml", "--terms", TERMS, cwd=folder)
+    assert "to use it, write in the config: filter.gyro.bias.map.path: followed.map.json\n" in done.stdout
+    used = ("--set", "filter.gyro.bias.map.path=followed.map.json", "--set", "filter.accel=null")
+    assert run("check", "followed.yaml", *used, cwd=folder).returncode == 0
 
 
 def test_json_says_what_each_term_is(folder):

@@ -96,7 +96,11 @@ def test_a_quiet_run_has_nothing_to_say():
         ({"count": 9, "used": 0}, journal(), "no update was used: nothing is known of the bias"),
         ({"end": 61.0}, journal(), "only 1.0 s after the alignment: too short"),
         ({}, journal(ratio=np.array([1.0, 2.5, 1.0])), "y 2.5); set filter.gyro.noise"),
-        ({"nis": nis(1.44)}, journal(), "NIS 1.44 a component, 0.99 to 1.01 was expected: innovations are 20 % larger"),
+        (
+            {"nis": nis(1.44)},
+            journal(),
+            "NIS 1.44 per component, 0.99 to 1.01 was expected: innovations are 20 % larger",
+        ),
         ({"nis": nis(0.25)}, journal(), "50 % smaller than the model says, so its deviations are too large"),
         ({}, journal(ratio=np.array([1.0, 1.0, 0.001])), "or correct unit and path of source.channels.gyro"),
     ],
@@ -123,6 +127,8 @@ def test_a_prediction_far_beyond_its_sigma_is_named_and_one_within_is_not():
     (line,) = said(replace(QUIET, yardsticks=replace(SCORES, coast=coast)), journal())
     assert line.startswith("prediction, to the end: off by gyro y ")
     assert "34 times its sigma" in line
+    assert "of the map" not in line  # the config has none
+    assert "fit a map of the temperature with driftlab fit-map" in line
     near = {**SCORES.coast, "to the end": np.array([1.0, 3.5, 2.0])}
     assert said(replace(QUIET, yardsticks=replace(SCORES, coast=near)), journal()) == []
 

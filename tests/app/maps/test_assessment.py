@@ -76,6 +76,12 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
         assert misfit.left < 0.05 * by_axis[misfit.axis].left
 
 
+def test_a_range_that_begins_at_zero_is_said_as_it_is_read():
+    T = np.abs(np.linspace(-40, 40, 4001)) + 1e-7
+    found = verdict(Polynomial(order=1), T, np.random.default_rng(0).normal(0, 1e-5, (4001, 3)))
+    assert "between 0 and 40 °C" in found.sentences(RATE)[0]
+
+
 def test_a_bend_within_what_is_between_up_and_down_is_not_said():
     found = verdict(Polynomial(), *soak(0, 3, planted=200.0))
     assert found.memory.answer == "seen"

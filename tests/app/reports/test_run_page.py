@@ -217,9 +217,7 @@ def test_on_paper_no_heading_is_left_alone_and_there_is_where_to_sign(page, open
         assert lines[-1] not in headings
     first = pages[0]
     (signed,) = [k for k, line in enumerate(first) if "measured by checked by date" in line]
-    (result,) = [
-        k for k, line in enumerate(first) if line.startswith("Without updates the bias is predicted over 10 min")
-    ]
+    (result,) = [k for k, line in enumerate(first) if line.startswith("Without updates the bias of ")]
     (error,) = [k for k, line in enumerate(first) if line.startswith("prediction, 10 min ")]
     assert result < error < signed  # on the sheet that is signed
     assert "dark / light" not in every
@@ -256,10 +254,10 @@ def test_the_headline_is_of_all_predictions_as_their_limit_is(run, tmp_path):
     value = f"{np.max(found.run.measured['coast'].values) * RATE.factor:.2f}"
     first = f"{found.overview.yardsticks.coast['10 min'][1] * RATE.factor:.2f}"
     assert result == (
-        f"Without updates the bias is predicted over 10 min to {value} deg/h rms of 4 predictions, y; "
-        f"the first of them is off by {first} deg/h."
+        f"Without updates the bias of y is predicted over 10 min to {value} deg/h rms of 4 predictions; "
+        f"the first is off by {first} deg/h."
     )
-    assert re.match(r"the first 10 min without updates turn the heading by \S+ deg; of all 4 the sigma of y is ", use)
+    assert re.match(r"the first 10 min without updates turn the heading by \S+ deg; sigma of y over all 4 is ", use)
     found.save(tmp_path / "out")
     (cells,) = re.findall(
         r"<td>prediction, all 4 of 10 min</td><td>(.*?)</td></tr>", (tmp_path / "out" / "report.html").read_text()

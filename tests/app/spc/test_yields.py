@@ -160,4 +160,4 @@ def test_a_unit_in_doubt_of_which_nothing_was_measured_is_undecided():
 def test_units_that_limits_accept_and_that_stand_out_are_said():
     found = yields_of([unit(k, "pass", "pass") for k in range(4)], odd=["0000", "0001", "0003"])
     assert found.whole.accepted_odd == found.as_json()["accepted_odd"] == 3
-    assert found.sentences() == ["3 of the 4 accepted units stand out: limits do not see why"]
+    assert found.sentences() == ["accepted units that stand out: 3 of 4; limits do not see why"]

@@ -25,6 +25,10 @@ from driftlab.starter.names import named, read_name
     ("timestamp_utc", "time", None, None), ("Time [ns]", "time", None, "ns"),
     ("gyro_bias_x", None, "x", None), ("bias_truth_x", None, "x", None), ("mag_x", None, "x", None),
     ("Gyro,131 LSB/(deg/s)", "gyro", None, "0.00763358779 deg/s"), ("ax 4.88e-4 g per LSB", "accel", "x", "0.000488 g"),
+    ("Roll rate", "gyro", "x", None), ("Pitch Rate (deg/s)", "gyro", "y", "deg/s"),
+    ("yawRate_dps", "gyro", "z", "deg/s"), ("Long. acc", "accel", "x", None),
+    ("acc_lateral [g]", "accel", "y", "g"), ("a_vert", "accel", "z", None),
+    ("roll", None, None, None), ("g_lat", None, None, None), ("yaw_rate_temp", "temperature", None, None),
     ("pressure", None, None, None), ("ppm", None, None, None), ("index", None, None, None),
 ])  # fmt: skip
 def test_a_name_says_quantity_axis_and_unit(path, quantity, axis, unit):

@@ -116,3 +116,12 @@ def test_what_is_masked_or_null_is_a_row_left_out_and_counted(data):
 def test_a_list_with_none_in_it_is_refused_by_name():
     with pytest.raises(BadValue, match="channel gyro is of type object, numbers were expected"):
         in_memory_name({"time": (T, "s"), "gyro": (_with_null(X), "rad/s")})
+
+
+@pytest.mark.parametrize(("unit", "given"), [("s", np.array), ("ns", np.array), ("ms", pl.Series), ("us", pl.Series)])
+def test_time_stamps_with_a_date_are_seconds(unit, given):
+    """Of 1 January 2026, 1,767,225,600 s after 1970; what is no time is missing."""
+    stamps = np.datetime64("2026-01-01", unit) + np.timedelta64(3, "s").astype(f"timedelta64[{unit}]") * np.arange(4)
+    stamps[2] = np.datetime64("NaT")
+    t = in_memory_name({"time": given(stamps), "gyro": (np.zeros(4), "rad/s")})._samples.t
+    np.testing.assert_array_equal(t, 1_767_225_600.0 + np.array([0, 3, np.nan, 9]))

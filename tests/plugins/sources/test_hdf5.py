@@ -145,7 +145,7 @@ def test_truncated_anywhere(tmp_path, options, libver):
     data = whole.read_bytes()
     for n in {*range(1, len(data), 97), *range(1, 16), len(data) - 1}:
         cut = text(tmp_path, data[:n], "cut.h5")
-        with pytest.raises(UnreadableFile, match=r"cut\.h5: is cut short or damaged"):
+        with pytest.raises(UnreadableFile, match=r"cut\.h5: is cut short or damaged \((?!.*eof = )"):
             read(Hdf5(path=cut, channels={**TIME, "gyro": {"path": "v", "unit": "deg/s"}}))
 
 
