@@ -164,10 +164,10 @@ def _between(T: Array) -> Array:
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
-    """Return a name; with the quantity of the file's unit where the name has another, as a thermometer's time."""
+    """Return a name with the file's unit; of its quantity where the name has another, as a thermometer's time."""
     known = None if unit is None else known_unit(unit.split(" since ")[0])
     if unit is None or known is None or (name.quantity is not None and _understood(unit, name.quantity)):
-        return name
+        return replace(name, unit=name.unit or known)
     unnamed = name.quantity in (None, "time") and not NO_SENSOR.intersection(name.group)  # T1 [°C] is no time
     return replace(name, quantity=quantity_of(known) if unnamed else None)
 

@@ -29,8 +29,8 @@ TWO = 3.0  # of the evidence of two shapes against one: both are there
 BESIDE = 4  # cells of temperature on either side, that a narrow difference stands out of
 NARROW = 8.0  # deviations of a cell's difference from those beside it: more is a narrow loop, or a jump
 WHY = {
-    "warms": "only ever warms: hysteresis cannot be seen; come back down by the same steps",
-    "cools": "only ever cools: hysteresis cannot be seen; come back up by the same steps",
+    "warms": "only ever warms: hysteresis cannot be seen, and a walk hardly; come back down by the same steps",
+    "cools": "only ever cools: hysteresis cannot be seen, and a walk hardly; come back up by the same steps",
     "no way": "the temperature goes neither up nor down in the order of the samples: hysteresis cannot be seen",
     "apart": "warming and cooling share too few temperatures: hysteresis cannot be seen; come back by the same steps",
     "short": "too short on its way up or down to distinguish hysteresis from noise; go slower, or up and down again",

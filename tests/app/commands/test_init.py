@@ -91,6 +91,15 @@ def test_every_guess_is_marked_and_nothing_else(tmp_path):
     assert re.search("# (guess|unknown): ", lines["bias"])
 
 
+def test_three_rates_without_axes_of_one_unit_in_a_line_of_its_own_are_a_triad(tmp_path):
+    file, rows = tmp_path / "rec.csv", np.column_stack([UNIT.t, np.rad2deg(UNIT.gyro), UNIT.temperature])
+    with file.open("w") as stream:
+        stream.write("Time;Alpha rate;Beta rate;Gamma rate;Temp\ns;deg/s;deg/s;deg/s;degC\n")
+        np.savetxt(stream, rows, fmt="%.9g", delimiter=";")
+    gyro = yaml.safe_load(init(file, out=tmp_path / "rec.yaml").text)["source"]["channels"]["gyro"]
+    assert gyro == {"path": ["Alpha rate", "Beta rate", "Gamma rate"], "unit": "deg/s"}
+
+
 @pytest.mark.parametrize(
     "command", [("check",), ("run", "--out", "out"), ("fit-map", "--kind", "spline", "--out", "m.json")]
 )

@@ -116,7 +116,7 @@ def test_hysteresis_is_said_with_its_size_and_is_part_of_what_the_map_is_good_to
 
 def test_a_soak_that_only_warms_says_so():
     found = verdict(Spline(), *soak(2, 8, UP))
-    said = "only ever warms: hysteresis cannot be seen; come back down by the same steps"
+    said = "only ever warms: hysteresis cannot be seen, and a walk hardly; come back down by the same steps"
     assert said in found.sentences(RATE)
     judged = found.as_json()["memory"]
     assert (judged["answer"], judged["why"], judged["size"]) == ("undecided", said, [None] * 3)
