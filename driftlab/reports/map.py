@@ -15,7 +15,7 @@ from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
 LABEL = "temperature [°C]"
-NEITHER = "before the first turn"
+NEITHER = "before warming or cooling"
 NAMES = WAYS | {NEITHER: 0}
 STYLES: tuple[LineStyle, ...] = ("line", "dashed", "dotted")  # so that none hides one that is alike
 ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
