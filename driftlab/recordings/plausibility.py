@@ -33,7 +33,7 @@ AT_END, STEEP = 0.005, 10.0  # of the rows at an end of the range, and times the
 BLOCK, BLOCKS = 100, 50  # rows, and how many of them are looked at in a chunk: of steps
 HELD = "is held by what writes it down"  # in the doubt about it
 SINGLE = "single readings far off both neighbours"  # likewise
-SEVERAL = 10  # of them are a doubt: a knock or two are motion
+SEVERAL, OFTEN = 10, 1e-3  # of them, and of the rows, are a doubt: who moves a unit knocks it now and then
 ENDS, CHANCE, SHARE = 10, 1e-6, 0.01  # ends of repetitions, chance of a longer one, share of the rows: of readings held
 MANY, SOME = 20, 10  # chunks, after which one in SOME is looked at: of steps
 EXACT = 0.01  # of a step: so far changes may be from multiples of it
@@ -271,7 +271,7 @@ class Lone:
         """Note a doubt about each axis of whose noise some such readings are more than all others."""
         shares = self.squares / self.rows / (self.usual / MEDIAN) ** 2
         for axis, count, share in zip(self.axes, self.counts, shares, strict=True):
-            if count >= SEVERAL and share > 1:
+            if count >= max(SEVERAL, OFTEN * self.rows) and share > 1:
                 faults.doubt(
                     f"{axis_name(self.name, axis)}: most of its noise is {SINGLE}, as of lost bits or of knocks; leave "
                     "such rows out, by a channel `valid` that is zero there"
