@@ -131,9 +131,8 @@ def _values(search: Search, unit: UnitModel, effect: Effect, axis: int) -> Array
 
 def _white(columns: Array, noise: LocalLevel) -> Array:
     """Return columns (n, m) of one recording as innovations of unit variance, its first level unknown."""
-    walk = np.full(len(columns), noise.walk)
-    walk[0] = np.inf
-    return whitened(np.ascontiguousarray(columns), np.full(len(columns), noise.white), walk)[0]
+    walk = np.r_[np.inf, np.full(len(columns) - 1, noise.walk)]
+    return np.asarray(whitened(np.ascontiguousarray(columns), np.full(len(columns), noise.white), walk)[0])
 
 
 class Information:
