@@ -90,7 +90,7 @@ def measured(kind):
     from demo import PLACEMENTS, recording
 
     config = load_config(CATS / "tczupt.yaml")
-    ((T, bias),), dt = read_parts(config, [f"{recording()}{PLACEMENTS[0]}"], Faults())
+    ((T, bias),), dt, _ = read_parts(config, [f"{recording()}{PLACEMENTS[0]}"], Faults())
     low, high = float(T.min()), float(T.max())
     chamber = Chamber(low, high, float(T[0]), 1.0, 0.0)
     subject = UnitModel.of(config, kind, None)

@@ -242,10 +242,10 @@ class _Inquiry:
     def after(self, recordings: Sequence[str]) -> PlanResult:
         """Plan what is still missing after recordings."""
         self.report("reading what was recorded")
-        parts, dt = read_parts(self.config, recordings, Faults())
+        parts, dt, memory = read_parts(self.config, recordings, Faults())
         request = self.request(self.range or self._span(parts))
         chamber = request.chamber
-        before = of_samples(parts, dt, request.subject, chamber)
+        before = of_samples(parts, dt, request.subject, chamber, memory)
         rated, subject = continuation_of(before, self.hours, request.target, self.report), before.subject
         unit = subject.with_curve(chamber.low, chamber.high)
         outlook = self._outlook(unit, rated.chosen.profile, chamber.lag)

@@ -96,8 +96,7 @@ def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False
     """
     count = max(1, round(chamber.swing / step))
     levels = np.linspace(chamber.low, chamber.high, count + 1)
-    if down:
-        levels = np.concatenate([levels, levels[::-1]])
+    levels = np.concatenate([levels, levels[::-1]]) if down else levels
     moves = _moves(chamber, levels)
     hold = (hours * 3600 - np.sum(moves)) / len(levels)
     if hold < SHORTEST:
@@ -113,8 +112,7 @@ def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
     They are as slow as the hours leave them; None where the chamber cannot be so fast.
     """
     levels = np.append(np.tile([chamber.low, chamber.high], cycles), chamber.low)
-    rate = _rate(chamber, hours, levels)
-    if rate is None:
+    if (rate := _rate(chamber, hours, levels)) is None:
         return None
     hold = chamber.settling(rate)
     moves = np.append(_moves(chamber, levels)[:1], np.full(2 * cycles, chamber.swing / rate))
@@ -134,9 +132,8 @@ def quickest(chamber: Chamber, cycles: int) -> float:
 
 def mixed(chamber: Chamber, hours: float, cycles: int, step: float) -> Profile | None:
     """Return ramps for half of the hours, then levels up and down: rates and holds that tell effects apart."""
-    first, held = ramps(chamber, hours / 2, cycles), None
-    if first is not None:
-        held = staircase(replace(chamber, start=chamber.low), hours / 2, step, down=True)
+    first = ramps(chamber, hours / 2, cycles)
+    held = first and staircase(replace(chamber, start=chamber.low), hours / 2, step, down=True)
     if first is None or held is None:
         return None
     name = f"{first.name}; then a {held.name}"

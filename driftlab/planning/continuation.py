@@ -2,7 +2,9 @@
 
 The recordings are read and fitted as `fit-map` does, one after the other as if there were no pause. White noise and
 walk are those of the residuals of the map (`measured_noise`), in place of the config's. A further profile is rated by
-the sigma of the map that is fitted to both together; the misfit of the kind so far stays. G temperatures, d axes.
+the sigma of the map that is fitted to both together; the misfit of the kind so far stays, and so does half of what is
+between up and down where a memory is seen. One that is not excluded counts so far, as probable as it is, as in
+`driftlab.maps.assessment`. G temperatures, d axes.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 
 from driftlab.config import Config, with_recording
 from driftlab.maps.fit import gather
+from driftlab.maps.hysteresis.memory import MemoryVerdict
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import (
     GRID,
@@ -54,16 +57,13 @@ class RecordedSoak(SigmaCurve):
     sigma: Array  # (G, d): uncertainty of the map, SI; NaN where nothing was seen
     misfit: Array  # (G, d): the part of it that the kind of map is to blame for
     kinds: Array  # (3, d): variances of the curve's bends, and of level and shape of a recording (`wander_of`)
+    memory: MemoryVerdict  # of the recording that is likeliest to have one
+    between: Array  # (G, d): half of what is between up and down, as probable as it is, SI
 
     @property
     def T(self) -> Array:
         """All temperatures (N,)."""
         return np.concatenate([T for T, _ in self.parts])
-
-    @property
-    def bias(self) -> Array:
-        """All biases (N, d)."""
-        return np.concatenate([bias for _, bias in self.parts])
 
     @property
     def hours(self) -> float:
@@ -107,8 +107,11 @@ class Continuation(SearchResult):
         return (1 - self.chosen.score / self.recorded.score) / self.chosen.profile.hours
 
 
-def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tuple[list[tuple[Array, Array]], float]:
-    """Return temperature (N,) and bias (N, d) of each recording as `fit-map` has them, and how long a sample is, s.
+Parts = list[tuple[Array, Array]]  # T (N,) in degC and bias (N, d) in SI of each recording
+
+
+def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tuple[Parts, float, MemoryVerdict]:
+    """Return recordings as `fit-map` has them, how long a sample is, s, and the likeliest memory in one of them.
 
     Raises
     ------
@@ -116,11 +119,14 @@ def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tup
         If a recording cannot be used.
     """
     soaks = [gather(with_recording(config, name), (), faults) for name in recordings]
-    return [(soak.T, soak.bias) for soak in soaks], float(np.median([soak.interval for soak in soaks]))
+    memory = max((soak.memory for soak in soaks), key=lambda verdict: verdict.probability)
+    return [(soak.T, soak.bias) for soak in soaks], float(np.median([soak.interval for soak in soaks])), memory
 
 
-def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:
-    """Return the soak of samples, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
+def of_samples(
+    parts: Parts, dt: float, subject: UnitModel, chamber: Chamber, memory: MemoryVerdict | None = None
+) -> RecordedSoak:
+    """Return the soak of samples, one each `dt` in s; without `memory` nothing is between up and down."""
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
     found = wander_of(T, bias, np.cumsum([0, *(len(T_r) for T_r, _ in parts)])[:-1].tolist())
     joint = found if len(parts) > 1 else None
@@ -145,9 +151,12 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitMod
     near = EDGE * chamber.swing
     inside = (grid >= T.min() - near) & (grid <= T.max() + near)
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
-    before = RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, np.zeros_like(sigma), kinds)
+    memory = memory or MemoryVerdict.unknown(subject.d, "")
+    zero, between = np.zeros_like(sigma), np.sqrt(memory.variance(grid))
+    before = RecordedSoak(known, chamber, rows, step, fitted, grid, sigma, zero, kinds, memory, between)
     alone = expected_curve_error(T_m, step, noise, walk, answer) if joint is None else before.expected([])
-    return replace(before, misfit=np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone.variance(grid), 0.0, None)))
+    misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone.variance(grid), 0.0, None))
+    return replace(before, misfit=misfit, sigma=np.hypot(sigma, between))
 
 
 def jointly(profile: Profile, before: RecordedSoak) -> RatedProfile:
@@ -155,7 +164,8 @@ def jointly(profile: Profile, before: RecordedSoak) -> RatedProfile:
     chamber, grid = before.chamber, before.temperature
     new = profile.samples(chamber.lag, max(int(profile.duration / before.dt), 2))[1]
     T, variance = np.concatenate([before.T, new]), before.expected([new]).variance(grid)
-    return RatedProfile.of(profile, chamber, T, grid, variance, before.misfit**2)
+    stays = before.misfit**2 + (before.between**2 if before.memory.answer == "seen" else 0.0)
+    return RatedProfile.of(profile, chamber, T, grid, variance, stays)
 
 
 def continuation_of(
@@ -202,8 +212,6 @@ def _parts(before: RecordedSoak) -> Iterator[tuple[float, float]]:
     ranges = [(low, high), *pairwise(cuts), (cuts[0], cuts[2]), (cuts[1], cuts[3])]
     seen = before.seen
     overlap = EDGE * before.chamber.swing
-    if seen[0] > low + overlap:
-        ranges.append((low, min(seen[0] + overlap, high)))
-    if seen[1] < high - overlap:
-        ranges.append((max(seen[1] - overlap, low), high))
+    ranges += [(low, min(seen[0] + overlap, high))] if seen[0] > low + overlap else []
+    ranges += [(max(seen[1] - overlap, low), high)] if seen[1] < high - overlap else []
     yield from (pair for pair in ranges if pair[1] - pair[0] >= least)

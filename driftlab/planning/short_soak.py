@@ -95,8 +95,7 @@ def _parts(chamber: Chamber, share: float, hours: float) -> Iterator[tuple[float
         low = chamber.low + at * (1 - share) * chamber.swing
         high = low + share * chamber.swing
         begin = min(max(chamber.start, low), high)
-        profile = ramps(Chamber(low, high, begin, chamber.rate, chamber.lag), hours, 1)
-        if profile is not None:
+        if (profile := ramps(Chamber(low, high, begin, chamber.rate, chamber.lag), hours, 1)) is not None:
             yield share, place, profile
 
 

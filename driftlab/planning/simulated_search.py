@@ -1,7 +1,8 @@
 """A planned recording, as the loop would have it: its rows, its simulated noise, and its information on effects.
 
 On each axis the bias is curve(T) + level + walk + white noise. Made white by the noise of the rows
-(`driftlab.noise.local_level`), with the map's curves B and the level taken out, the log-likelihood ratios are
+(`driftlab.noise.local_level.whitened`), with the map's curves B and the unknown level of each recording taken out, the
+log-likelihood ratios are
 
 ::
 
@@ -23,7 +24,7 @@ from driftlab.config import Config
 from driftlab.identification.columns import NormalEquations
 from driftlab.identification.records import Evidence, Record, lengths, row_starts
 from driftlab.identification.state import Search
-from driftlab.noise.local_level import LocalLevel, one_step
+from driftlab.noise.local_level import LocalLevel, whitened
 from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, FileSource
@@ -128,6 +129,12 @@ def _values(search: Search, unit: UnitModel, effect: Effect, axis: int) -> Array
     return np.asarray(columns.evidence.rows(late)[:, axis : axis + 1])
 
 
+def _white(columns: Array, noise: LocalLevel) -> Array:
+    """Return columns (n, m) of one recording as innovations of unit variance, its first level unknown."""
+    walk = np.r_[np.inf, np.full(len(columns) - 1, noise.walk)]
+    return np.asarray(whitened(np.ascontiguousarray(columns), np.full(len(columns), noise.white), walk)[0])
+
+
 class Information:
     """Information of a planned recording on the shapes of effects.
 
@@ -146,8 +153,7 @@ class Information:
         for axis, noise in enumerate(noises(unit, columns.evidence.interval)):
             q, y = len(B), columns.y[axis]
             whole = np.column_stack([columns.W[:, B], *own[axis], columns.W[:, y] * columns.scale[y]])
-            parts = one_step([whole[rows] for rows in columns.evidence.slices], noise.gain)
-            white = np.concatenate(parts) / np.sqrt(noise.variance)
+            white = np.concatenate([_white(whole[rows], noise) for rows in columns.evidence.slices])
             squares = white.T @ white
             ridge = search.squares.ridge(axis, B, columns.gram(search.everything, B)) / noise.variance
             equations = NormalEquations(squares[:q, :q], np.zeros(q), 0.0).raised(ridge)

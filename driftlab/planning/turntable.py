@@ -109,11 +109,8 @@ def plan_turntable(
     tried = []
     for levels in LEVELS:
         profile = staircase(chamber, hours, chamber.swing / (levels - 1))
-        if profile is None:
-            continue
-        for rounds in ROUNDS:
-            segments = _segments(profile, chamber, levels, rounds, rate)
-            if segments:
+        for rounds in ROUNDS if profile else ():
+            if profile and (segments := _segments(profile, chamber, levels, rounds, rate)):
                 T = np.linspace(chamber.low, chamber.high, GRID)
                 sigma = _sigma(subject, chamber, profile, segments, T)
                 share = float(np.mean((sigma / USUAL)[:, list(wanted)] ** 2))
@@ -136,8 +133,7 @@ def _segments(profile: Profile, chamber: Chamber, levels: int, rounds: int, rate
         if step < GAP + SETTLE + SHORTEST:
             return []
         for n in range(2 * len(AXES) * rounds):
-            axis = np.zeros(3)
-            axis[n // 2 % 3] = 1.0
+            axis = np.eye(3)[n // 2 % 3]
             begin = start + n * step + GAP
             segments.append(PlannedSegment(begin, start + (n + 1) * step, tuple(axis.tolist()), (-1) ** n * rate))
     return segments

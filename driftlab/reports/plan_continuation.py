@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from driftlab.maps.assessment import memory_sentence
 from driftlab.planning.continuation import LITTLE, Continuation
 from driftlab.planning.detectability import DetectabilityReport, EffectEstimate
 from driftlab.planning.search import MIN_COVERAGE, RatedProfile
@@ -83,8 +84,7 @@ def lines(plan: Continuation) -> list[str]:
     """Return the state of knowledge so far, and its basis, a sentence each."""
     before, unit = plan.recorded, plan.recorded.subject.unit
     subject, (low, high) = before.subject, before.seen
-    several = "s" if len(before.parts) > 1 else ""
-    count = f"{len(before.parts)} recording{several}"
+    count = f"{len(before.parts)} recording{'s' if len(before.parts) > 1 else ''}"
     sentences = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} °C"]
     if np.isfinite(before.score):
         value, at, axis = before.worst
@@ -101,7 +101,10 @@ def lines(plan: Continuation) -> list[str]:
         sentences.append(f"should there be time: {plan.chosen.profile.name}; {_gained(plan)}")
     if len(before.parts) > 1:
         sentences.append("recordings are fitted one after the other; another level after a pause counts as walk")
-    worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
+    between, worst = (float(np.sqrt(np.mean(v**2, axis=0)).max()) for v in (before.between, before.misfit))
+    if between > 0.5 * before.score and before.memory.answer != "none":
+        half = f"{_size(plan, between)} of it is half of what is, or may be, between up and down"
+        sentences.append(f"{half}: {memory_sentence(before.memory, subject.axes, unit)}")
     if worst > 0.5 * before.score:
         sentences.append(
             f"{_size(plan, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no "
@@ -133,11 +136,8 @@ def _sigma_chart(plan: Continuation) -> Chart:
     low, high = before.seen
     ends = ((before.chamber.low, low), (high, before.chamber.high))
     shades = tuple(Shade(a, b, "not seen yet", "hole") for a, b in ends if b > a)
-    curves = [
-        (best.temperature, best.sigma, "with the further profile"),
-        (before.temperature, before.sigma, "so far"),
-    ]
-    rules = target_rule(plan.target, unit.factor)
+    further = best.temperature, best.sigma, "with the further profile"
+    curves, rules = [further, (before.temperature, before.sigma, "so far")], target_rule(plan.target, unit.factor)
     panels = sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
     return Chart(panels, "temperature [°C]", "Sigma of the map", "one standard deviation of the map's error")
 

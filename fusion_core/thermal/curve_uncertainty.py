@@ -76,25 +76,18 @@ def curve_error(
     SingularFit
         If the temperatures have a hole over which the curve is less sure than its own swing.
     """
-    domain = (float(T.min()), float(T.max()))
-    grid = np.linspace(*domain, GRID)
+    grid = np.linspace(T.min(), T.max(), GRID)
     d = bias.shape[1]
     left = bias - predict(T)
     blocks = blocks_of(T, left) if known is None else summed(T, left, known.blocks.of_sample)
     holes = find_holes(T)
-    fitted = predict(np.sort(blocks.T))
-    swing = np.ptp(fitted, axis=0)
+    swing = np.ptp(predict(np.sort(blocks.T)), axis=0)
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
     smoothed = _smoothed(cells_of(T, bias), grid, predict, smoother)
-    found_ripples = ripples(T, left, float(np.median(np.diff(contrasts.knots))))
-    per_axis, misfits = zip(
-        *(
-            _axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis], found_ripples[axis], known)
-            for axis in range(d)
-        ),
-        strict=True,
-    )
+    narrow = ripples(T, left, float(np.median(np.diff(contrasts.knots))))
+    each = [_axis_modes(blocks, contrasts, grid, smoother, k, smoothed[:, k], narrow[k], known) for k in range(d)]
+    per_axis, misfits = zip(*each, strict=True)
     found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
     _check_holes(kind, found, swing)
     return found
@@ -234,21 +227,22 @@ def _axis_modes(
 ) -> tuple[Array, Misfit | None]:  # fmt: skip
     """Return the modes (r, G) of the curve's error, and where a misfit is seen.
 
-    They are of the noise's part, of what is `smoothed` (G,), of the misfit, and of a ripple that is narrower.
+    They are of the noise's part, of what is `smoothed` (G,), of the misfit, and of a ripple that is narrower. As few as
+    needed are those of the noise alone: beside a deep dip none of them would count, and sigma be nothing elsewhere.
     """
     G, K = len(grid), len(blocks.T)
     both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
     taken = np.asarray(blocks.over @ both[G:])
     H, left = both[:G] - (blocks.n / np.sum(blocks.n)) @ taken, np.eye(K) - taken
     noise = contrasts.noise(blocks.y[:, axis], left) if known is None else known.noise(contrasts, blocks, axis)
-    modes = np.column_stack([H @ noise.root, smoothed])
+    shapes = [smoothed] if np.any(smoothed) else []
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
     if np.any(shape):
-        modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
+        shapes.append(np.interp(grid, contrasts.knots, shape))
     if ripple is not None:
-        modes = np.column_stack([modes, ripple_modes(ripple, grid)])
+        shapes += [*ripple_modes(ripple, grid).T]
         misfit = misfit or Misfit(axis=axis, T=ripple.T, left=ripple.rms, noise=ripple.chance)
-    return _largest(modes), misfit
+    return np.vstack([_largest(H @ noise.root), *shapes]), misfit
 
 
 def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) -> Array:

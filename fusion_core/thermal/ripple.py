@@ -9,8 +9,8 @@ up, in the mean of those that went through all three, v on the ways down::
 since noise and walk of two ways are independent, and what differs between up and down is smooth. Without a ripple the
 sign of u v is as good as tossed, triple by triple, so that z = sum(u v) / sqrt(sum((u v)^2)) exceeds x with a
 probability of exp(-x^2 / 2) at most (W. Hoeffding, J. Am. Stat. Assoc. 58 (1963) 13). A dip at one temperature is one
-product of many: it is seen where u and v are both, and to the same side, beyond NARROW of their robust deviations.
-N samples, d axes.
+product of many: it is seen where u and v are both, and to the same side, beyond NARROW of their robust deviations,
+where these grow with the white noise of neighbouring samples at that temperature. N samples, d axes.
 """
 
 from __future__ import annotations
@@ -55,18 +55,20 @@ def ripples(T: Array, left: Array, width: float) -> list[Ripple | None]:
     means = np.add.reduceat(T, np.arange(0, len(T), step)) / np.diff([*range(0, len(T), step), len(T)])
     way = np.repeat(directions(means, TURN * float(np.ptp(T))), step)[: len(T)]
     found: list[Ripple | None] = [None] * left.shape[1]
+    louder = _louder(T, left, width)
     least = np.sqrt(2 * np.log(HALVINGS / CHANCE))
     cells = _cells_of(((T - T.min()) / (width / 2**HALVINGS)).astype(np.int64), way, left)
     for halving in range(1, HALVINGS + 1):
         cell = width / 2**halving
         ways, noise, at = _ways_apart(cells, HALVINGS - halving)
         where, third = float(T.min()) + (at + 0.5) * cell, at % 3 == 1  # of cells that no other three have
+        beside = louder[np.minimum(((where - T.min()) / width).astype(np.int64), len(louder) - 1)]
         inner = (where > T.min() + width) & (where < T.max() - width)  # about a turn, both ways are of one moment
         products = ways[0, third] * ways[1, third]
         if len(products) < TRIPLES:
             continue
-        total, scatter = products.sum(axis=0), np.sqrt(np.sum(products**2, axis=0))
-        for axis, dip in enumerate(_dips(ways[:, inner], noise[:, inner], where[inner], cell)):
+        total, scatter = products.sum(axis=0), np.linalg.norm(products, axis=0)
+        for axis, dip in enumerate(_dips(ways[:, inner], noise[:, inner], beside[inner], where[inner], cell)):
             seen = None
             if total[axis] > least * scatter[axis]:
                 rms, chance = np.sqrt(np.array([total[axis], scatter[axis]]) / len(products) / GAIN)
@@ -122,8 +124,19 @@ def _ways_apart(cells: Sequence[_Cells], shift: int) -> tuple[Array, Array, Inte
     return np.stack(apart)[:, there], np.stack(noise)[:, there], np.flatnonzero(there).astype(np.int64)
 
 
-def _dips(ways: Array, noise: Array, where: Array, cell: float) -> list[Ripple | None]:
-    """Return the dip that u and v (2, M, d) of each axis show at temperatures (M,); None where there is none."""
+def _louder(T: Array, left: Array, width: float) -> Array:
+    """Return the white noise (B, d) of neighbouring samples in each `width` of temperature, in its median or more."""
+    at, squares = ((T[1:] - T.min()) / width).astype(np.int64), np.diff(left, axis=0) ** 2
+    sums, n = np.stack([np.bincount(at, column) for column in squares.T]), np.maximum(np.bincount(at), 1)
+    usual = np.maximum(np.median(sums / n, axis=1), np.finfo(float).tiny)
+    return np.sqrt(np.maximum((sums / n).T / usual, 1.0))
+
+
+def _dips(ways: Array, noise: Array, louder: Array, where: Array, cell: float) -> list[Ripple | None]:
+    """Return the dip that u and v (2, M, d) of each axis show at temperatures (M,); None where there is none.
+
+    Their noise is `louder` (M, d) than elsewhere.
+    """
     found: list[Ripple | None] = [None] * ways.shape[2]
     if len(where) < TRIPLES:
         return found
@@ -131,13 +144,14 @@ def _dips(ways: Array, noise: Array, where: Array, cell: float) -> list[Ripple |
     if np.sum(passed) < TRIPLES:
         return found
     ways, noise, where = ways[:, passed], noise[:, passed], where[passed]
-    noise = np.maximum(noise, np.median(noise) ** 2 / noise)  # white noise falls with the time in a cell, a walk grows
-    z = np.abs(ways) / noise[:, :, None]
+    # white noise falls with the time in a cell, a walk grows
+    noise = np.maximum(noise, np.median(noise) ** 2 / noise)[:, :, None] * louder[passed]
+    z = np.abs(ways) / noise
     usual = 1.4826 * np.median(z, axis=1)
     beyond = np.min(z / np.maximum(usual, np.finfo(float).tiny)[:, None], axis=0) * (ways[0] * ways[1] > 0)
     for axis, k in enumerate(np.argmax(beyond, axis=0)):
         if beyond[k, axis] > NARROW:
-            chance = float(np.sqrt(np.mean((usual[:, axis] * noise[:, k]) ** 2) / 2))
+            chance = float(np.sqrt(np.mean((usual[:, axis] * noise[:, k, axis]) ** 2) / 2))
             found[axis] = Ripple(abs(float(np.mean(ways[:, k, axis]))), chance, float(where[k]), cell, dip=True)
     return found
 

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from driftlab.maps.hysteresis.memory import memory_of
 from driftlab.planning.chamber import Chamber, ramps
 from driftlab.planning.continuation import continuation_of, jointly, of_samples
 from driftlab.planning.unit_model import UnitModel
 from driftlab.reports import plan_continuation
+from driftlab.soak.blocks import brief
 from driftlab.units import BiasUnit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
@@ -89,3 +91,19 @@ def test_what_the_kind_cannot_follow_is_not_recorded_away():
     assert found.enough == ""
     assert "is not reached by recording more" in plan_continuation.headline(found)
     assert any("kind: polynomial cannot follow" in line for line in plan_continuation.lines(found))
+
+
+def test_half_of_what_is_between_up_and_down_is_not_known_and_stays():
+    ((T, bias),) = soak([ramps(CHAMBER, 6.0, 2)], 0)
+    half = 30 * np.deg2rad(1 / 3600)
+    bias = bias + half * np.sign(np.gradient(T))[:, None] * (0.9 + 0.1 * np.cos(T / 50))[:, None]
+    memory = memory_of(brief(T, bias, [0], DT))
+    before = of_samples([(T, bias)], DT, SUBJECT, CHAMBER, memory)
+    assert memory.answer == "seen"
+    assert before.score == pytest.approx(half, rel=0.15)
+    found = continuation_of(before, 3.0, half / 2)
+    assert found.enough == ""
+    assert found.chosen.score == pytest.approx(half, rel=0.15)
+    assert "is not reached by recording more" in plan_continuation.headline(found)
+    assert any("between up and down" in line and "hysteresis" in line for line in plan_continuation.lines(found))
+    assert of_samples([(T, bias)], DT, SUBJECT, CHAMBER).score < half / 2  # the curve between them alone

@@ -8,13 +8,14 @@ from driftlab.identification.records import Evidence, Record
 from driftlab.identification.result import search
 from driftlab.identification.state import name_of
 from driftlab.planning.detectability import MonteCarlo, effects_in, predict_detectability
-from driftlab.planning.simulated_search import Information, noises, planned, shapes
+from driftlab.planning.simulated_search import Information, measured, noises, planned, shapes
 from driftlab.planning.unit_model import UnitModel
 from driftlab.reports.plan_effects import lines, matrix, table
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.hysteresis import Hysteresis
 from fusion_plugins.effects.relaxation import Relaxation
+from fusion_plugins.effects.turn_on import TurnOn
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
 
@@ -62,6 +63,25 @@ def test_nats_are_those_of_the_whole_covariance():
     assert information.nats(0, own) == pytest.approx(left(), rel=0.05)
     assert information.left(0, own, [1]) == pytest.approx(left(r), rel=0.1)
     assert information.left(0, own, [0]) == pytest.approx(0.0, abs=1e-6 * information.nats(0, own))
+
+
+@pytest.mark.parametrize("tau", ["2 min", "1 h"])
+def test_the_size_of_what_settles_is_that_of_generalised_least_squares(tau):
+    t = np.arange(1.0, DURATION + 1)
+    rng, T = np.random.default_rng(3), up_and_down(t)
+    steps, white = rng.normal(size=(2, len(t), len(AXES)))
+    found = measured(UNIT, [(T, curve(T) + WALK * np.cumsum(steps, axis=0) + WHITE * white)], 1.0)
+    settling = TurnOn(tau=tau)
+    size, sigma = Information(found, UNIT, [settling]).size(0)
+    columns = found.columns
+    n, B = len(columns.evidence), columns.W[:, columns.of_map([])]
+    (noise, _) = noises(UNIT, columns.evidence.interval)
+    root = np.linalg.inv(np.linalg.cholesky(noise.covariance(n)))
+    X = root @ np.column_stack([shapes(found, UNIT, settling, 0), np.ones(n), B])
+    y = columns.W[:, columns.y[0]] * columns.scale[columns.y[0]]
+    assert size[0] == pytest.approx(float(np.linalg.lstsq(X, root @ y)[0][0]), abs=0.1 * sigma[0])
+    assert sigma[0] == pytest.approx(float(np.sqrt(np.linalg.pinv(X.T @ X, rcond=1e-11)[0, 0])), rel=0.05)
+    assert abs(size[0]) < 4 * sigma[0]  # nothing settles in it
 
 
 def made_up(effect, size, seed):

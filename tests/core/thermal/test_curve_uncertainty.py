@@ -361,3 +361,16 @@ def test_of_a_finding_what_is_hardly_known_is_no_misfit():
     assert abs(share[3] * shape[3]) < 3.0
     noise = np.random.default_rng(0).normal(size=40)
     assert np.max(_share_of_misfit(noise, np.ones(40))) < 0.3
+
+
+@pytest.mark.parametrize("maps", [Spline(), Polynomial()], ids=["spline", "cubic"])
+def test_a_misfit_at_one_temperature_takes_nothing_of_sigma_at_others(maps):
+    def dipped(T):
+        return bend(30)(T) - 300 * DEG_H * np.exp(-(((T - 33) / 0.25) ** 2) / 2)[:, None]
+
+    T = np.linspace(12, 43, 50)
+    for seed in range(4):
+        smooth, dip = (maps.fit(*soak(curve, seed, TWICE, N=14_400), {}) for curve in (bend(30), dipped))
+        assert dip.record.error.misfits
+        assert not smooth.record.error.misfits
+        assert np.min(dip.sigma(T) / smooth.sigma(T)) > 0.6

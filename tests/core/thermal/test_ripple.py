@@ -83,3 +83,18 @@ def test_a_walk_where_the_temperature_is_slow_is_no_dip():
         left = np.cumsum(rng.normal(size=(N, 3)), axis=0) / 3 + rng.normal(size=(N, 3))
         false += sum(ripple is not None for ripple in ripples(T, left, WIDTH))
     assert false <= 1
+
+
+def test_noise_that_grows_with_temperature_is_no_dip_and_hides_none_elsewhere():
+    false = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        T = up_and_down(rng)
+        left = rng.normal(size=(N, 3)) * np.where(T < -5, 8.0, 1.0)[:, None]
+        left[:, 1] -= 5.0 * np.exp(-(((T - 31.2) / 0.25) ** 2) / 2)
+        without, dip, other = ripples(T, left, WIDTH)
+        false += (without is not None) + (other is not None)
+        assert dip is not None
+        assert dip.dip
+        assert abs(dip.T - 31.2) < 0.5
+    assert false <= 1  # of 40
