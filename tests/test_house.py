@@ -261,7 +261,7 @@ BUDGET = {
     "driftlab/evaluation": 1609,
     "driftlab/family": 3408,
     "driftlab/filtering": 1329,
-    "driftlab/identification": 2345,
+    "driftlab/identification": 2351,
     "driftlab/live": 844,
     "driftlab/maps": 2090,
     "driftlab/noise": 1557,

@@ -102,10 +102,18 @@ def closed(
         verdict = replace(verdict, word="unexplained")
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     others = (remark for remark in remarks if remark not in off)
-    noise = ["what is left looks like noise"] * (verdict.word == "nothing_missing" and not verdict.promising)
+    noise = [_noise(outcomes)] * (verdict.word == "nothing_missing" and not verdict.promising)
     lines = (*untested, *off, *([first] if first else []), *identified.lines, *noise, *others)
     whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
     return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})
+
+
+def _noise(outcomes: Sequence[Outcome]) -> str:
+    """Return the sentence on what is left where nothing is missing, with its size where sigma is too small for it."""
+    nis = max((outcome.runs[-1].overview.nis for outcome in outcomes), key=lambda test: test.mean)
+    times = np.sqrt(nis.mean)
+    larger = f", {times:.2g} times as large as declared: set the noise, sigma is as much too small"
+    return f"what is left looks like noise{larger if times > LARGER and not nis.consistent else ''}"
 
 
 def _untested(outcomes: Sequence[Outcome]) -> list[str]:
@@ -122,6 +130,7 @@ def _untested(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 NO_PARAMETERS = ("kind", "channel", "channels")  # beside the fields that all effects have
+LARGER = 1.2  # times the declared noise: as much too small a sigma is said
 UNTESTED = 0.5  # of the updates beyond what an effect was fitted on: more test nothing of it
 MAX_MEANS = 4096  # of a prediction that are compared
 TINY = 1e-200  # of a variance: errors without noise leave no chance

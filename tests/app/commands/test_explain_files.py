@@ -203,9 +203,18 @@ def test_where_nothing_is_added_the_declared_map_stays_to_the_byte(tmp_path):
     out = tmp_path / "out"
     assert (out / "explained.json").read_bytes() == (out / "declared.json").read_bytes()
     np.testing.assert_array_equal(error["after"], error["before"])
+    assert "what is left looks like noise" in closed.lines
+    names = [[str(tmp_path / f"{name}.h5")] for name in ("soak", "train", "holdout")]
+    thirds = ["filter.gyro.noise=1.03 deg/h/sqrt(Hz)", "filter.accel.noise=0.00133 m/s^2/sqrt(Hz)"]
+    lines = explain(
+        load_config(tmp_path / "declared.yaml", settings=thirds), *names, out=tmp_path / "quiet"
+    ).closed.lines
+    assert (
+        "what is left looks like noise, 3 times as large as declared: set the noise, sigma is as much too small"
+        in lines
+    )
     with h5py.File(tmp_path / "holdout.h5", "a") as file:  # a jump that no other recording has
         file["gyro"][len(file["gyro"]) // 3 :, 1] += 12 / 3600  # deg/s
-    names = [[str(tmp_path / f"{name}.h5")] for name in ("soak", "train", "holdout")]
     again = explain(load_config(tmp_path / "declared.yaml"), *names, out=tmp_path / "again").closed
     assert again.verdict.word == "unexplained"
     assert again.lines[0].startswith("holdout.h5: prediction, ")
