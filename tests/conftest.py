@@ -1,5 +1,6 @@
 """Fixtures that all tests share: the folder of measured recordings, and a browser."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -26,11 +27,18 @@ def pytest_configure(config):
     settings.register_profile("untimed", deadline=None)  # a slow hour fails no test
     settings.load_profile("untimed")
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.set_threshold(100_000, 50, 50)  # as the command line has it; a quarter of the collection of tests went into this
 
 
 def pytest_collection_modifyitems(items):
     """Begin with the files that take longest, so that at the end no process waits for another that has one of them."""
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
+def pytest_collection_finish():
+    """Leave what imports have made out of later searches for garbage: all of it stays."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
