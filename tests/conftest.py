@@ -15,6 +15,7 @@ LONG = (
     "test_explain_files.py", "test_unit.py", "test_plugin_examples.py", "test_family_example.py", "test_live_waits.py",
     "test_plan.py", "test_examples.py", "test_live_web.py", "test_fleet_killed.py", "test_checkpoint.py",
     "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py", "test_compilation.py",
+    "test_third_party.py",
 )  # fmt: skip
 
 
