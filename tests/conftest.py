@@ -1,5 +1,6 @@
 """Fixtures that all tests share: the folder of measured recordings, and a browser."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -14,6 +15,7 @@ LONG = (
     "test_explain_files.py", "test_unit.py", "test_plugin_examples.py", "test_family_example.py", "test_live_waits.py",
     "test_plan.py", "test_examples.py", "test_live_web.py", "test_fleet_killed.py", "test_checkpoint.py",
     "test_pages_every_kind.py", "test_detectability.py", "test_navigator.py", "test_live_map.py", "test_compilation.py",
+    "test_third_party.py",
 )  # fmt: skip
 
 
@@ -26,11 +28,18 @@ def pytest_configure(config):
     settings.register_profile("untimed", deadline=None)  # a slow hour fails no test
     settings.load_profile("untimed")
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.set_threshold(100_000, 50, 50)  # as the command line has it; a quarter of the collection of tests went into this
 
 
 def pytest_collection_modifyitems(items):
     """Begin with the files that take longest, so that at the end no process waits for another that has one of them."""
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
+def pytest_collection_finish():
+    """Leave what imports have made out of later searches for garbage: all of it stays."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

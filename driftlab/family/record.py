@@ -5,7 +5,7 @@ d axes; all values in SI, temperatures in degC.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import isqrt
 from typing import Annotated, Any, Literal
 
@@ -88,11 +88,14 @@ class Figures(BaseModel):
 
     def table(self, names: Sequence[str], d: int) -> Array:
         """Return values and deviations (2, figures, d) of figures by their names, NaN where they are not known."""
-        rows = np.full((2, len(names), d), np.nan)
-        for k, name in enumerate(names):
-            if name in self.figures and len(self.figures[name].value) == d:
-                rows[:, k] = np.array([self.figures[name].value, self.figures[name].sigma], dtype=np.float64)
-        return np.where(np.isfinite(rows), rows, np.nan)
+        return table_of([self.figures.get(name) for name in names], d)
+
+
+def table_of(figures: Iterable[Figure | None], d: int) -> Array:
+    """Return values and deviations (2, figures, d) of figures, NaN where they are not known."""
+    rows = [(one.value, one.sigma) if one and len(one.value) == d else 2 * ((None,) * d,) for one in figures]
+    both = np.array(rows, dtype=np.float64).reshape(len(rows), 2, d).swapaxes(0, 1).copy()
+    return np.where(np.isfinite(both), both, np.nan)
 
 
 class RepeatedSoak(Figures):

@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord
+from driftlab.family.record import FIGURES, TERM_FIGURES, Figure, RepeatedSoak, TermParabolas, UnitRecord, table_of
 from fusion_core.chunk import Array
 
 HELD = (*FIGURES, "hysteresis", "soaks", *TERM_FIGURES)  # figures that are compared over units
@@ -199,7 +199,7 @@ def figure_of(records: Sequence[UnitRecord], name: str, d: int) -> Array:
     """Return values and deviations (2, n, d) of a figure of records, NaN where they are not known."""
     if isinstance(records, RecordsOfUnits):
         return records.records.column(records.rows, name, d)
-    return np.array([record.table((name,), d)[:, 0] for record in records]).reshape(len(records), 2, d).swapaxes(0, 1)
+    return table_of((record.figures.get(name) for record in records), d)
 
 
 def figures_in(records: Sequence[UnitRecord]) -> set[str]:

@@ -50,7 +50,7 @@ def test_the_last_error_and_its_covariance_are_those_of_the_joint_solution(examp
     run, simulation = example
     from joint_solution import joint_solution
 
-    drive = simulation.simulate(0, cycles=2)
+    drive = simulation.simulate(0, cycles=1)
     x, P, x_joint, P_joint = joint_solution(run.navigator(drive, 1.0, fitted), drive.start)
     sigma = np.sqrt(np.diag(P))
     assert np.max(np.abs(x) / sigma) > 0.01  # there is something to compare
@@ -85,7 +85,7 @@ def test_the_navigator_is_short():
 
 
 def test_the_script_prints_its_table_and_draws(tmp_path):
-    code = f"import run; run.main(1, run.Path({str(tmp_path)!r}), cycles=2)"
+    code = f"import run; run.main(1, run.Path({str(tmp_path)!r}), cycles=1)"
     done = subprocess.run([sys.executable, "-c", code], cwd=FOLDER, capture_output=True, text=True, check=True)
     assert done.stdout.count("| random walk") == 2
     assert (tmp_path / "navigator.png").stat().st_size > 10_000

@@ -20,7 +20,7 @@ DOSES = {
     "surroundings": 0.0875,
     "extremes": 0.1,
     "injections": 0.1,
-    "bombs": 0.034,
+    "bombs": 0.023,
 }
 
 

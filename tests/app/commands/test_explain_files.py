@@ -22,7 +22,7 @@ from fusion_core.errors import ConfigError, EmptyRecording
 @pytest.fixture(scope="module")
 def hysteresis(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unit")
-    closed, error = loop(folder, 3, ("hysteresis",))
+    closed, error = loop(folder, 3, ("hysteresis",), hours=(1.6, 1.2, 1.0))
     return folder, closed, error
 
 
@@ -198,7 +198,7 @@ def test_without_a_map_temperature_is_a_channel_like_any_other(hysteresis, tmp_p
 
 
 def test_where_nothing_is_added_the_declared_map_stays_to_the_byte(tmp_path):
-    closed, error = loop(tmp_path, 7, ())
+    closed, error = loop(tmp_path, 7, (), hours=(1.6, 1.2, 1.0))
     assert closed.verdict.word == "nothing_missing"
     out = tmp_path / "out"
     assert (out / "explained.json").read_bytes() == (out / "declared.json").read_bytes()

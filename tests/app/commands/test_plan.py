@@ -55,10 +55,15 @@ def bench(tmp_path, monkeypatch):
     return tmp_path
 
 
+def planned(what, hours, **given):
+    """Plan, and foretell of one effect how small it may be: of all of them that takes longer than all else."""
+    return driftlab.plan(what, hours, effects=["thermal_rate"], **given)
+
+
 @pytest.fixture(scope="module")
 def target():
     """A plan of 8 h that is to come to 1 deg/h."""
-    return driftlab.plan(UNIT, 8, range=(-20.0, 50.0), lag="5 min", sigma="1 deg/h")
+    return planned(UNIT, 8, range=(-20.0, 50.0), lag="5 min", sigma="1 deg/h")
 
 
 def run(*args):
@@ -96,7 +101,7 @@ def test_a_target_is_reached_and_not_much_sooner(target):
     found = target.found
     assert found.shortest.score <= found.target
     assert found.shortest.share >= MIN_COVERAGE
-    less = driftlab.plan("unit.yaml", 0.9 * found.shortest.profile.hours, range=(-20.0, 50.0), lag="5 min").found
+    less = planned("unit.yaml", 0.9 * found.shortest.profile.hours, range=(-20.0, 50.0), lag="5 min").found
     assert less.chosen.score > found.target
 
 
@@ -139,7 +144,7 @@ def test_hours_are_a_time_with_its_unit_or_a_number_of_hours(text):
 
 
 def test_a_walk_asks_for_cycles_and_white_noise_does_not(target):
-    calm = driftlab.plan("unit.yaml", 8, walk="0 deg/s/sqrt(s)", range=(-20.0, 50.0), lag="5 min").found
+    calm = planned("unit.yaml", 8, walk="0 deg/s/sqrt(s)", range=(-20.0, 50.0), lag="5 min").found
     walking = target.found
     assert walking.chosen.profile.reversals > 2
     assert walking.classic.score > 4 * walking.chosen.score
@@ -147,7 +152,7 @@ def test_a_walk_asks_for_cycles_and_white_noise_does_not(target):
 
 
 def test_a_simulated_unit_tells_what_it_is():
-    plan = driftlab.plan(TWIN, 4, kind="spline")
+    plan = planned(TWIN, 4, kind="spline")
     assert (plan.found.chamber.low, plan.found.chamber.high, plan.found.chamber.lag) == (-20, 50, 300)
     assert "the simulated unit's own" in " ".join(plan.lines())
     np.testing.assert_allclose(plan.found.subject.walk, np.deg2rad(2.2e-5))
@@ -156,10 +161,9 @@ def test_a_simulated_unit_tells_what_it_is():
 
 
 def test_a_fitted_map_gives_range_and_curve(bench):
-    driftlab.fit_map(TWIN, out="map.json")
+    low, high = driftlab.fit_map(TWIN, out="map.json").map.domain
     named = {"extends": "unit.yaml", "filter": {"gyro": {"bias": {"map": {"path": "map.json"}}}}}
-    plan = driftlab.plan(named, 4, lag="5 min")
-    low, high = driftlab.fit_map(TWIN).map.domain
+    plan = planned(named, 4, lag="5 min")
     assert (plan.found.chamber.low, plan.found.chamber.high) == pytest.approx((low, high))
     assert "the curve is that of map.json" in " ".join(plan.lines())
 
@@ -167,7 +171,7 @@ def test_a_fitted_map_gives_range_and_curve(bench):
 def test_what_a_kind_cannot_follow_is_said():
     curves = [{"steps": [{"at": "20 degC", "height": "0.05 deg/s", "width": "1 K"}]}] * 3
     stepped = {**TWIN, "source": {**TWIN["source"], "gyro": {"curve": curves}}}
-    lines = driftlab.plan(stepped, 4).lines()
+    lines = planned(stepped, 4).lines()
     assert any("is what kind: polynomial cannot follow of the curve" in line for line in lines)
 
 
@@ -182,11 +186,11 @@ def soak_of(profile, seed):
 
 def test_a_plan_comes_true():
     """Of simulated soaks of the planned profile, fitted as `fit-map` does; benchmarks/plan.py has all of it."""
-    plan = driftlab.plan(TWIN, 3)
+    plan = planned(TWIN, 3)
     assert not any("cannot follow of the curve" in line for line in plan.lines())
     grid, inside = plan.temperature[5:-5], slice(5, -5)
     off, said = [], []
-    for seed in range(8):
+    for seed in range(4):
         config = soak_of(plan.found.chosen.profile, seed)
         fitted, twin = driftlab.fit_map(config).map, twin_of(config_of(config))
         T = np.clip(plan.found.chosen.profile.samples(300.0, 5000)[1], *fitted.domain)
@@ -194,7 +198,7 @@ def test_a_plan_comes_true():
         off.append(fitted.bias(grid) - twin.curve(grid) - level)
         said.append(np.sqrt(np.mean(fitted.sigma(grid) ** 2)))
     foretold = np.sqrt(np.mean(plan.sigma[inside] ** 2))
-    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(foretold, rel=0.35)  # of 24 axes
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(foretold, rel=0.35)  # of 12 axes
     assert np.median(said) == pytest.approx(foretold, rel=0.15)
 
 

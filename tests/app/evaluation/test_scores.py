@@ -48,16 +48,17 @@ def recording(seed):
 def drawn(rows, error, known, end):
     """Return nodes of the error over time, straight over what is not known, and the time it covers up to `end`."""
     t, tau = rows["t"], rows["tau"]
-    s, e = [], []
+    s, e, last = [], [], None
+    bridge = np.linspace(0, 1, 1501)[1:-1]
     for k in np.flatnonzero(known):
         begin = t[k] - tau[k]
-        if s and begin - s[-1] > 1e-9:
-            bridge = np.linspace(0, 1, 1501)[:, None]
-            s += list(s[-1] + bridge[1:-1, 0] * (begin - s[-1]))
-            e += list(e[-1] * (1 - bridge[1:-1]) + error[k] * bridge[1:-1])
-        s += [begin, t[k]]
-        e += [error[k], error[k]]
-    s, e = np.array(s), np.array(e)
+        if last is not None and begin - t[last] > 1e-9:
+            s.append(t[last] + bridge * (begin - t[last]))
+            e.append(error[last] + bridge[:, None] * (error[k] - error[last]))
+        s.append([begin, t[k]])
+        e.append([error[k], error[k]])
+        last = k
+    s, e = np.concatenate(s), np.concatenate(e)
     keep = s < end
     if np.any(~keep):
         cut = int(np.argmin(keep))

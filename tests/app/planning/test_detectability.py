@@ -103,8 +103,14 @@ def named(evidence):
     return {name_of(term.effect) for term in found.model}
 
 
-def test_the_loop_finds_twice_the_smallest_size_and_not_half_of_it():
-    (play,) = predict_detectability(UNIT, up_and_down, DURATION, ["hysteresis"]).effects
+@pytest.fixture(scope="module")
+def play():
+    """What is foretold of a hysteresis."""
+    (found,) = predict_detectability(UNIT, up_and_down, DURATION, ["hysteresis"]).effects
+    return found
+
+
+def test_the_loop_finds_twice_the_smallest_size_and_not_half_of_it(play):
     large, small = (
         [named(made_up(play.effect, times * play.found_from, s)[0]) for s in range(4)] for times in (2, 0.5)
     )
@@ -125,13 +131,11 @@ def test_what_only_warms_up_cannot_show_a_loop():
     assert all(row[k] == ("", "") for k, (_, row) in enumerate(rows))
 
 
-def test_less_noise_finds_smaller_effects():
+def test_less_noise_finds_smaller_effects(play):
     quiet = UnitModel(**{**UNIT.__dict__, "noise": UNIT.noise / 4, "walk": UNIT.walk / 4})
-    loud, still = (
-        predict_detectability(unit, up_and_down, DURATION, ["hysteresis"]).effects[0] for unit in (UNIT, quiet)
-    )
-    assert still.found_from == pytest.approx(loud.found_from / 4, rel=0.35)
-    assert still.left == loud.left == {}
+    (still,) = predict_detectability(quiet, up_and_down, DURATION, ["hysteresis"]).effects
+    assert still.found_from == pytest.approx(play.found_from / 4, rel=0.35)
+    assert still.left == play.left == {}
 
 
 def test_what_was_recorded_says_how_large_an_effect_may_be():

@@ -47,8 +47,10 @@ def test_a_table_that_still_spins_up_is_in_doubt_and_no_limit_passes(tmp_path, t
     )
     assert "larger stimulus.settle, or correct start and stop" in first
     assert made.limits[0].verdict == "undecided"
-    settled = fitted(tmp_path, *spinning_up(0, min(tau, 0.1)))
-    assert settled.limits[0].verdict == "pass"
+
+
+def test_a_table_that_has_spun_up_before_it_is_looked_at_passes(tmp_path):
+    assert fitted(tmp_path, *spinning_up(0, 0.1)).limits[0].verdict == "pass"
 
 
 def test_times_that_are_late_are_in_doubt_with_axis_and_time(tmp_path):
@@ -66,7 +68,7 @@ def test_times_that_are_late_are_in_doubt_with_axis_and_time(tmp_path):
         assert "not steady" in (tmp_path / f"map.{name}.html").read_text()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("temperatures", "hold"), [([-20.0, 20.0, 60.0], 16.0), ([0.0, 15.0, 30.0, 45.0], 6.0)])
 def test_a_steady_table_is_in_no_doubt(tmp_path, seed, temperatures, hold):
     t, y, T, table = turntable(seed, temperatures, hold=hold)

@@ -1,11 +1,13 @@
 """Pages of maps, noise and plans, opened as they are written; those of a run and a comparison have their own tests."""
 
+import json
+from functools import cache
+
+import command_line
 import pytest
 from browsers import assert_drawn_everywhere, assert_fits_on_paper
-from typer.testing import CliRunner
 
 import driftlab
-from driftlab.cli import app
 
 CONFIG = """
 filter:
@@ -58,40 +60,47 @@ def soak(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def made(soak, tmp_path_factory):
+    """Return what a command of PAGES says as JSON, and its page; each is made once."""
+
+    @cache
+    def make(kind):
+        folder = tmp_path_factory.mktemp("made")
+        (folder / "soak.h5").symlink_to(soak)
+        (folder / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
+        (folder / "network.yaml").write_text(CONFIG.replace("MAP", "onnx_network"))
+        arguments, page, _ = PAGES[kind]
+        done = command_line.driftlab(*arguments, "--json", cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout), folder / page
+
+    return make
+
+
 @pytest.mark.parametrize("kind", PAGES)
-def test_it_is_drawn_on_every_screen(kind, soak, tmp_path, monkeypatch, opened):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "soak.h5").symlink_to(soak)
-    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
-    (tmp_path / "network.yaml").write_text(CONFIG.replace("MAP", "onnx_network"))
-    arguments, page, figures = PAGES[kind]
-    done = CliRunner().invoke(app, list(arguments))
-    assert done.exit_code == 0, done.output
-    assert_drawn_everywhere(opened, tmp_path / page, figures)
-    assert_fits_on_paper(opened(tmp_path / page, width=SHEET))
+def test_it_is_drawn_on_every_screen(kind, made, opened):
+    _, page = made(kind)
+    assert_drawn_everywhere(opened, page, PAGES[kind][2])
+    assert_fits_on_paper(opened(page, width=SHEET))
 
 
-def test_kinds_are_bars_with_their_names(soak, tmp_path, monkeypatch, opened):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "soak.h5").symlink_to(soak)
-    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
-    tried = driftlab.fit_map("unit.yaml", "soak.h5", compare=True)
-    tried.save("map.json")
-    shown = opened(tmp_path / "map.report.html")
+def test_kinds_are_bars_with_their_names(made, opened):
+    said, page = made("kinds")
+    shown = opened(page)
     bars = shown.locator("ol.bars li")
-    names = [row["name"] for row in sorted(tried.summary["compare"]["tried"], key=lambda row: row["error"])]
+    names = [row["name"] for row in sorted(said["compare"]["tried"], key=lambda row: row["error"])]
     assert [text.removesuffix(" taken") for text in bars.locator(".name").all_inner_texts()] == names
     assert bars.locator(".name strong").count() == 1
     widths = [bars.nth(k).locator(".bar").bounding_box()["width"] for k in range(len(names))]
     assert widths == sorted(widths)
 
 
-def test_a_plan_with_more_hours_is_never_worse(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
-    # in 1.5 h a second cycle does not fit, and one that is slower suffers more from the walk
-    found = driftlab.plan("unit.yaml", 1.5, range=(0.0, 40.0), lag="2 min").found
-    sigma = [point.best.score for point in found.pareto]
+def test_a_plan_with_more_hours_is_never_worse(made):
+    said, _ = made("plan")
+    sigma = [point["sigma"] for point in said["pareto"]]
     assert sigma == sorted(sigma, reverse=True)
-    assert found.chosen.score <= 1.05 * min(point.best.score for point in found.pareto if point.hours <= 1.5)
-    assert found.chosen.profile.hours < 1.5
+    # in 1.5 h a second cycle does not fit, and one that is slower suffers more from the walk
+    assert said["profile"]["knots"]["time_s"][-1] < 1.5 * 3600
+    best = min(point["sigma"] for point in said["pareto"] if point["hours"] <= 1.5)
+    assert max(said["profiles"][0]["sigma_rms"].values()) <= 1.05 * best
