@@ -53,10 +53,11 @@ def noise_of(t: Array, values: Array, temperature: Array | None = None) -> Quick
 
     `temperature` (N,) is that of the sensor, in any unit; without one its drift cannot be separated from a walk.
     """
+    values = _mended(values)
     rows = _quietest(t, values)
     if rows is None:
         return None
-    quiet = _mended(values[rows])
+    quiet = values[rows]
     dt = float(np.median(np.diff(t[rows])))
     white = np.empty(values.shape[1])
     for k in range(values.shape[1]):
@@ -65,7 +66,7 @@ def noise_of(t: Array, values: Array, temperature: Array | None = None) -> Quick
         white[k] = float(np.median(allan.allan[early] * np.sqrt(allan.tau[early])))
     if not np.all(white > 0):
         return None
-    walk, known = _walk(t, _mended(values), temperature)
+    walk, known = _walk(t, values, temperature)
     return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt, known)
 
 

@@ -233,9 +233,10 @@ def alone(x: Array, usual: float) -> NDArray[np.intp]:
     sizes = np.abs(steps)
     least = np.minimum(sizes[:-1], sizes[1:])
     rows = np.flatnonzero((least > USUAL * usual) & (np.abs(steps[:-1] + steps[1:]) < least / 2)) + 1
+    if not len(rows):
+        return rows
     about = np.clip(rows - ABOUT, 0, max(len(sizes) - 2 * ABOUT, 0))[:, None] + np.arange(min(2 * ABOUT, len(sizes)))
-    far: NDArray[np.intp] = rows[least[rows - 1] > USUAL * np.median(sizes[about], axis=1)]
-    return far
+    return np.asarray(rows[least[rows - 1] > USUAL * np.nanmedian(sizes[about], axis=1)])
 
 
 class Lone:

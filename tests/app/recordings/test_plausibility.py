@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from driftlab.recordings.plausibility import ALONE, Copies, Lone, Rails, Rounding, Thermometer
+from driftlab.recordings.plausibility import ALONE, Copies, Lone, Rails, Rounding, Thermometer, alone
 from driftlab.recordings.screening import _suspect
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
@@ -290,6 +290,13 @@ def test_a_single_reading_on_the_border_of_two_chunks_is_counted():
         x = np.random.default_rng(4).normal(size=(N, 3))
         x[row, 2] += 100
         assert single_readings(x, 7_000)[1] == {"readings of gyro z alone between others far off": 1}
+
+
+def test_gaps_and_few_readings_are_no_trouble():
+    x = np.random.default_rng(6).normal(size=500)
+    x[[3, 100, 498]], x[105] = 90.0, np.nan
+    assert alone(x, 1.0).tolist() == [3, 100, 498]
+    assert [len(alone(np.array([0.0, 90.0, 0.0])[:n], 1.0)) for n in range(4)] == [0, 0, 0, 0]
 
 
 def _in_bursts(rng):
