@@ -144,7 +144,7 @@ def is_trusted(run: ScoredRun) -> bool:
 def inconsistency(mean: float) -> str:
     """Return the meaning of a mean NIS a component that is outside its bounds."""
     (size, deviations), root = ("larger", "small") if mean > 1 else ("smaller", "large"), np.sqrt(mean)
-    by = f"{100 * abs(root - 1):.2g} % {size} than" if 0.5 < root < 2 else f"{root:.2g} times as large as"
+    by = f"{100 * abs(root - 1):.2g} % {size} than" if 0.5 <= root < 2 else f"{root:.2g} times as large as"
     return f"innovations are {by} the model says, so its deviations are too {deviations}"
 
 

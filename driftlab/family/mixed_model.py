@@ -294,8 +294,7 @@ class Posterior:
 
     def informed(self, J: Array, h: Array) -> Posterior:
         """Return the law of a unit of this one when its soak has J (d, q, q) and h (d, q)."""
-        L, _ = self.root
-        back = L.transpose(0, 2, 1)
+        L, back = self.root[0], self.root[0].transpose(0, 2, 1)
         V = inverse(np.eye(L.shape[2]) + back @ J @ L)
         a = back @ (h[..., None] - J @ self.c[..., None])
         return Posterior(self.c + (L @ (V @ a))[..., 0], L @ V @ back)

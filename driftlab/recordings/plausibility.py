@@ -25,7 +25,7 @@ LASTING = 60.0  # s that it stands, at least
 ENOUGH = 1000  # rows that are looked at together: a live source has one at a time
 ALONE = "rows whose temperature stands alone between others"
 JUMP, USUAL = 1.0, 10.0  # K, and times the usual step: more from row to row is a jump
-ABOUT = 16  # rows before and behind a reading that show how much its neighbours scatter
+ABOUT, FEW = 16, 7  # rows before and behind a reading, in which fewer changes are as large: of it, and of two more
 MEDIAN = 0.6745  # of the sizes of normal numbers of variance 1
 FASTEST = 1.0  # K/s: no body of a sensor warms faster
 MOVED = 5.0  # K over which that is looked at
@@ -226,17 +226,18 @@ def usual_change(values: Array) -> Array:
 def alone(x: Array, usual: float) -> NDArray[np.intp]:
     """Return the rows of readings x (N,) that are far from both neighbours, which are close to each other.
 
-    Far is more than USUAL usual changes from row to row, and as many of those in the rows about it: where all scatter
-    more, as in motion, none stands alone.
+    Far is more than USUAL usual changes from row to row, and half as many times nearly all changes in the rows about
+    it: where all scatter more, as in motion, none stands alone.
     """
     steps = np.diff(x)
     sizes = np.abs(steps)
     least = np.minimum(sizes[:-1], sizes[1:])
     rows = np.flatnonzero((least > USUAL * usual) & (np.abs(steps[:-1] + steps[1:]) < least / 2)) + 1
-    if not len(rows):
-        return rows
-    about = np.clip(rows - ABOUT, 0, max(len(sizes) - 2 * ABOUT, 0))[:, None] + np.arange(min(2 * ABOUT, len(sizes)))
-    return np.asarray(rows[least[rows - 1] > USUAL * np.nanmedian(sizes[about], axis=1)])
+    if not len(rows) or len(sizes) < 2 * ABOUT:
+        return rows[:0]
+    about = np.clip(rows - ABOUT, 0, len(sizes) - 2 * ABOUT)[:, None] + np.arange(2 * ABOUT)
+    others = np.partition(sizes[about], -FEW, axis=1)[:, -FEW]
+    return np.asarray(rows[least[rows - 1] > USUAL / 2 * others])  # of noise, twice the median
 
 
 class Lone:

@@ -33,12 +33,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.parent.name != "adr")]
 RAISES = {"errors.md"}  # what it shows must fail: tests of their own
 ELSEWHERE = [["plugins", "--check"]]  # half a minute, as `tests/test_plugin_examples.py` runs it
-PRINTED = {
-    "first_run",
-    "plan_a_soak",
-    "put_a_map_into_your_firmware",
-}  # on recordings of their own: in full or shortened
-TYPED = ("driftlab", "$", "...", "python", ".venv/", "source .venv")
+PRINTED = {"first_run", "plan_a_soak", "put_a_map_into_your_firmware"}  # recordings of their own: in full or shortened
+TYPED = ("driftlab", "$", "...", "python", ".venv/", "source .venv", "arm-none-eabi-gcc")
 UNDER = {  # where a piece of a config belongs that does not begin at its top
     "calibration": ("filter", "gyro"),
     "bias": ("filter", "gyro"),
