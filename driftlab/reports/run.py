@@ -102,7 +102,7 @@ def result_sentences(run: ScoredRun) -> tuple[str, str]:
     if several and np.all(np.isfinite(own := scores.coast[length])):
         result += f"; the first is off by {unit.number(own[worst])} {unit.shown}"
     of = axis and f" of {scores.axes[unsure]}"
-    verdict = "no sign that sigma is too small" if ratios[unsure] <= REFUTED else "sigma is too small; widen walk or map"
+    verdict = "no sign that it is too small" if ratios[unsure] <= REFUTED else "it is too small; widen walk or map"
     size = f"{unit.number(sigmas[unsure])} {unit.shown}"
     times = f"the error {ratios[unsure]:.1f} times that and the reference's noise together"
     whose = f"sigma{of}" + (f" over all {len(scores.coasts)}" if several else " there")
