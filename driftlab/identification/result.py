@@ -102,7 +102,7 @@ def closed(
         verdict = replace(verdict, word="unexplained")
     remarks = (f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks)
     others = (remark for remark in remarks if remark not in off)
-    noise = [_noise(outcomes)] * (verdict.word == "nothing_missing" and not verdict.promising)
+    noise = [_noise(outcomes)] if verdict.word == "nothing_missing" and not verdict.promising else []
     lines = (*untested, *off, *([first] if first else []), *identified.lines, *noise, *others)
     whole = replace(identified, verdict=verdict, outcomes=tuple(outcomes), change=change, lines=lines)
     return replace(whole, content={**as_json(whole, recordings), "holdout_change": asdict(change)})

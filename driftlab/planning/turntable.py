@@ -106,12 +106,12 @@ def plan_turntable(
     ConfigError
         If the hours are too few for three temperatures with all faces.
     """
-    tried = []
+    tried, T = [], np.linspace(chamber.low, chamber.high, GRID)
     for levels in LEVELS:
-        profile = staircase(chamber, hours, chamber.swing / (levels - 1))
-        for rounds in ROUNDS if profile else ():
-            if profile and (segments := _segments(profile, chamber, levels, rounds, rate)):
-                T = np.linspace(chamber.low, chamber.high, GRID)
+        if (profile := staircase(chamber, hours, chamber.swing / (levels - 1))) is None:
+            continue
+        for rounds in ROUNDS:
+            if segments := _segments(profile, chamber, levels, rounds, rate):
                 sigma = _sigma(subject, chamber, profile, segments, T)
                 share = float(np.mean((sigma / USUAL)[:, list(wanted)] ** 2))
                 tried.append(TurntableDesign(profile, levels, rounds, segments, T, sigma, share))
